@@ -1,0 +1,24 @@
+"""Captures: photographs of one object under known lights, read from folders of files."""
+
+from splinecli.capture.capture_files import CaptureFiles
+from splinecli.capture.ground_truth import read_normals
+from splinecli.capture.images import read_image, read_mask
+from splinecli.capture.layout import find_capture_files, find_captures
+from splinecli.capture.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.reader import CaptureSource, open_capture, read_capture
+from splinecli.capture.record import Capture
+
+__all__ = [
+    "Capture",
+    "CaptureFiles",
+    "CaptureSource",
+    "find_capture_files",
+    "find_captures",
+    "open_capture",
+    "read_capture",
+    "read_image",
+    "read_light_directions",
+    "read_light_intensities",
+    "read_mask",
+    "read_normals",
+]

@@ -1,0 +1,84 @@
+"""The files of one capture, and the names by which they are recognised."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splinecli.capture.image_lists import IMAGE_SUFFIXES, list_folder
+from splinecli.errors import InputError
+
+FILENAMES = "filenames.txt"
+LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt")
+LIGHT_INTENSITIES = ("light_intensities.txt",)
+MASK = tuple(f"mask{suffix}" for suffix in IMAGE_SUFFIXES)
+GROUND_TRUTH = tuple(
+    f"{stem}{suffix}"
+    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt")
+    for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
+)
+
+NOT_PHOTOGRAPHS = frozenset(
+    {Path(name).stem for name in (*MASK, *GROUND_TRUTH)}
+    # What splinecli itself writes, should its output folder be the capture's own.
+    | {"normals", "error_map"}
+)
+"""Lower-case stems of pictures in a capture's folder that are no photographs."""
+
+
+@dataclass(frozen=True)
+class CaptureFiles:
+    """The files of one capture; the images in the order of the lights.
+
+    Args:
+        name: the folder's name.
+        folder: the folder.
+        images: one file a light.
+        light_directions: F x 3 text.
+        light_intensities: F x 3 text, or None where all lights are equally strong.
+        mask: an image, or None where every pixel counts.
+        ground_truth: a normal map, or None.
+    """
+
+    name: str
+    folder: Path
+    images: tuple[Path, ...]
+    light_directions: Path
+    light_intensities: Path | None = None
+    mask: Path | None = None
+    ground_truth: Path | None = None
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """Files named by the user, which go before what the folder holds."""
+
+    lights: Path | None = None
+    intensities: Path | None = None
+    mask: Path | None = None
+    ground_truth: Path | None = None
+
+    def named(self) -> tuple[Path, ...]:
+        """Those that are there. Raises InputError for one that is no file."""
+        files = tuple(
+            f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None
+        )
+        for file in files:
+            if not file.exists():
+                raise InputError("the file does not exist", path=file)
+            if not file.is_file():
+                raise InputError("found a folder, expected a file", path=file)
+        return files
+
+
+def find_named(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first of the names that the folder holds, letter case aside; None for none."""
+    files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.is_file()}
+    return next((files[name] for name in names if name in files), None)
+
+
+def capture_name(folder: Path) -> str:
+    """The folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name."""
+    path = folder.absolute()
+    return (path.resolve() if ".." in path.parts else path).name or "capture"

@@ -1,0 +1,152 @@
+"""Ground-truth normal maps from .mat, .npy, text and picture files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.decoding import decode_image
+from splinecli.capture.text_files import read_number_rows
+from splinecli.errors import InputError
+
+StrPath = str | os.PathLike[str]
+
+_MAT_KEY = "Normal_gt"
+_PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
+# A picture's background may be gray, the code of the zero vector: a real normal is never so short.
+_SHORTEST_IN_PICTURE = 0.5
+# Pixels normalised at a time: in float64, but not all of a large picture at once.
+_BLOCK = 1 << 20
+
+
+def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """A normal map (H, W, 3) float32: unit vectors, zero outside the mask and where there is no ground truth.
+
+    Frame: x right, y up, z to the camera. The file is one of
+
+    - MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array;
+    - .npy;
+    - .txt: H*W rows of x y z in row-major order;
+    - .png or .tif: n = 2 v / full range - 1, black for no ground truth; floating-point TIFF as it is.
+
+    Vectors are normalised; zero and non-finite ones are no ground truth.
+
+    Args:
+        path: the file.
+        shape: (H, W) of the images.
+        mask: (H, W), true where normals are wanted.
+
+    Raises:
+        InputError: the file cannot be read, has another size, or has no normal inside the mask.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("the ground truth does not exist or is no file", path=path)
+    suffix = path.suffix.lower()
+    if suffix == ".mat":
+        stored = _read_mat(path)
+    elif suffix == ".npy":
+        stored = _read_npy(path)
+    elif suffix == ".txt":
+        stored = _read_text(path, shape)
+    elif suffix in _PICTURE_SUFFIXES:
+        stored = decode_image(path)
+    else:
+        raise InputError(
+            f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png or .tif', path=path
+        )
+    if stored.shape != (*shape, 3):
+        raise InputError(
+            f"found ground truth of {_times(stored.shape)}, expected {_times((*shape, 3))} like the images",
+            path=path,
+        )
+    is_picture = suffix in _PICTURE_SUFFIXES and stored.dtype.kind == "u"
+    if stored.dtype.kind not in "fiu":
+        raise InputError(f"found ground truth of type {stored.dtype}, expected real numbers", path=path)
+    normals = np.zeros((*shape, 3), np.float32)
+    rows, columns = np.nonzero(mask)
+    for start in range(0, len(rows), _BLOCK):
+        place = rows[start : start + _BLOCK], columns[start : start + _BLOCK]
+        vectors = stored[place].astype(np.float64)
+        normals[place] = _from_picture(vectors, stored.dtype) if is_picture else _unit_or_zero(vectors, 0.0)
+    if not normals.any():
+        raise InputError("found no normal inside the mask, expected at least one", path=path)
+    return normals
+
+
+def _from_picture(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.float64]:
+    coloured = values.any(axis=1, keepdims=True)
+    return _unit_or_zero(values * 2 / np.iinfo(dtype).max - 1, _SHORTEST_IN_PICTURE) * coloured
+
+
+def _unit_or_zero(vectors: NDArray[np.float64], shortest: float) -> NDArray[np.float64]:
+    """Vectors (P, 3) at unit length; zero where they are not finite or not longer than the shortest."""
+    # Not NaN, not infinite, and nothing (of a damaged file) whose square would be.
+    usable = (np.abs(vectors) < 1e100).all(axis=1, keepdims=True)
+    length = np.linalg.norm(np.where(usable, vectors, 0), axis=1, keepdims=True)
+    scaled: NDArray[np.float64] = np.divide(
+        vectors, length, out=np.zeros_like(vectors), where=usable & (length > shortest)
+    )
+    return scaled
+
+
+def _read_mat(path: Path) -> NDArray[Any]:
+    from scipy.io import loadmat
+
+    try:
+        variables = loadmat(path)
+    except NotImplementedError:
+        raise InputError(
+            "found a MATLAB 7.3 file, which is not supported",
+            path=path,
+            hint="Save it with MATLAB's option -v7",
+        ) from None
+    except Exception:  # a damaged file surfaces as any of a dozen types
+        raise InputError("the MATLAB file is damaged and cannot be read", path=path) from None
+    if isinstance(variables.get(_MAT_KEY), np.ndarray):
+        return np.asarray(variables[_MAT_KEY])
+    maps = {
+        name: value
+        for name, value in variables.items()
+        if isinstance(value, np.ndarray) and value.ndim == 3 and value.shape[2] == 3
+    }
+    if len(maps) != 1:
+        found = ", ".join(maps) if maps else "none"
+        raise InputError(
+            f"found no {_MAT_KEY}, and of other H x W x 3 arrays {found}, expected one", path=path
+        )
+    return next(iter(maps.values()))
+
+
+def _read_npy(path: Path) -> NDArray[Any]:
+    try:
+        with path.open("rb") as file:
+            # Not np.load: that would also open archives, and pickles where it is told to.
+            array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
+        raise InputError("the .npy file is damaged, or holds no array of numbers", path=path) from None
+    return array
+
+
+def _read_text(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+    try:
+        rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
+    except (ValueError, OSError):
+        # Slower, but it knows commas and names the line at fault.
+        rows = read_number_rows(path).as_array()
+    expected = (shape[0] * shape[1], 3)
+    if rows.shape != expected:
+        raise InputError(
+            f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {expected[0]} rows of 3,"
+            f" one for each pixel of {_times(shape)}",
+            path=path,
+        )
+    return rows.reshape(*shape, 3)
+
+
+def _times(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(size) for size in shape)

@@ -1,0 +1,83 @@
+"""From a folder to the files of a capture: the one place where the layouts are tried in turn."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from splinecli.capture import diligent, plain_folder
+from splinecli.capture.capture_files import (
+    FILENAMES,
+    LIGHT_DIRECTIONS,
+    NOT_PHOTOGRAPHS,
+    CaptureFiles,
+    Overrides,
+    find_named,
+)
+from splinecli.capture.image_lists import list_folder, list_images
+from splinecli.errors import InputError
+
+StrPath = str | os.PathLike[str]
+
+# Special before general: a plain folder takes whatever holds images.
+_LAYOUTS = (diligent.find, plain_folder.find)
+
+
+def find_capture_files(
+    folder: StrPath,
+    *,
+    lights: StrPath | None = None,
+    intensities: StrPath | None = None,
+    mask: StrPath | None = None,
+    ground_truth: StrPath | None = None,
+) -> CaptureFiles:
+    """The files of the capture in the folder; files named here go before those that the folder holds.
+
+    Raises:
+        InputError: the folder is missing, is a file or holds no images; filenames.txt names an image that
+            does not exist; there is no light file; or a file named here does not exist.
+    """
+    named = (lights, intensities, mask, ground_truth)
+    overrides = Overrides(*(None if file is None else Path(file) for file in named))
+    list_folder(Path(folder))  # raises where it is no folder
+    overrides.named()
+    for find in _LAYOUTS:
+        files = find(Path(folder), overrides)
+        if files is not None:
+            return files
+    raise AssertionError("the plain folder takes every folder or raises")  # pragma: no cover
+
+
+def find_captures(folder: StrPath) -> list[Path]:
+    """The captures of a dataset's folder in natural order, or the folder alone where it is a capture itself.
+
+    A capture is a folder with a light file beside its images; whether it can be read shows when it is read.
+
+    Raises:
+        InputError: the folder is missing, is a file, or holds no capture.
+    """
+    folder = Path(folder)
+    inside = _subfolders(folder)
+    if _looks_like_capture(folder):
+        return [folder]
+    captures = [path for path in inside if _looks_like_capture(path)]
+    if captures:
+        return captures
+    deeper = [path for path in inside if any(_looks_like_capture(sub) for sub in _subfolders(path))]
+    raise InputError(
+        f"found no capture, expected folders of images with a light file ({' or '.join(LIGHT_DIRECTIONS)})",
+        path=folder,
+        hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
+    )
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    return [entry for entry in list_folder(folder) if entry.is_dir()]
+
+
+def _looks_like_capture(folder: Path) -> bool:
+    if find_named(folder, LIGHT_DIRECTIONS) is None:
+        return False
+    if find_named(folder, [FILENAMES]) is not None:
+        return True
+    return bool(list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=()))

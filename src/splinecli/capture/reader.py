@@ -1,0 +1,186 @@
+"""From files to a Capture, one photograph at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.capture_files import CaptureFiles
+from splinecli.capture.decoding import decode_image
+from splinecli.capture.ground_truth import read_normals
+from splinecli.capture.images import read_mask, to_linear
+from splinecli.capture.layout import StrPath, find_capture_files
+from splinecli.capture.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.record import Capture, check_light_indices
+from splinecli.errors import InputError
+
+SATURATED_SHARE = 0.01
+"""The share of saturated observations above which the capture carries a warning."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureSource:
+    """A capture whose lights are read and whose images are not.
+
+    Args:
+        files: its files.
+        light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
+        light_intensities: (F, 3) float64, RGB; ones where no file gives them.
+    """
+
+    files: CaptureFiles
+    light_directions: NDArray[np.float64]
+    light_intensities: NDArray[np.float64]
+
+    @property
+    def n_lights(self) -> int:
+        return len(self.light_directions)
+
+    def read(
+        self, light_indices: Sequence[int] | None = None, progress: Callable[[], object] | None = None
+    ) -> Capture:
+        """The capture under the chosen lights (all of them for None), in the order given.
+
+        Only their images are read, and at most one full image is held beside the result. Values outside the
+        mask are not looked at.
+
+        Args:
+            light_indices: zero-based.
+            progress: called once after each image.
+
+        Raises:
+            UsageError: an index is out of range, comes twice, or there are fewer than three.
+            InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or
+                the lights cannot give normals (see Capture).
+        """
+        indices = (
+            tuple(range(self.n_lights))
+            if light_indices is None
+            else check_light_indices(light_indices, self.n_lights)
+        )
+        first_path = self.files.images[indices[0]]
+        first = decode_image(first_path)
+        mask = self._read_mask(first.shape[:2], first_path)
+        ground_truth = None
+        if self.files.ground_truth is not None:
+            ground_truth = read_normals(self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask)
+        observations = np.empty((np.count_nonzero(mask), len(indices)), np.float32)
+        n_saturated, n_8_bit = 0, 0
+        stored: NDArray[Any] | None = first
+        del first
+        for position, index in enumerate(indices):
+            path = self.files.images[index]
+            if stored is None:
+                stored = decode_image(path)
+            if stored.shape[:2] != mask.shape:
+                raise InputError(
+                    f"found an image of {_size(stored.shape)} pixels,"
+                    f" expected {_size(mask.shape)} as in {first_path.name}",
+                    path=path,
+                )
+            observations[:, position], saturated = _observe(stored[mask], self.light_intensities[index], path)
+            n_saturated += saturated
+            n_8_bit += stored.dtype == np.uint8
+            stored = None  # let go before the next is decoded: one full image at a time
+            if progress is not None:
+                progress()
+        return Capture(
+            name=self.files.name,
+            observations=observations,
+            light_directions=self.light_directions[list(indices)],
+            light_indices=indices,
+            mask=mask,
+            ground_truth=ground_truth,
+            warnings=_warnings(n_saturated / observations.size, n_8_bit),
+        )
+
+    def _read_mask(self, shape: tuple[int, ...], image: Path) -> NDArray[np.bool_]:
+        if self.files.mask is None:
+            return np.ones(shape, np.bool_)
+        mask = read_mask(self.files.mask)
+        if mask.shape != shape:
+            raise InputError(
+                f"found a mask of {_size(mask.shape)} pixels, expected {_size(shape)} as in {image.name}",
+                path=self.files.mask,
+            )
+        return mask
+
+
+def open_capture(
+    folder: StrPath,
+    *,
+    lights: StrPath | None = None,
+    intensities: StrPath | None = None,
+    mask: StrPath | None = None,
+    ground_truth: StrPath | None = None,
+) -> CaptureSource:
+    """Find a capture's files and read its lights; files named here go before those that the folder holds.
+
+    Raises:
+        InputError: the folder holds no capture (see find_capture_files) or a light file is wrong.
+    """
+    files = find_capture_files(
+        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+    )
+    n_images = len(files.images)
+    directions = read_light_directions(files.light_directions, n_images)
+    if files.light_intensities is None:
+        strengths = np.ones((n_images, 3))
+    else:
+        strengths = read_light_intensities(files.light_intensities, n_images)
+    return CaptureSource(files, directions, strengths)
+
+
+def read_capture(
+    folder: StrPath,
+    *,
+    lights: StrPath | None = None,
+    intensities: StrPath | None = None,
+    mask: StrPath | None = None,
+    ground_truth: StrPath | None = None,
+    light_indices: Sequence[int] | None = None,
+    progress: Callable[[], object] | None = None,
+) -> Capture:
+    """Open a capture and read it: open_capture and CaptureSource.read, which see."""
+    source = open_capture(
+        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+    )
+    return source.read(light_indices, progress)
+
+
+def _observe(
+    pixels: NDArray[Any], intensity: NDArray[np.float64], path: Path
+) -> tuple[NDArray[np.float32], int]:
+    """Stored pixels (P, C) under a light of RGB intensity (3,) -> observations (P,), number saturated.
+
+    Each channel is divided by its intensity, then the mean is taken; a gray image is equal in all channels.
+    """
+    weights = 1 / (3 * intensity)
+    if pixels.shape[1] == 1:
+        weights = weights.sum(keepdims=True)
+    n_saturated = 0
+    if pixels.dtype.kind == "u":
+        n_saturated = int(np.count_nonzero((pixels == np.iinfo(pixels.dtype).max).any(axis=1)))
+    return to_linear(pixels, path) @ weights.astype(np.float32), n_saturated
+
+
+def _warnings(saturated_share: float, n_8_bit: int) -> tuple[str, ...]:
+    warnings = []
+    if saturated_share > SATURATED_SHARE:
+        warnings.append(
+            f"{100 * saturated_share:.1f} % of the observations are saturated;"
+            " a shorter exposure gives better normals."
+        )
+    if n_8_bit:
+        warnings.append("The images have 8 bits; 16-bit linear images give better normals.")
+    return tuple(warnings)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    """Height and width as people say them: width x height."""
+    return f"{shape[1]} x {shape[0]}"

@@ -1,0 +1,171 @@
+"""The record that everything after reading works on: the mask's pixels under known lights."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError, UsageError
+
+MIN_LIGHTS = 3
+"""A normal times an albedo has three unknowns."""
+
+FLATTEST_LIGHTS = 1e-3
+"""Smallest singular value of the (F, 3) lights over the largest, below which they count as coplanar."""
+
+_UNIT_TOLERANCE = 1e-3
+_BLOCK = 1 << 20  # rows checked at a time: a check must not need a second copy of a large capture
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One object under F lights, seen by a fixed orthographic camera. Validated once, when it is made.
+
+    Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
+
+    Args:
+        name: what the outputs are called.
+        observations: (P, F) float32, linear: every channel divided by its light's intensity, then the mean of
+            the channels. Only the mask's pixels, in the mask's row-major order.
+        light_directions: (F, 3) float64, unit, above the horizon (z > 0).
+        light_indices: (F,) zero-based indices of these lights in the whole capture.
+        mask: (H, W) bool with P true pixels.
+        ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
+        warnings: sentences a user should read.
+
+    Raises:
+        InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
+            horizon, there are fewer than three lights or all lie in one plane, or the mask is empty.
+    """
+
+    name: str
+    observations: NDArray[np.float32]
+    light_directions: NDArray[np.float64]
+    light_indices: tuple[int, ...]
+    mask: NDArray[np.bool_]
+    ground_truth: NDArray[np.float32] | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
+        object.__setattr__(self, "observations", np.asarray(self.observations, np.float32))
+        object.__setattr__(self, "light_directions", np.asarray(self.light_directions, np.float64))
+        object.__setattr__(self, "light_indices", tuple(operator.index(i) for i in self.light_indices))
+        object.__setattr__(self, "mask", np.asarray(self.mask, np.bool_))
+        object.__setattr__(self, "warnings", tuple(self.warnings))
+        self._check_lights()
+        self._check_observations()
+        if self.ground_truth is not None:
+            object.__setattr__(self, "ground_truth", np.asarray(self.ground_truth, np.float32))
+            self._check_ground_truth(self.ground_truth)
+
+    @property
+    def n_lights(self) -> int:
+        return len(self.light_directions)
+
+    @property
+    def n_pixels(self) -> int:
+        return len(self.observations)
+
+    def choose_lights(self, positions: Sequence[int]) -> Capture:
+        """The same capture under some of its lights, in the order given.
+
+        Args:
+            positions: zero-based positions among this record's lights, not indices in the whole capture.
+
+        Raises:
+            UsageError: a position is out of range, comes twice, or there are fewer than three.
+            InputError: the chosen lights lie in one plane.
+        """
+        chosen = list(check_light_indices(positions, self.n_lights))
+        return replace(
+            self,
+            observations=self.observations[:, chosen],
+            light_directions=self.light_directions[chosen],
+            light_indices=tuple(self.light_indices[i] for i in chosen),
+        )
+
+    def _check_lights(self) -> None:
+        lights = self.light_directions
+        if lights.ndim != 2 or lights.shape[1] != 3:
+            raise InputError(f"{self.name}: light directions of shape {lights.shape}, expected (F, 3)")
+        if len(self.light_indices) != len(lights):
+            raise InputError(f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights")
+        if len(lights) < MIN_LIGHTS:
+            raise InputError(
+                f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}",
+                hint="A normal has three unknowns, so three images under different lights are the fewest",
+            )
+        if not np.isfinite(lights).all():
+            raise InputError(f"{self.name}: a light direction is not finite")
+        if (np.abs(np.linalg.norm(lights, axis=1) - 1) > _UNIT_TOLERANCE).any():
+            raise InputError(f"{self.name}: a light direction is not a unit vector")
+        if (lights[:, 2] <= 0).any():
+            below = int(np.argmax(lights[:, 2] <= 0))
+            raise InputError(
+                f"{self.name}: light {self.light_indices[below]} lies below the horizon (z <= 0)",
+                hint="z points to the camera",
+            )
+        strengths = np.linalg.svd(lights, compute_uv=False)
+        if strengths[-1] < FLATTEST_LIGHTS * strengths[0]:
+            raise InputError(
+                f"{self.name}: the {len(lights)} lights lie in one plane,"
+                " so least squares (LS) cannot solve for a normal",
+                hint="Choose lights that surround the viewing direction",
+            )
+
+    def _check_observations(self) -> None:
+        if self.mask.ndim != 2:
+            raise InputError(f"{self.name}: a mask of shape {self.mask.shape}, expected (H, W)")
+        n_pixels = int(np.count_nonzero(self.mask))
+        if n_pixels == 0:
+            raise InputError(f"{self.name}: the mask is empty")
+        expected = (n_pixels, self.n_lights)
+        if self.observations.shape != expected:
+            raise InputError(
+                f"{self.name}: observations of shape {self.observations.shape},"
+                f" expected (pixels, lights) = {expected}"
+            )
+        if not all(np.isfinite(block).all() for block in _blocks(self.observations)):
+            raise InputError(f"{self.name}: an observation is not finite")
+
+    def _check_ground_truth(self, normals: NDArray[np.float32]) -> None:
+        expected = (*self.mask.shape, 3)
+        if normals.shape != expected:
+            raise InputError(
+                f"{self.name}: ground truth of shape {normals.shape}, expected (H, W, 3) = {expected}"
+            )
+        for block in _blocks(normals.reshape(-1, 3)):
+            length = np.linalg.norm(block, axis=1)
+            # Written so that NaN fails it too.
+            if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():
+                raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
+
+
+def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
+    """The indices as a tuple of ints, in their order, once they can choose among n_lights lights.
+
+    Raises:
+        UsageError: an index is out of range, comes twice, or there are fewer than three.
+    """
+    chosen = tuple(operator.index(index) for index in indices)
+    for position, index in enumerate(chosen):
+        if not 0 <= index < n_lights:
+            raise UsageError(
+                f"light index {index} is out of range: the capture has {n_lights} lights",
+                hint=f"Light indices count from 0 to {n_lights - 1}",
+            )
+        if index in chosen[:position]:
+            raise UsageError(f"light index {index} comes twice", hint="Name each light once")
+    if len(chosen) < MIN_LIGHTS:
+        raise UsageError(f"{len(chosen)} lights chosen, expected at least {MIN_LIGHTS}")
+    return chosen
+
+
+def _blocks(rows: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+    for start in range(0, len(rows), _BLOCK):
+        yield rows[start : start + _BLOCK]

@@ -1,0 +1,100 @@
+"""Text files as people really hand them in: any separator, byte order marks, comments, blank lines."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError
+
+_SEPARATORS = re.compile(r"[\s,;]+")
+
+
+@dataclass(frozen=True)
+class NumberRows:
+    """The rows of numbers of a text file, not necessarily of one length.
+
+    Args:
+        path: the file.
+        rows: the numbers of each row, all finite.
+        lines: the one-based line of the file that each row stands on.
+        texts: those lines as written, without comment.
+    """
+
+    path: Path
+    rows: tuple[tuple[float, ...], ...]
+    lines: tuple[int, ...]
+    texts: tuple[str, ...] = field(repr=False)
+
+    def drop_first(self) -> NumberRows:
+        """Without the first row (a count line)."""
+        return NumberRows(self.path, self.rows[1:], self.lines[1:], self.texts[1:])
+
+    def as_array(self) -> NDArray[np.float64]:
+        """The rows as (R, C) float64; raises InputError at the first row that differs in length."""
+        lengths = [len(row) for row in self.rows]
+        usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
+        for row, line in zip(self.rows, self.lines, strict=True):
+            if len(row) != usual:
+                raise InputError(
+                    f"found {columns(len(row))}, expected {usual} as in the other lines",
+                    path=self.path,
+                    line=line,
+                )
+        return np.array(self.rows, np.float64)
+
+
+def columns(count: int) -> str:
+    return f"{count} column" + ("" if count == 1 else "s")
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a UTF-8 file, with or without a byte order mark; InputError where it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8-sig").split("\n")
+    except FileNotFoundError:
+        raise InputError("the file does not exist", path=path) from None
+    except IsADirectoryError:
+        raise InputError("found a folder, expected a text file", path=path) from None
+    except UnicodeDecodeError:
+        raise InputError(
+            "the file is not UTF-8 text", path=path, hint="Save it as plain UTF-8 text"
+        ) from None
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+
+
+def read_number_rows(path: Path) -> NumberRows:
+    """Numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
+
+    Raises:
+        InputError: with the line, for a word that is no finite number; or the file holds no numbers at all.
+    """
+    rows, lines, texts = [], [], []
+    for line, text in enumerate(read_lines(path), start=1):
+        content = text.partition("#")[0].strip()
+        words = [word for word in _SEPARATORS.split(content) if word]
+        if words:
+            rows.append(tuple(_number(word, path, line) for word in words))
+            lines.append(line)
+            texts.append(content)
+    if not rows:
+        raise InputError("the file holds no numbers", path=path)
+    return NumberRows(path, tuple(rows), tuple(lines), tuple(texts))
+
+
+def _number(word: str, path: Path, line: int) -> float:
+    try:
+        # float() would also take Python's own "1_000".
+        value = float(word) if "_" not in word else None
+    except ValueError:
+        value = None
+    if value is None:
+        raise InputError(f'found "{word[:40]}", expected a number', path=path, line=line)
+    if not np.isfinite(value):
+        raise InputError(f'found "{word[:40]}", expected a finite number', path=path, line=line)
+    return value

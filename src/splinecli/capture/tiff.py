@@ -1,0 +1,92 @@
+"""TIFF files as pixels: 8 and 16 bits and floating point, gray or RGB."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError
+
+# TIFF's PhotometricInterpretation: what a sample means.
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
+
+
+def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    """The first picture of a TIFF file as stored, (H, W) or (H, W, samples).
+
+    Values grow with brightness: a file in which zero is white is turned round, as viewers show it.
+    tifffile reads every sample format; OpenCV stands in for compressions that it has no decoder for (LZW).
+
+    Raises:
+        InputError: the file is truncated, damaged, or of a kind that holds no linear gray or RGB values.
+    """
+    import tifffile
+
+    damaged = InputError("the TIFF is damaged and cannot be read", path=path, hint="Copy or export it again")
+    with _quiet_tifffile():
+        try:
+            with tifffile.TiffFile(path) as file:
+                page: Any = file.pages.first
+                _check_complete(page, path)
+                photometric = int(page.photometric)
+                if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
+                    raise InputError(
+                        f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
+                        path=path,
+                        hint="Export it as RGB",
+                    )
+                pixels = _decode_page(page)
+        except InputError:
+            raise
+        except Exception:  # a damaged header causes whatever it causes: struct, key, value, memory errors
+            raise damaged from None
+    if pixels is None:
+        if photometric == _WHITE_IS_ZERO:
+            raise damaged
+        return decode_with_opencv()
+    if photometric == _WHITE_IS_ZERO:
+        if pixels.dtype.kind == "u":
+            return np.asarray(np.iinfo(pixels.dtype).max - pixels)
+        if pixels.dtype == np.bool_:
+            return ~pixels
+    return pixels
+
+
+def _decode_page(page: Any) -> NDArray[Any] | None:
+    """(H, W) or (H, W, samples), or None where tifffile has no decoder or fails in it."""
+    if int(page.photometric) == _YCBCR:
+        return None
+    try:
+        pixels: NDArray[Any] = page.asarray()
+    except Exception:  # a missing codec shows as one of several types, depending on tifffile's version
+        return None
+    if page.axes == "SYX":
+        pixels = np.moveaxis(pixels, 0, -1)
+    return pixels if pixels.ndim in (2, 3) else None
+
+
+def _check_complete(page: Any, path: Path) -> None:
+    size = path.stat().st_size
+    if any(
+        count == 0 or offset + count > size
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+    ):
+        raise InputError("the TIFF is truncated", path=path, hint="Copy or export it again")
+
+
+@contextmanager
+def _quiet_tifffile() -> Iterator[None]:
+    """tifffile logs what it dislikes about a file; the errors raised here say all that a user needs."""
+    logger = logging.getLogger("tifffile")
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        yield
+    finally:
+        logger.disabled = before

@@ -1,0 +1,49 @@
+"""Angular errors of normals, in degrees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.normals import angle_between_deg
+
+
+@dataclass(frozen=True)
+class AngularErrors:
+    """Over the pixels that have a ground truth: mean (MAE), median and 90th percentile in degrees; and the shares of
+    pixels, 0 to 1, with an error under 5 and under 10 degrees."""
+
+    mean: float
+    median: float
+    p90: float
+    under_5: float
+    under_10: float
+
+
+def angular_error_map_deg(
+    normals: NDArray[np.floating], ground_truth: NDArray[np.floating], mask: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Errors (H, W) of normal maps (H, W, 3) inside the mask; NaN elsewhere and where the ground truth is zero.
+
+    Signed directions count: a normal that points the wrong way is 180 degrees off, not 0.
+    """
+    scored = mask & ground_truth.any(axis=-1)
+    errors = np.full(mask.shape, np.nan, np.float32)
+    errors[scored] = angle_between_deg(normals[scored], ground_truth[scored])
+    return errors
+
+
+def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
+    """Summary of an error map or list, NaN left out; None where nothing is left."""
+    errors = errors_deg[np.isfinite(errors_deg)].astype(np.float64)
+    if not errors.size:
+        return None
+    return AngularErrors(
+        mean=float(errors.mean()),
+        median=float(np.median(errors)),
+        p90=float(np.percentile(errors, 90)),
+        under_5=float((errors < 5).mean()),
+        under_10=float((errors < 10).mean()),
+    )

@@ -1,0 +1,38 @@
+"""What every method of photometric stereo looks like from outside."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Estimator(Protocol):
+    """Normals from observations, pixel by pixel.
+
+    name: the method's name in the registry; weights: name and SHA-256 of the weights it uses, or None.
+    device and precision: what it computes on and in, for the report.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def weights(self) -> dict[str, str] | None: ...
+    @property
+    def device(self) -> str: ...
+    @property
+    def precision(self) -> str: ...
+
+    def estimate(
+        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Unit normals (P, 3), x right, y up, z to the camera.
+
+        Args:
+            observations: (P, F) linear, already divided by the lights' intensities.
+            light_directions: (F, 3) unit vectors towards the lights.
+
+        A pixel that no light reaches has no normal; it gets (0, 0, 1), the least surprising one.
+        """
+        ...

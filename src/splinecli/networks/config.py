@@ -1,0 +1,52 @@
+"""Network configurations: everything needed to rebuild a network, frozen, stored inside its weight file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+from splinecli.errors import ModelError
+from splinecli.observation_map import MAP_SIZE
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """A SPLINE-Net.
+
+    Attributes:
+        size: "paper", the layers of the authors' networks; "compact", made for laptop cores.
+        map_size: cells along a side of the observation map.
+        width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's hidden
+            features of the compact size; the paper size has fixed layers and ignores them.
+    """
+
+    size: Literal["paper", "compact"] = "compact"
+    map_size: int = MAP_SIZE
+    width: int = 64
+    li_blocks: int = 2
+    ne_blocks: int = 3
+    head_width: int = 256
+
+    @property
+    def is_canonical(self) -> bool:
+        """Whether each pixel's lights are turned about the view axis until its Lambertian normal has azimuth zero."""
+        return self.size == "compact"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as stored in weight files and checkpoints."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
+        """Rebuild a configuration. Raises ModelError for an unknown key or value."""
+        known = {field.name: field.type for field in fields(cls)}
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
+        for name, value in values.items():
+            if name == "size":
+                if value not in ("paper", "compact"):
+                    raise ModelError(f"network size is {value!r}; expected 'paper' or 'compact'")
+            elif not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 4096:
+                raise ModelError(f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096")
+        return cls(**values)

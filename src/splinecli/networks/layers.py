@@ -1,0 +1,43 @@
+"""Blocks that the compact LI-Net and NE-Net share."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+PATCH = 4
+
+
+class ResidualBlock(nn.Module):
+    """x + conv3x3(relu(conv3x3(relu(x)))), (P, C, h, w) -> the same. Starts as the identity, so needs no norm."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        hidden = self.first(torch.relu(x))
+        out: Tensor = x + self.second(torch.relu(hidden))
+        return out
+
+
+class MapEncoder(nn.Module):
+    """Maps (P, C, w, w) -> features (P, width, w / 4, w / 4).
+
+    Every 4 x 4 patch of cells becomes one position (a space-to-depth step, where a CPU is fastest), tagged with a learned
+    embedding of where it lies: cells are light directions, so a map, unlike a photograph, is not translation invariant.
+    """
+
+    def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
+        super().__init__()
+        side = map_size // PATCH
+        self.patches = nn.Conv2d(channels * PATCH**2, width, 1)
+        self.position = nn.Parameter(torch.zeros(1, width, side, side))
+        self.blocks = nn.Sequential(*(ResidualBlock(width) for _ in range(blocks)))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        patches = nn.functional.pixel_unshuffle(maps, PATCH).contiguous(memory_format=torch.channels_last)
+        features: Tensor = self.blocks(self.patches(patches) + self.position)
+        return features

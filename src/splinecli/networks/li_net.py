@@ -1,0 +1,64 @@
+"""LI-Net, the lighting interpolation network: sparse observation map -> dense observation map."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from splinecli.networks.layers import PATCH, MapEncoder
+
+
+class PaperLINet(nn.Module):
+    """The authors' generator (Zheng et al., ICCV 2019): (P, 1, w, w) -> (P, 1, w, w) in 0..1; 8.40 M parameters.
+
+    7x7 conv to 64; two stride-2 4x4 convs to 128 and 256; six residual blocks; two transposed convs back; 7x7 conv;
+    sigmoid; instance norm between.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+
+        def normed(conv: nn.Module, width: int) -> list[nn.Module]:
+            return [conv, nn.InstanceNorm2d(width), nn.ReLU(inplace=True)]
+
+        self.layers = nn.Sequential(
+            *normed(nn.Conv2d(1, 64, 7, padding=3), 64),
+            *normed(nn.Conv2d(64, 128, 4, stride=2, padding=1), 128),
+            *normed(nn.Conv2d(128, 256, 4, stride=2, padding=1), 256),
+            *(_PaperResidualBlock(256) for _ in range(6)),
+            *normed(nn.ConvTranspose2d(256, 128, 4, stride=2, padding=1), 128),
+            *normed(nn.ConvTranspose2d(128, 64, 4, stride=2, padding=1), 64),
+            nn.Conv2d(64, 1, 7, padding=3),
+        )
+
+    def forward(self, sparse: Tensor) -> Tensor:
+        return torch.sigmoid(self.layers(sparse))
+
+
+class _PaperResidualBlock(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.InstanceNorm2d(width),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.InstanceNorm2d(width),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = x + self.layers(x)
+        return out
+
+
+class CompactLINet(nn.Module):
+    """An encoder-decoder on quarter-resolution patches: (P, C, w, w) -> (P, 1, w, w), a correction, zero at first."""
+
+    def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
+        super().__init__()
+        self.encoder = MapEncoder(channels, width, blocks, map_size)
+        self.decoder = nn.Conv2d(width, PATCH**2, 1)
+        nn.init.zeros_(self.decoder.weight)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)

@@ -1,0 +1,70 @@
+"""NE-Net, the normal estimation network: sparse and dense observation map -> normal."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from splinecli.networks.layers import MapEncoder
+
+
+class PaperNENet(nn.Module):
+    """CNN-PS (Ikehata, ECCV 2018) on `channels` maps: (P, channels, w, w) -> (P, 3), not yet of unit length.
+
+    2.65 M parameters for two channels of 32 x 32, nearly all of them in the 20480 x 128 layer.
+    """
+
+    def __init__(self, channels: int, map_size: int) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(channels, 16, 3, padding=1)
+        self.dense1 = _DenseBlock(16)
+        self.transition1 = nn.Conv2d(48, 48, 1)
+        self.dense2 = _DenseBlock(48)
+        self.transition2 = nn.Conv2d(80, 80, 1)
+        self.dropout = nn.Dropout(0.2)
+        self.hidden = nn.Linear(80 * (map_size // 2) ** 2, 128)
+        self.out = nn.Linear(128, 3)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        x = self.dense1(self.stem(maps))
+        x = self.dropout(self.transition1(torch.relu(x)))
+        x = self.dense2(nn.functional.avg_pool2d(x, 2))
+        x = self.dropout(self.transition2(torch.relu(x)))
+        out: Tensor = self.out(torch.relu(self.hidden(x.flatten(1))))
+        return out
+
+
+class _DenseBlock(nn.Module):
+    """Two 3x3 convs of 16 channels, each joined to all that came before: (P, C, ...) -> (P, C + 32, ...)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, 16, 3, padding=1)
+        self.second = nn.Conv2d(width + 16, 16, 3, padding=1)
+        self.dropout = nn.Dropout(0.2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for conv in (self.first, self.second):
+            x = torch.cat((x, self.dropout(conv(torch.relu(x)))), dim=1)
+        return x
+
+
+class CompactNENet(nn.Module):
+    """Maps (P, C, w, w) -> a correction of the Lambertian normal (P, 3), zero at first."""
+
+    def __init__(self, channels: int, width: int, blocks: int, head_width: int, map_size: int) -> None:
+        super().__init__()
+        self.encoder = MapEncoder(channels, width, blocks, map_size)
+        self.squeeze = nn.Conv2d(width, width // 2, 1)
+        side = map_size // 4
+        self.hidden = nn.Linear(width // 2 * side * side, head_width)
+        self.out = nn.Linear(head_width, 3)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        features = torch.relu(self.squeeze(torch.relu(self.encoder(maps))))
+        # Patches first, channels last: the order in memory, so that flattening copies nothing.
+        hidden = torch.relu(self.hidden(features.permute(0, 2, 3, 1).flatten(1)))
+        out: Tensor = self.out(hidden)
+        return out

@@ -1,0 +1,169 @@
+"""SPLINE-Net (Zheng et al., ICCV 2019): observations -> maps -> LI-Net -> NE-Net -> normal.
+
+The compact size differs from the paper's in four ways, all of them about learning more from each pixel:
+
+1. Canonical azimuth: each pixel's lights are turned about the view axis until its robust Lambertian normal lies over
+   the +x axis, and the estimate is turned back. Normals then come in one azimuth only.
+2. Both networks correct that Lambertian fit instead of starting from nothing: LI-Net its map, NE-Net its normal. A
+   matte pixel is right from the start.
+3. Beside the sparse map stand the cells that hold an observation, and the residual of the fit there, computed with the
+   exact light directions, which a 32 x 32 grid alone would round by up to 2 degrees.
+4. The dense map shares the sparse map's scale (its largest observation), values above 1 cut off: a highlight that no
+   light has hit does not change the scale of everything else.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.lambertian import fit_lambertian
+from splinecli.networks.li_net import CompactLINet, PaperLINet
+from splinecli.networks.ne_net import CompactNENet, PaperNENet
+from splinecli.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map
+
+RESIDUAL_LIMIT = 3.0
+
+
+class Views(NamedTuple):
+    """What the networks see of P pixels, in each pixel's own frame.
+
+    sparse, holds, residual, lambertian_map: (P, 1, w, w); lambertian_normals (P, 3); scale (P, 1), the observation that
+    the maps call 1; cosine, sine (P,): the turn from the capture's frame to the pixel's; mirrored: y flipped after it.
+    """
+
+    sparse: Tensor
+    holds: Tensor
+    residual: Tensor
+    lambertian_map: Tensor
+    lambertian_normals: Tensor
+    scale: Tensor
+    cosine: Tensor
+    sine: Tensor
+    mirrored: bool
+
+
+class SplineNet(nn.Module):
+    """LI-Net and NE-Net with everything between raw observations and normals."""
+
+    cells: Tensor
+    inside: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.li_net: nn.Module
+        self.ne_net: nn.Module
+        if config.size == "paper":
+            self.li_net = PaperLINet()
+            self.ne_net = PaperNENet(2, config.map_size)
+        else:
+            self.li_net = CompactLINet(4, config.width, config.li_blocks, config.map_size)
+            self.ne_net = CompactNENet(5, config.width, config.ne_blocks, config.head_width, config.map_size)
+        cells, inside = cell_directions(config.map_size)
+        self.register_buffer("cells", cells.view(-1, 3), persistent=False)
+        self.register_buffer("inside", inside.float()[None, None], persistent=False)
+
+    def look(
+        self,
+        observations: Tensor,
+        light_directions: Tensor,
+        valid: Tensor | None = None,
+        *,
+        turn_deg: float | Tensor = 0.0,
+        mirror: bool = False,
+    ) -> Views:
+        """Maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
+
+        Args:
+            turn_deg: a further turn of the lights about the view axis, one for all or (P,).
+            mirror: then flip y; an isotropic pixel looks the same from its mirrored lights.
+        """
+        scale = map_scale(observations, valid)
+        observed = observations / scale
+        if self.config.is_canonical:
+            scaled_normals = fit_lambertian(observed, light_directions, valid)
+        else:
+            scaled_normals = observed.new_tensor((0.0, 0.0, 1.0)).expand(len(observed), 3)
+        x, y, z = scaled_normals.unbind(-1)
+        # A fit that looks away from the camera is laid on the rim, where the closest visible normal is.
+        z = torch.maximum(z, 0.02 * torch.hypot(x, y))
+        azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
+        angle = torch.as_tensor(turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
+        cosine, sine = angle.cos(), angle.sin()
+        lights = rotate_about_view_axis(
+            light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
+        )
+        scaled_normals = rotate_about_view_axis(torch.stack((x, y, z), dim=-1), cosine, sine)
+        if mirror:
+            flip = lights.new_tensor((1.0, -1.0, 1.0))
+            lights, scaled_normals = lights * flip, scaled_normals * flip
+        albedo = scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-3)
+        predicted = (lights @ scaled_normals[..., None])[..., 0]
+        residual = ((observed - predicted) / albedo).clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)
+        maps = sparse_map(torch.stack((observed, residual), dim=-1), lights, valid, size=self.config.map_size)
+        side = self.config.map_size
+        lambertian_map = (scaled_normals @ self.cells.T).clamp(0, 1).view(-1, 1, side, side)
+        return Views(
+            maps.values[:, :1],
+            maps.holds,
+            maps.values[:, 1:],
+            lambertian_map,
+            scaled_normals / scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-12),
+            scale,
+            cosine,
+            sine,
+            mirror,
+        )
+
+    def interpolate(self, views: Views) -> Tensor:
+        """LI-Net: the dense maps (P, 1, w, w) of what was seen, zero outside the unit disc."""
+        if self.config.size == "paper":
+            dense: Tensor = self.li_net(views.sparse)
+        else:
+            inputs = torch.cat((views.sparse, views.holds, views.residual, views.lambertian_map), dim=1)
+            dense = views.lambertian_map + self.li_net(inputs)
+        return dense * self.inside
+
+    def estimate(self, views: Views, dense: Tensor) -> Tensor:
+        """NE-Net: unit normals (P, 3) in the pixels' frames."""
+        if self.config.size == "paper":
+            raw: Tensor = self.ne_net(torch.cat((views.sparse, dense), dim=1))
+        else:
+            inputs = torch.cat(
+                (views.sparse, views.holds, views.residual, views.lambertian_map, dense.to(views.sparse.dtype)), dim=1
+            )
+            raw = views.lambertian_normals + self.ne_net(inputs)
+        return nn.functional.normalize(raw.float(), dim=-1)
+
+    def forward(
+        self,
+        observations: Tensor,
+        light_directions: Tensor,
+        valid: Tensor | None = None,
+        *,
+        turn_deg: float | Tensor = 0.0,
+        mirror: bool = False,
+    ) -> Tensor:
+        """Unit normals (P, 3) in the capture's frame; arguments as in `look`."""
+        # Only the convolutions may run in bfloat16: the fit and the maps' geometry need every digit.
+        with torch.autocast(observations.device.type, enabled=False):
+            views = self.look(observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror)
+        return to_capture_frame(self.estimate(views, self.interpolate(views)), views)
+
+
+def to_capture_frame(normals: Tensor, views: Views) -> Tensor:
+    """Turn normals (P, 3) from the pixels' frames back into the capture's."""
+    if views.mirrored:
+        normals = normals * normals.new_tensor((1.0, -1.0, 1.0))
+    return rotate_about_view_axis(normals, views.cosine, -views.sine)
+
+
+def to_pixel_frame(vectors: Tensor, views: Views) -> Tensor:
+    """Turn vectors (P, 3) from the capture's frame into the pixels'."""
+    turned = rotate_about_view_axis(vectors, views.cosine, views.sine)
+    return turned * turned.new_tensor((1.0, -1.0, 1.0)) if views.mirrored else turned

@@ -1,0 +1,129 @@
+"""Weight files: safetensors that carry their network's configuration and a checksum. Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from splinecli.errors import ModelError
+from splinecli.files import write_bytes
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.spline_net import SplineNet
+
+FORMAT = "splinecli-weights-1"
+SHIPPED = resources.files("splinecli") / "assets"
+
+
+@dataclass(frozen=True)
+class LoadedNetwork:
+    """A network ready to estimate (float32, evaluation mode), the name it was asked by and its file's SHA-256."""
+
+    network: SplineNet
+    name: str
+    sha256: str
+
+
+def tensors_sha256(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and bytes, in the order of the names."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def save_weights(network: SplineNet, path: Path) -> None:
+    """Write the network's parameters as float16 with its configuration. Raises OutputError."""
+    tensors = {
+        name: tensor.detach().cpu().half().clone(memory_format=torch.contiguous_format)
+        for name, tensor in network.state_dict().items()
+    }
+    metadata = {
+        "format": FORMAT,
+        "config": json.dumps(network.config.to_dict(), sort_keys=True),
+        "tensors_sha256": tensors_sha256(tensors),
+    }
+    write_bytes(path, save(tensors, metadata))
+
+
+def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of one of splinecli's safetensors files, checked against the checksum inside.
+
+    Raises ModelError where the file is missing, is no such file, or is damaged; `hint` says where a right one is had.
+    """
+    if not path.is_file():
+        raise ModelError("no such file", path=path, hint=hint)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+    except (SafetensorError, OSError) as error:
+        raise ModelError(f"not a safetensors file, or cut short ({error})", path=path, hint=hint) from error
+    found = metadata.get("format", "no format entry")
+    if found != expected_format:
+        raise ModelError(f"not splinecli's: found {found}, expected {expected_format}", path=path, hint=hint)
+    if metadata.get("tensors_sha256") != tensors_sha256(tensors):
+        raise ModelError("damaged: the tensors do not match the checksum in the file", path=path, hint=hint)
+    return tensors, metadata
+
+
+def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) -> None:
+    """Fill the network; every tensor must be there, of its shape, and no other. Raises ModelError."""
+    try:
+        network.load_state_dict(tensors, strict=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ModelError(f"the tensors do not fit the configuration ({reason})", path=path) from error
+
+
+def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
+    """Rebuild the network of a weight file. Raises ModelError."""
+    hint = f"--weights takes a file written by 'splinecli train' or one of the names {', '.join(shipped_names())}"
+    tensors, metadata = read_tensors(path, FORMAT, hint)
+    try:
+        values = json.loads(metadata.get("config", ""))
+    except json.JSONDecodeError as error:
+        raise ModelError("the configuration in the file is not JSON", path=path) from error
+    network = SplineNet(NetworkConfig.from_dict(values))
+    load_strictly(network, tensors, path)
+    network.eval().to(memory_format=torch.channels_last)
+    return LoadedNetwork(network, name or path.stem, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def shipped_names() -> list[str]:
+    """Names of the weights that come in the package."""
+    return sorted(manifest())
+
+
+def manifest() -> dict[str, dict[str, str]]:
+    """name -> {file, sha256, method, description} of the shipped weights."""
+    entries: dict[str, dict[str, str]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
+    return entries
+
+
+def resolve_weights(name_or_file: str) -> LoadedNetwork:
+    """Load shipped weights by name, or a file by path. Raises ModelError."""
+    entry = manifest().get(name_or_file)
+    if entry is None:
+        path = Path(name_or_file)
+        if path.suffix != ".safetensors" and not path.exists():
+            names = ", ".join(shipped_names())
+            raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")
+        return load_weights(path)
+    with resources.as_file(SHIPPED / entry["file"]) as path:
+        loaded = load_weights(path, name=name_or_file)
+    if loaded.sha256 != entry["sha256"]:
+        raise ModelError(
+            f"the shipped weights {name_or_file!r} were changed: their SHA-256 is not the manifest's",
+            hint="Reinstall splinecli",
+        )
+    return loaded

@@ -1,0 +1,185 @@
+"""The online pixel generator: pixels made one by one, in batches, on the device of its random generator.
+
+Each pixel is a scene of its own (normal, material, neighbouring walls, ambient light) that can be asked for its
+radiance under any light: under a random rig for the sparse observations, under every cell's direction for the complete
+dense map. After PX-Net (Logothetis et al., ICCV 2021), which trains a per-pixel network without rendered objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splinecli.observation_map import MAP_SIZE, cell_directions, rotate_about_view_axis
+from splinecli.synthesis.effects import (
+    Wall,
+    add_sensor_noise,
+    disturb_light_directions,
+    disturb_light_strengths,
+    dot,
+    draw_ambient,
+    draw_exposure,
+    draw_wall,
+    quantise,
+)
+from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.synthesis.principled import Material, draw_material, shade
+
+
+@dataclass(frozen=True)
+class PixelGeneratorConfig:
+    """Switches and shares of the pixel generator (a share of 0 switches an effect off)."""
+
+    min_lights: int = 4
+    max_lights: int = 96
+    usual_lights: int = 10
+    cast_shadows: bool = True
+    interreflections: bool = True
+    wall_share: float = 0.45
+    second_wall_share: float = 0.2
+    ambient_share: float = 0.5
+    mixed_share: float = 0.2
+    light_direction_error_share: float = 0.5
+    light_strength_error_share: float = 0.5
+    saturated_share: float = 0.08
+    sensor_noise: bool = True
+    eight_bit_share: float = 0.15
+
+
+@dataclass(frozen=True)
+class PixelScene:
+    """P pixels seen from +z. `mixed` holds a second surface for the first M pixels (edges, blends of materials)."""
+
+    normals: Tensor
+    material: Material
+    walls: tuple[Wall, ...]
+    ambient: Tensor
+    mixed: PixelScene | None = None
+    mixed_weight: Tensor | None = None
+
+    def radiance(self, directions: Tensor) -> Tensor:
+        """Radiance (P, D) under unit lights from directions (D, 3) or (P, D, 3); matte white facing its light is 1."""
+        visible = torch.ones((), device=self.normals.device)
+        returned = self.ambient
+        for wall in self.walls:
+            visible = visible * wall.visibility(directions)
+            returned = returned + wall.reflected(directions)
+        normal_z = self.normals[:, 2:]
+        direct = shade(self.material, dot(self.normals, directions), normal_z, directions[..., 2])
+        material = self.material
+        # Light from a wide angle meets the diffuse albedo and, averaged over the lobe, the mirror reflectance.
+        albedo = material.base + 0.08 * material.specular * (1 - material.metallic)
+        total = direct * visible + albedo * returned
+        if self.mixed is not None and self.mixed_weight is not None:
+            count = len(self.mixed_weight)
+            of_mixed = directions if directions.ndim == 2 else directions[:count]
+            second = self.mixed.radiance(of_mixed)
+            blended = torch.lerp(total[:count], second, self.mixed_weight)
+            total = torch.cat((blended, total[count:]))
+        return total
+
+    def rotate(self, cosine: Tensor, sine: Tensor) -> PixelScene:
+        """Each pixel's scene turned about the view axis by an angle of its own; cosine and sine (P,)."""
+        mixed = self.mixed
+        if mixed is not None:
+            mixed = mixed.rotate(cosine[: len(mixed.normals)], sine[: len(mixed.normals)])
+        return PixelScene(
+            rotate_about_view_axis(self.normals, cosine, sine),
+            self.material,
+            tuple(wall.rotate(cosine, sine) for wall in self.walls),
+            self.ambient,
+            mixed,
+            self.mixed_weight,
+        )
+
+    def dense_map(self, size: int = MAP_SIZE) -> Tensor:
+        """The complete map (P, 1, size, size): the radiance at every cell's centre, zero outside the unit disc."""
+        directions, inside = cell_directions(size)
+        directions, inside = directions.to(self.normals.device), inside.to(self.normals.device)
+        dense = self.normals.new_zeros(len(self.normals), 1, size, size)
+        dense[:, 0, inside] = self.radiance(directions[inside])
+        return dense
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """What a capture would hold of P pixels: observations (P, F), light_directions (P, F, 3), valid (P, F) bool.
+
+    `scene` is the truth behind them and `exposure` (P, 1) the factor from its radiance to the observations.
+    """
+
+    observations: Tensor
+    light_directions: Tensor
+    valid: Tensor
+    scene: PixelScene
+    exposure: Tensor
+
+
+def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
+    """Unit normals (P, 3) towards the camera, uniform by projected area: as often as a sphere's pixels show them."""
+    radius = 0.997 * torch.sqrt(torch.rand(pixels, generator=generator, device=generator.device))
+    azimuth = 2 * torch.pi * torch.rand(pixels, generator=generator, device=generator.device)
+    return torch.stack((radius * azimuth.cos(), radius * azimuth.sin(), (1 - radius**2).sqrt()), dim=-1)
+
+
+def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tensor:
+    """Normals across an edge: each turned by a random amount (Gaussian, sigma 0.5), still towards the camera."""
+    moved = normals + 0.5 * torch.randn(normals.shape, generator=generator, device=normals.device)
+    moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
+    return torch.nn.functional.normalize(moved, dim=1)
+
+
+def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
+    """Random pixels. Of the mixed ones half lie on an edge (a second normal), half blend two materials."""
+    normals = draw_visible_normals(pixels, generator)
+    material = draw_material(pixels, generator)
+    walls = tuple(
+        draw_wall(
+            normals, share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
+        )
+        for share in (config.wall_share, config.second_wall_share)
+        if share > 0 and (config.cast_shadows or config.interreflections)
+    )
+    ambient = draw_ambient(pixels, config.ambient_share, generator)
+    count = round(config.mixed_share * pixels)
+    if not count:
+        return PixelScene(normals, material, walls, ambient)
+    # Every second mixed pixel is an edge; its second surface has the same material, the others the same normal.
+    edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
+    other = draw_material(count, generator)
+    own = material.take(slice(count))
+    second = Material(*(torch.where(edge, a, b) for a, b in zip(vars(own).values(), vars(other).values(), strict=True)))
+    second_normals = torch.where(edge, draw_neighbour_normals(normals[:count], generator), normals[:count])
+    mixed = PixelScene(second_normals, second, (), ambient[:count])
+    weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(edge, 0.4, 0.7)
+    return PixelScene(normals, material, walls, ambient, mixed, weight)
+
+
+class PixelGenerator:
+    """Draws batches of pixels; reproducible from the seed of `generator`, on whose device everything is made."""
+
+    def __init__(self, config: PixelGeneratorConfig, generator: torch.Generator) -> None:
+        self.config = config
+        self.generator = generator
+
+    def draw(self, pixels: int) -> PixelBatch:
+        """A batch of P pixels, each with lights of its own number and spread; F is the largest number drawn."""
+        config, generator = self.config, self.generator
+        scene = draw_scene(pixels, config, generator)
+        counts = draw_light_counts(
+            pixels, config.min_lights, config.max_lights, config.usual_lights, generator
+        )
+        true_directions = draw_light_directions(pixels, int(counts.max()), generator)
+        valid = torch.arange(true_directions.shape[1], device=counts.device) < counts[:, None]
+        radiance = scene.radiance(true_directions) * valid
+        exposure = draw_exposure(radiance, config.saturated_share, generator)
+        observed = disturb_light_strengths(radiance * exposure, config.light_strength_error_share, generator)
+        observed = observed.clamp(max=1)
+        if config.sensor_noise:
+            observed = add_sensor_noise(observed, generator)
+            observed = quantise(observed, config.eight_bit_share, generator)
+        calibrated = disturb_light_directions(true_directions, config.light_direction_error_share, generator)
+        return PixelBatch(observed * valid, calibrated, valid, scene, exposure)
+

@@ -1,0 +1,104 @@
+"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for one pixel seen from +z.
+
+Isotropic and gray: a pixel's observation is the mean of its colour channels and the model is all but linear in the
+base colour, so one channel is enough. Every parameter is a tensor (P, 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Material:
+    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (`specular` may reach 4, as in CyclesPS)."""
+
+    base: Tensor
+    metallic: Tensor
+    specular: Tensor
+    roughness: Tensor
+    sheen: Tensor
+    clearcoat: Tensor
+    clearcoat_gloss: Tensor
+
+    def take(self, pixels: slice | Tensor) -> Material:
+        """The materials of some of the pixels."""
+        return Material(*(getattr(self, field.name)[pixels] for field in fields(self)))
+
+
+def draw_material(pixels: int, generator: torch.Generator) -> Material:
+    """Random materials. Classes: 35 % matte, 30 % specular, 25 % metallic, 10 % half metallic.
+
+    base U(0.05, 1); roughness U(0.05, 1), of metals U(0.2, 0.9); specular U(0, 1), of the specular class U(0, 1) with
+    half of them U(1, 4); metallic 0, 1 or U(0, 1); sheen U(0, 1) on a fifth of the dielectrics; clearcoat U(0, 1) with
+    gloss U(0, 1) on 15 % of all.
+    """
+    device = generator.device
+
+    def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
+        return torch.rand(pixels, 1, generator=generator, device=device) * (high - low) + low
+
+    kind, split = uniform(), uniform()
+    metal = (kind >= 0.65) & (kind < 0.9)
+    blend = kind >= 0.9
+    shiny = (kind >= 0.35) & ~metal & ~blend
+    zero, one = torch.zeros_like(kind), torch.ones_like(kind)
+    return Material(
+        base=uniform(0.05, 1.0),
+        metallic=torch.where(metal, one, torch.where(blend, uniform(), zero)),
+        specular=torch.where(shiny & (split < 0.5), uniform(1.0, 4.0), uniform()),
+        roughness=torch.where(metal | blend, uniform(0.2, 0.9), uniform(0.05, 1.0)),
+        sheen=torch.where((uniform() < 0.2) & ~metal, uniform(), zero),
+        clearcoat=torch.where(uniform() < 0.15, uniform(), zero),
+        clearcoat_gloss=uniform(),
+    )
+
+
+def schlick_weight(cosine: Tensor) -> Tensor:
+    """(1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel approximation."""
+    complement = (1 - cosine).clamp(0, 1)
+    square = complement * complement
+    return square * square * complement
+
+
+def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+    """Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 - a^2)(n.x)^2))."""
+    return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())
+
+
+def shade(material: Material, n_dot_l: Tensor, n_dot_v: Tensor, light_z: Tensor) -> Tensor:
+    """pi times the reflected radiance, BRDF times max(n.l, 0), under unit light (P, D).
+
+    Args:
+        n_dot_l: (P, D) cosines of normal and light, may be negative (attached shadow: zero radiance).
+        n_dot_v: (P, 1) cosines of normal and viewing direction (0, 0, 1), positive.
+        light_z: (D) or (P, D), the lights' z.
+    """
+    lit = n_dot_l.clamp(min=0)
+    l_dot_h = ((1 + light_z) / 2).sqrt()
+    n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
+    n_dot_h_squared = n_dot_h * n_dot_h
+    fresnel = schlick_weight(l_dot_h)
+
+    grazing_90 = 2 * material.roughness * l_dot_h * l_dot_h - 0.5
+    diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
+    diffuse = (1 - material.metallic) * (material.base * diffuse + material.sheen * fresnel)
+
+    alpha_squared = (material.roughness**4).clamp(min=1e-4)
+    f0 = (0.08 * material.specular * (1 - material.metallic) + material.base * material.metallic).clamp(max=1)
+    spread = n_dot_h_squared * (alpha_squared - 1) + 1
+    specular = alpha_squared * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared) / (spread * spread)
+    radiance = diffuse + specular * (f0 + (1 - f0) * fresnel)
+
+    if bool((material.clearcoat > 0).any()):
+        coat_alpha_squared = (0.1 + (0.001 - 0.1) * material.clearcoat_gloss) ** 2
+        coat = (coat_alpha_squared - 1) / (coat_alpha_squared.log() * (1 + (coat_alpha_squared - 1) * n_dot_h_squared))
+        quarter = torch.full_like(n_dot_v, 0.25**2)
+        coat = coat * smith_ggx(n_dot_v, quarter) * smith_ggx(lit, quarter) * (0.04 + 0.96 * fresnel)
+        radiance = radiance + 0.25 * material.clearcoat * coat
+    return radiance * lit
+
+

@@ -1,0 +1,94 @@
+"""Checkpoints: one safetensors file that rebuilds a run exactly where it stood."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from splinecli.errors import ModelError
+from splinecli.files import write_bytes
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import load_strictly, read_tensors, tensors_sha256
+from splinecli.training.config import TrainingConfig
+
+FORMAT = "splinecli-checkpoint-1"
+
+
+@dataclass
+class Clock:
+    """How far a run has come."""
+
+    step: int = 0
+    pixels: int = 0
+    seconds: float = 0.0
+
+
+def save_checkpoint(
+    path: Path,
+    config: TrainingConfig,
+    network: SplineNet,
+    average: SplineNet,
+    optimizer: torch.optim.Optimizer,
+    generator: torch.Generator,
+    clock: Clock,
+) -> None:
+    """Write the whole state of a run. Raises OutputError."""
+    tensors: dict[str, Tensor] = {"generator": generator.get_state()}
+    for prefix, module in (("network", network), ("average", average)):
+        tensors |= {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
+    for index, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
+    plain = {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+    }
+    metadata = {
+        "format": FORMAT,
+        "config": json.dumps(config.to_dict()),
+        "clock": json.dumps(asdict(clock)),
+        "tensors_sha256": tensors_sha256(plain),
+    }
+    write_bytes(path, save(plain, metadata))
+
+
+def read_checkpoint_config(path: Path) -> TrainingConfig:
+    """The configuration of the run behind a checkpoint. Raises ModelError."""
+    _, metadata = _read(path)
+    return TrainingConfig.from_dict(json.loads(metadata["config"]))
+
+
+def load_checkpoint(
+    path: Path,
+    network: SplineNet,
+    average: SplineNet,
+    optimizer: torch.optim.Optimizer,
+    generator: torch.Generator,
+) -> Clock:
+    """Put a run's state back. Raises ModelError where the file does not fit the run."""
+    tensors, metadata = _read(path)
+    groups: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimizer": {}}
+    for name, tensor in tensors.items():
+        prefix, _, rest = name.partition(".")
+        if prefix in groups:
+            groups[prefix][rest] = tensor
+    load_strictly(network, groups["network"], path)
+    load_strictly(average, groups["average"], path)
+    states: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in groups["optimizer"].items():
+        index, _, key = name.partition(".")
+        states.setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+    generator.set_state(tensors["generator"])
+    return Clock(**json.loads(metadata["clock"]))
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    tensors, metadata = read_tensors(path, FORMAT, "Start a run with 'splinecli train -o RUN' first")
+    for key in ("config", "clock"):
+        if key not in metadata:
+            raise ModelError(f"the checkpoint holds no {key}", path=path)
+    return tensors, metadata

@@ -1,0 +1,245 @@
+"""Photographs and masks: values exactly as written, and damaged files refused without a word on stderr."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from splinecli.capture import read_image, read_mask
+from splinecli.errors import InputError
+
+WriteImage = Callable[..., Path]
+
+RNG = np.random.default_rng(2)
+RGB16 = RNG.integers(0, 65536, (7, 9, 3)).astype(np.uint16)
+RGB8 = (RGB16 >> 8).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "A.TIFF"])
+@pytest.mark.parametrize(
+    "stored", [RGB16, RGB8, RGB16[..., 0], RGB8[..., 0]], ids=["rgb16", "rgb8", "gray16", "gray8"]
+)
+def test_integers_are_scaled_by_their_full_range(
+    write_image: WriteImage, name: str, stored: NDArray[np.uint16]
+) -> None:
+    image = read_image(write_image(name, stored))
+    assert image.dtype == np.float32
+    full = np.float32(np.iinfo(stored.dtype).max)
+    np.testing.assert_array_equal(image, stored.reshape(7, 9, -1).astype(np.float32) / full)
+
+
+def test_16_bits_are_not_cut_to_8(write_image: WriteImage) -> None:
+    image = read_image(write_image("a.png", np.array([[0, 1, 2, 65535]], np.uint16)))
+    np.testing.assert_allclose(image.ravel() * 65535, [0, 1, 2, 65535], rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_floating_point_tiff_is_kept(tmp_path: Path, dtype: type, channels: int) -> None:
+    stored = RNG.uniform(0, 5, (7, 9, channels)).astype(dtype)
+    photometric = "rgb" if channels == 3 else "minisblack"
+    tifffile.imwrite(tmp_path / "a.tif", stored.squeeze(), photometric=photometric)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), stored.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": "zlib"},
+        {"compression": "zlib", "predictor": True},
+        {"tile": (16, 16)},
+        {"bigtiff": True},
+    ],
+    ids=["deflate", "predictor", "tiles", "bigtiff"],
+)
+def test_kinds_of_tiff(tmp_path: Path, options: dict[str, object]) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", RGB16, photometric="rgb", **options)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), RGB16 / np.float32(65535))
+
+
+def test_planar_and_white_is_zero_tiff(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", np.moveaxis(RGB16, 2, 0), photometric="rgb", planarconfig="separate")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), RGB16 / np.float32(65535))
+    tifffile.imwrite(tmp_path / "w.tif", 255 - RGB8[..., 0], photometric="miniswhite")
+    np.testing.assert_array_equal(read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_alpha_is_dropped(tmp_path: Path, name: str) -> None:
+    bgra = np.dstack([RGB16[..., ::-1], RNG.integers(0, 65536, (7, 9)).astype(np.uint16)])
+    cv2.imwrite(str(tmp_path / name), bgra)
+    np.testing.assert_array_equal(read_image(tmp_path / name), RGB16 / np.float32(65535))
+
+
+def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
+    stored = np.zeros((16, 32, 3), np.uint8)
+    stored[:, :16, 0] = 255  # red on the left
+    stored[:, 16:, 2] = 255  # blue on the right
+    path = write_image("a.jpg", stored)
+    data = path.read_bytes()
+    # An EXIF segment that asks for a turn by 90 degrees: one entry, tag 0x112, orientation 6.
+    exif = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, 6) + b"\0" * 4
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
+    assert cv2.imread(str(path)).shape == (32, 16, 3)  # the segment works: by default OpenCV turns the image
+    image = read_image(path)
+    assert image.shape == (16, 32, 3)
+    apart = np.r_[:14, 18:32]  # the chroma is subsampled, so the colours mix where they meet
+    np.testing.assert_allclose(image[:, apart], stored[:, apart] / 255, atol=0.05)  # JPEG's loss
+
+
+def test_the_format_is_told_by_content(write_image: WriteImage) -> None:
+    path = write_image("a.png", RGB8)
+    np.testing.assert_array_equal(read_image(path.rename(path.with_suffix(".tif"))), RGB8 / np.float32(255))
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95, 0.999])
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "deflate.tif", "lzw.tif"])
+def test_truncated_images(
+    tmp_path: Path, write_image: WriteImage, capfd: pytest.CaptureFixture[str], name: str, share: float
+) -> None:
+    large = RNG.integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    path = tmp_path / name
+    if name in ("a.tif", "deflate.tif"):
+        tifffile.imwrite(path, large, compression="zlib" if name == "deflate.tif" else None)
+    else:
+        write_image(name, large)  # OpenCV's TIFF is LZW
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(
+        InputError, match=r"is (truncated|damaged and cannot be read)\. Copy or export it again\."
+    ) as caught:
+        read_image(path)
+    assert caught.value.path == path
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["a.png", "deflate.tif"])
+def test_damaged_images(
+    tmp_path: Path, write_image: WriteImage, capfd: pytest.CaptureFixture[str], name: str
+) -> None:
+    path = tmp_path / name
+    if name == "a.png":
+        write_image(name, RGB16)
+    else:
+        tifffile.imwrite(path, RGB16, compression="zlib")
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 30] = bytes(30)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="is damaged"):
+        read_image(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def test_png_with_too_few_pixels_in_whole_chunks(
+    write_image: WriteImage, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = write_image("a.png", RGB16)
+    header = path.read_bytes()[:33]
+    path.write_bytes(header + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b""))
+    with pytest.raises(InputError, match="the image is damaged and cannot be read"):
+        read_image(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_c_library_is_silent_and_gamma_is_not_applied(
+    write_image: WriteImage, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = write_image("a.png", RGB16)
+    data = path.read_bytes()
+    bad_profile = chunk(b"gAMA", struct.pack(">I", 45455)) + chunk(
+        b"iCCP", b"x\0\0" + zlib.compress(b"no profile")
+    )
+    path.write_bytes(data[:33] + bad_profile + data[33:])
+    np.testing.assert_array_equal(read_image(path), RGB16 / np.float32(65535))
+    assert capfd.readouterr() == ("", "")
+    cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert "iCCP" in capfd.readouterr().err  # libpng does complain of this file when nobody holds its mouth
+
+
+@pytest.mark.parametrize(
+    ("stored", "message"),
+    [
+        ([[1, np.nan]], "found a value that is not finite (NaN or infinity), expected a photograph."),
+        ([[1, np.inf]], "found a value that is not finite (NaN or infinity), expected a photograph."),
+        (
+            [[1, -0.5]],
+            "found the negative value -0.5, expected a photograph."
+            " Set values below zero, such as noise after a dark frame was taken off, to zero.",
+        ),
+    ],
+)
+def test_values_no_photograph_has(tmp_path: Path, stored: list[list[float]], message: str) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.array(stored, np.float32))
+    with pytest.raises(InputError) as caught:
+        read_image(path)
+    assert str(caught.value) == f"{path}: {message}"
+
+
+def test_files_that_are_no_such_image(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with pytest.raises(InputError, match="the file does not exist"):
+        read_image(path)
+    with pytest.raises(InputError, match="found a folder, expected an image"):
+        read_image(tmp_path)
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="the file is empty"):
+        read_image(path)
+    path.write_bytes(b"P5 1 1 255\n0")
+    with pytest.raises(InputError, match="found neither PNG, TIFF nor JPEG"):
+        read_image(path)
+    path.write_bytes(b"II*\0\x08\0\0\0")
+    with pytest.raises(InputError, match="the TIFF is damaged and cannot be read"):
+        read_image(path)
+    tifffile.imwrite(path, RGB16.astype(np.int32), photometric="rgb")
+    with pytest.raises(InputError, match="found int32 pixels, expected 8-bit, 16-bit or floating-point ones"):
+        read_image(path)
+    tifffile.imwrite(path, RGB8[..., 0], photometric="palette", colormap=np.zeros((3, 256), np.uint16))
+    with pytest.raises(InputError, match="colour model PALETTE, expected gray or RGB"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("stored", "expected"),
+    [
+        (np.array([[0, 1], [1, 0]], np.uint8), [[False, True], [True, False]]),
+        (np.array([[0, 255], [127, 128]], np.uint8), [[False, True], [False, True]]),
+        (np.array([[0, 65535]], np.uint16), [[False, True]]),
+        (np.array([[[0, 0, 200], [90, 90, 90]]], np.uint8), [[True, False]]),
+    ],
+)
+def test_mask(write_image: WriteImage, stored: NDArray[np.uint8], expected: list[list[bool]]) -> None:
+    mask = read_mask(write_image("mask.png", stored))
+    assert mask.dtype == np.bool_
+    np.testing.assert_array_equal(mask, expected)
+
+
+def test_bilevel_tiff_mask(tmp_path: Path) -> None:
+    mask = RGB8[..., 0] > 99
+    tifffile.imwrite(tmp_path / "mask.tif", mask, photometric="minisblack")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.tif"), mask)
+    # tifffile's own choice for bool is that True is black: then the picture is what a viewer shows, too.
+    tifffile.imwrite(tmp_path / "mask.tif", mask, photometric="miniswhite")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.tif"), ~mask)
+
+
+def test_empty_mask(write_image: WriteImage) -> None:
+    path = write_image("mask.png", np.zeros((3, 3), np.uint8))
+    with pytest.raises(InputError) as caught:
+        read_mask(path)
+    assert str(caught.value) == (
+        f"{path}: the mask is empty: every pixel is zero. Paint the object white, or give no mask."
+    )

@@ -1,0 +1,194 @@
+"""Which files of a folder are taken for what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from splinecli.capture import find_capture_files, find_captures
+from splinecli.errors import InputError
+
+
+def fill(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return folder
+
+
+def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
+    folder = fill(
+        tmp_path / "vase",
+        *(
+            "img10.png",
+            "img2.PNG",
+            "img1.png",
+            "Img3.tif",
+            "img04.jpeg",
+            "notes.txt",
+            "._img1.png",
+            "img5.exr",
+        ),
+        *(
+            "lights.txt",
+            "light_intensities.txt",
+            "Mask.png",
+            "normals_gt.npy",
+            "normal_gt.png",
+            "sub/img6.png",
+        ),
+        *("normals.png", "error_map.png"),
+    )
+    files = find_capture_files(folder)
+    assert [path.name for path in files.images] == [
+        "img1.png",
+        "img2.PNG",
+        "Img3.tif",
+        "img04.jpeg",
+        "img10.png",
+    ]
+    assert (files.name, files.folder) == ("vase", folder)
+    assert files.light_directions == folder / "lights.txt"
+    assert files.light_intensities == folder / "light_intensities.txt"
+    assert files.mask == folder / "Mask.png"
+    assert files.ground_truth == folder / "normals_gt.npy"
+
+
+def test_plain_folder_with_nothing_but_images_and_lights(tmp_path: Path) -> None:
+    files = find_capture_files(fill(tmp_path, "a.png", "b.png", "light_directions.txt"))
+    assert (files.light_intensities, files.mask, files.ground_truth) == (None, None, None)
+
+
+def test_plain_folder_in_the_order_of_filenames_txt(tmp_path: Path) -> None:
+    fill(tmp_path, "a.png", "b.png", "c.png", "lights.txt")
+    (tmp_path / "filenames.txt").write_text("c.png\r\n\r\na.png\r\n", encoding="utf-8-sig")
+    assert [path.name for path in find_capture_files(tmp_path).images] == ["c.png", "a.png"]
+
+
+def test_diligent(tmp_path: Path) -> None:
+    fill(
+        tmp_path,
+        "001.png",
+        "002.png",
+        "light_directions.txt",
+        "light_intensities.txt",
+        "mask.png",
+        "normal.txt",
+    )
+    (tmp_path / "filenames.txt").write_text("002.png\n001.png\n")
+    files = find_capture_files(tmp_path)
+    assert files.images == (tmp_path / "002.png", tmp_path / "001.png")
+    assert files.mask == tmp_path / "mask.png"
+    assert files.ground_truth == tmp_path / "normal.txt"
+    fill(tmp_path, "Normal_gt.mat")
+    assert find_capture_files(tmp_path).ground_truth == tmp_path / "Normal_gt.mat"
+
+
+def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
+    folder = fill(
+        tmp_path / "vase",
+        "a.png",
+        "b.png",
+        "outline.png",
+        "gt.tif",
+        "lights.txt",
+        "mask.png",
+        "normal_gt.npy",
+    )
+    other = fill(tmp_path, "other.txt", "strengths.txt")
+    files = find_capture_files(
+        folder,
+        lights=other / "other.txt",
+        intensities=other / "strengths.txt",
+        mask=folder / "outline.png",
+        ground_truth=str(folder / "gt.tif"),
+    )
+    assert [path.name for path in files.images] == ["a.png", "b.png"]
+    assert files.light_directions == other / "other.txt"
+    assert files.light_intensities == other / "strengths.txt"
+    assert files.mask == folder / "outline.png"
+    assert files.ground_truth == folder / "gt.tif"
+
+
+@pytest.mark.parametrize("way", ["vase", "vase/", "vase/.", "vase/../vase", "vase/inner/.."])
+def test_the_name_is_the_folder_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    fill(tmp_path / "vase", "a.png", "lights.txt", "inner/x")
+    monkeypatch.chdir(tmp_path)
+    assert find_capture_files(way).name == "vase"
+
+
+def test_the_name_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(fill(tmp_path / "vase", "a.png", "lights.txt"))
+    assert find_capture_files(".").name == "vase"
+
+
+def test_folders_that_are_no_capture(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere: the folder does not exist\."):
+        find_capture_files(tmp_path / "nowhere")
+    fill(tmp_path, "file", "empty/notes.txt", "dark/a.png", "dark/b.png")
+    with pytest.raises(InputError, match=r"found a file, expected a folder of images\."):
+        find_capture_files(tmp_path / "file")
+    with pytest.raises(InputError) as caught:
+        find_capture_files(tmp_path / "empty")
+    assert str(caught.value) == (
+        f"{tmp_path / 'empty'}: the folder holds no images. PNG, TIFF and JPEG files count as images."
+    )
+    with pytest.raises(InputError) as caught:
+        find_capture_files(tmp_path / "dark")
+    assert str(caught.value) == (
+        f"{tmp_path / 'dark'}: the folder holds 2 images but no light file"
+        " (light_directions.txt or lights.txt)."
+        " Pass --lights FILE, with one line x y z for each image."
+    )
+    assert (
+        find_capture_files(tmp_path / "dark", lights=tmp_path / "file").light_directions == tmp_path / "file"
+    )
+    with pytest.raises(InputError, match=r"none\.png: the file does not exist\."):
+        find_capture_files(tmp_path / "dark", lights=tmp_path / "file", mask=tmp_path / "none.png")
+    with pytest.raises(InputError, match=r"found a folder, expected a file\."):
+        find_capture_files(tmp_path / "dark", lights=tmp_path)
+
+
+@pytest.mark.parametrize("lights", ["lights.txt", "light_directions.txt"])
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("a.png\n\nb.png\n", 3, 'the image "b.png" does not exist. Correct the name or remove the line.'),
+        ("x" * 300, 1, f'the image "{"x" * 300}" does not exist. Correct the name or remove the line.'),
+        ("a.png\na.png\n", 2, 'the image "a.png" is also on line 1.'),
+        ("\n\n", None, "the list names no images."),
+    ],
+)
+def test_wrong_filenames_txt(tmp_path: Path, lights: str, text: str, line: int | None, message: str) -> None:
+    fill(tmp_path, "a.png", lights)
+    path = tmp_path / "filenames.txt"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        find_capture_files(tmp_path)
+    assert str(caught.value) == (f"{path}: " if line is None else f"{path}:{line}: ") + message
+
+
+def test_find_captures(tmp_path: Path) -> None:
+    fill(tmp_path / "set", "o10/a.png", "o10/lights.txt", "o2/a.png", "o2/light_directions.txt", "o3/a.png")
+    fill(tmp_path / "set", "o4/lights.txt", "o5/lights.txt", "o5/filenames.txt", "readme.txt", "lights.txt")
+    assert [path.name for path in find_captures(tmp_path / "set")] == ["o2", "o5", "o10"]
+    assert find_captures(tmp_path / "set/o2") == [tmp_path / "set/o2"]
+
+
+def test_find_captures_finds_none(tmp_path: Path) -> None:
+    fill(tmp_path, "set/o1/a.png", "set/o1/lights.txt", "empty/notes.txt")
+    message = (
+        "found no capture, expected folders of images with a light file (light_directions.txt or lights.txt)."
+    )
+    with pytest.raises(InputError) as caught:
+        find_captures(tmp_path)
+    assert str(caught.value) == (
+        f"{tmp_path}: {message} There are captures in {tmp_path / 'set'}: give that folder."
+    )
+    with pytest.raises(InputError) as caught:
+        find_captures(tmp_path / "empty")
+    assert str(caught.value) == f"{tmp_path / 'empty'}: {message}"
+    with pytest.raises(InputError, match="the folder does not exist"):
+        find_captures(tmp_path / "nowhere")

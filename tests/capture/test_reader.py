@@ -1,0 +1,200 @@
+"""Whole captures: observations against the photographs written, and real ones against known errors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from splinecli.capture import open_capture, read_capture
+from splinecli.errors import InputError, UsageError
+from splinecli.normals import angle_between_deg, unit
+
+WriteImage = Callable[..., Path]
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+INTENSITIES = np.array([[1, 2, 4], [2, 2, 2], [0.5, 1, 3], [1, 1, 1]])
+
+
+@pytest.fixture
+def photographs() -> NDArray[np.uint16]:
+    """(4, 5, 6, 3) 16-bit RGB values, none of them saturated."""
+    return np.random.default_rng(1).integers(0, 65000, (4, 5, 6, 3)).astype(np.uint16)
+
+
+@pytest.fixture
+def capture_folder(tmp_path: Path, write_image: WriteImage, photographs: NDArray[np.uint16]) -> Path:
+    """tmp_path/vase: four photographs and light_directions.txt, nothing else."""
+    for number, pixels in enumerate(
+        photographs, start=8
+    ):  # img8, img9, img10, img11: not in the order of text
+        write_image(f"vase/img{number}.png", pixels)
+    np.savetxt(tmp_path / "vase/light_directions.txt", LIGHTS)
+    return tmp_path / "vase"
+
+
+def expected(photographs: NDArray[np.uint16], intensities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, F) for the whole image, in float64."""
+    return np.asarray(
+        (photographs / 65535 / intensities[:, None, None]).mean(axis=-1).reshape(len(photographs), -1).T
+    )
+
+
+def test_without_intensities_and_mask(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
+    capture = read_capture(capture_folder)
+    np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6)
+    assert capture.observations.dtype == np.float32
+    assert (capture.name, capture.light_indices, capture.ground_truth) == ("vase", (0, 1, 2, 3), None)
+    assert capture.warnings == ()
+    assert capture.mask.shape == (5, 6)
+    assert capture.mask.all()
+    np.testing.assert_allclose(capture.light_directions, LIGHTS)
+
+
+def test_channels_are_divided_by_their_own_intensity(
+    capture_folder: Path, photographs: NDArray[np.uint16]
+) -> None:
+    np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
+    np.testing.assert_allclose(
+        read_capture(capture_folder).observations, expected(photographs, INTENSITIES), rtol=1e-6
+    )
+
+
+def test_gray_images_are_equal_in_all_channels(
+    capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
+) -> None:
+    np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
+    gray = np.repeat(photographs[..., :1], 3, axis=-1)
+    for number, pixels in enumerate(gray, start=8):
+        write_image(f"vase/img{number}.png", pixels[..., 0])
+    np.testing.assert_allclose(
+        read_capture(capture_folder).observations, expected(gray, INTENSITIES), rtol=1e-6
+    )
+
+
+def test_mask_and_ground_truth(
+    capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
+) -> None:
+    mask = np.random.default_rng(4).random((5, 6)) < 0.5
+    write_image("vase/mask.png", mask.astype(np.uint8) * 255)
+    normals = np.broadcast_to([0.0, 0.6, 0.8], (5, 6, 3))
+    np.save(capture_folder / "normals_gt.npy", normals)
+    capture = read_capture(capture_folder)
+    np.testing.assert_array_equal(capture.mask, mask)
+    np.testing.assert_allclose(
+        capture.observations, expected(photographs, np.ones((4, 3)))[mask.ravel()], rtol=1e-6
+    )
+    assert capture.ground_truth is not None
+    np.testing.assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
+
+
+def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
+    (capture_folder / "img9.png").write_bytes(b"damaged")
+    calls: list[int] = []
+    source = open_capture(capture_folder)
+    assert source.n_lights == 4
+    assert [path.name for path in source.files.images] == ["img8.png", "img9.png", "img10.png", "img11.png"]
+    capture = source.read([3, 0, 2], progress=lambda: calls.append(1))
+    assert len(calls) == 3
+    assert capture.light_indices == (3, 0, 2)
+    np.testing.assert_allclose(capture.light_directions, LIGHTS[[3, 0, 2]])
+    np.testing.assert_allclose(
+        capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6
+    )
+    with pytest.raises(InputError, match=r"img9\.png: found neither PNG, TIFF nor JPEG"):
+        source.read()
+
+
+@pytest.mark.parametrize(
+    ("indices", "message"),
+    [
+        (
+            [0, 1, 4],
+            "light index 4 is out of range: the capture has 4 lights. Light indices count from 0 to 3.",
+        ),
+        ([0, 1, 1], "light index 1 comes twice. Name each light once."),
+        ([0, 1], "2 lights chosen, expected at least 3."),
+    ],
+)
+def test_wrong_light_indices(capture_folder: Path, indices: list[int], message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        read_capture(capture_folder, light_indices=indices)
+    assert str(caught.value) == message
+
+
+def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> None:
+    mask = write_image("vase/mask.png", np.full((6, 5), 255, np.uint8))
+    with pytest.raises(InputError) as caught:
+        read_capture(capture_folder)
+    assert str(caught.value) == f"{mask}: found a mask of 5 x 6 pixels, expected 6 x 5 as in img8.png."
+    mask.unlink()
+    image = write_image("vase/img10.png", np.zeros((5, 7), np.uint16))
+    with pytest.raises(InputError) as caught:
+        read_capture(capture_folder)
+    assert str(caught.value) == f"{image}: found an image of 7 x 5 pixels, expected 6 x 5 as in img8.png."
+
+
+def test_counts_that_differ(capture_folder: Path) -> None:
+    np.savetxt(capture_folder / "light_directions.txt", LIGHTS[[0, 1, 2, 3, 1]])
+    with pytest.raises(InputError, match=r"found 5 light directions, expected 4, one for each image\."):
+        open_capture(capture_folder)
+
+
+def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
+    capture_folder: Path, write_image: WriteImage
+) -> None:
+    for number in range(8, 12):
+        (capture_folder / f"img{number}.png").unlink()
+        tifffile.imwrite(capture_folder / f"{number}.tif", np.array([[0, np.nan, 2.5]], np.float32))
+    write_image("vase/mask.png", np.array([[1, 0, 1]], np.uint8))
+    capture = read_capture(capture_folder)
+    np.testing.assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
+    assert capture.warnings == ()
+    (capture_folder / "mask.png").unlink()
+    with pytest.raises(InputError, match=r"8\.tif: found a value that is not finite"):
+        read_capture(capture_folder)
+
+
+def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
+    pixels = np.full((10, 10, 3), 200, np.uint8)
+    pixels[0, :5, 1] = 255
+    for number in range(8, 12):
+        write_image(f"vase/img{number}.png", pixels)
+    assert read_capture(capture_folder).warnings == (
+        "5.0 % of the observations are saturated; a shorter exposure gives better normals.",
+        "The images have 8 bits; 16-bit linear images give better normals.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "n_pixels", "mae_deg"), [("ballPNG", 15791, 4.29), ("catPNG", 45200, 8.45)]
+)  # the errors: the README beside the data; 0.02 for their rounding and the light files' four decimals
+def test_least_squares_on_diligent(shared_data: Path, name: str, n_pixels: int, mae_deg: float) -> None:
+    capture = read_capture(shared_data / "DiLiGenT/pmsData" / name)
+    assert (capture.name, capture.observations.shape) == (name, (n_pixels, 96))
+    solution = np.linalg.lstsq(
+        capture.light_directions, capture.observations.T.astype(np.float64), rcond=None
+    )[0]
+    assert capture.ground_truth is not None
+    truth = capture.ground_truth[capture.mask]
+    scored = truth.any(axis=1)
+    assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(mae_deg, abs=0.02)
+
+
+def test_psbox_s_transposed_lights(shared_data: Path) -> None:
+    source = open_capture(shared_data / "psbox/Objects", lights=shared_data / "psbox/light_directions.txt")
+    assert source.n_lights == 12
+    assert source.read([0, 4, 8]).n_pixels == 430 * 550
+
+
+def test_importing_is_light() -> None:
+    heavy = {"cv2", "scipy", "tifffile", "torch", "rich"}
+    code = f"import splinecli.capture, sys; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

@@ -1,0 +1,108 @@
+"""The record: what it refuses, and choosing lights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splinecli.capture import Capture
+from splinecli.errors import InputError, UsageError
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+MASK = np.array([[True, False, True], [True, True, False]])
+
+
+def make(**changes: Any) -> Capture:
+    fields: dict[str, Any] = {
+        "name": "vase",
+        "observations": np.arange(16).reshape(4, 4),
+        "light_directions": LIGHTS,
+        "light_indices": (0, 1, 2, 7),
+        "mask": MASK,
+    }
+    return Capture(**(fields | changes))
+
+
+def test_fields_get_their_dtypes() -> None:
+    capture = make(ground_truth=np.zeros((2, 3, 3)))
+    assert capture.observations.dtype == np.float32
+    assert capture.light_directions.dtype == np.float64
+    assert capture.ground_truth is not None
+    assert capture.ground_truth.dtype == np.float32
+    assert (capture.n_lights, capture.n_pixels) == (4, 4)
+
+
+def test_choose_lights_keeps_the_order_given() -> None:
+    chosen = make(warnings=("Read me.",)).choose_lights([3, 0, 2])
+    np.testing.assert_array_equal(chosen.observations, np.arange(16).reshape(4, 4)[:, [3, 0, 2]])
+    np.testing.assert_array_equal(chosen.light_directions, LIGHTS[[3, 0, 2]])
+    assert chosen.light_indices == (7, 0, 2)
+    assert chosen.warnings == ("Read me.",)
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        (
+            [0, 1, 4],
+            "light index 4 is out of range: the capture has 4 lights. Light indices count from 0 to 3.",
+        ),
+        (
+            [0, 1, -1],
+            "light index -1 is out of range: the capture has 4 lights. Light indices count from 0 to 3.",
+        ),
+        ([0, 1, 2, 1], "light index 1 comes twice. Name each light once."),
+        ([0, 1], "2 lights chosen, expected at least 3."),
+    ],
+)
+def test_positions_that_cannot_be_meant(positions: list[int], message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        make().choose_lights(positions)
+    assert str(caught.value) == message
+
+
+def test_chosen_lights_in_one_plane() -> None:
+    row = np.array([[-0.6, 0, 0.8], [0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+    with pytest.raises(InputError) as caught:
+        make(light_directions=row).choose_lights([0, 1, 2])
+    assert str(caught.value) == (
+        "vase: the 3 lights lie in one plane, so least squares (LS) cannot solve for a normal."
+        " Choose lights that surround the viewing direction."
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": np.zeros((5, 4))}, r"observations of shape \(5, 4\), expected .* = \(4, 4\)"),
+        ({"observations": np.full((4, 4), np.nan)}, "an observation is not finite"),
+        ({"light_directions": LIGHTS[:, :2]}, r"light directions of shape \(4, 2\), expected \(F, 3\)"),
+        ({"light_indices": (0, 1, 2)}, "3 light indices for 4 lights"),
+        (
+            {"light_directions": LIGHTS[:2], "light_indices": (0, 1), "observations": np.zeros((4, 2))},
+            "2 lights, expected at least 3",
+        ),
+        ({"light_directions": LIGHTS * 1.01}, "a light direction is not a unit vector"),
+        ({"light_directions": LIGHTS * np.nan}, "a light direction is not finite"),
+        ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 lies below the horizon \(z <= 0\)"),
+        ({"mask": np.zeros((2, 3), bool)}, "the mask is empty"),
+        ({"mask": np.ones(4, bool)}, r"a mask of shape \(4,\), expected \(H, W\)"),
+        (
+            {"ground_truth": np.zeros((3, 2, 3))},
+            r"ground truth of shape \(3, 2, 3\), expected .* = \(2, 3, 3\)",
+        ),
+        (
+            {"ground_truth": np.full((2, 3, 3), 0.1)},
+            "a ground-truth normal is neither a unit vector nor zero",
+        ),
+        (
+            {"ground_truth": np.full((2, 3, 3), np.nan)},
+            "a ground-truth normal is neither a unit vector nor zero",
+        ),
+    ],
+)
+def test_fields_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=f"vase: {message}"):
+        make(**changes)
