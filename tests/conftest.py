@@ -7,6 +7,10 @@ from pathlib import Path
 import pytest
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff")
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real captures that lie beside the repository on the authors' machines; none of them is part of it."""

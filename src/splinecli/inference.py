@@ -20,8 +20,8 @@ TILE_PIXELS = 16_384
 class NormalEstimate:
     """The normals of one capture.
 
-    normal_map: (H, W, 3) float32, unit, zero outside the mask. error_map_deg: (H, W) float32, NaN where there is no
-    ground truth, or None without any; errors: its summary. seconds: spent estimating.
+    normal_map: (H, W, 3) float32, unit, zero outside the mask. error_map_deg: (H, W) float32, NaN where there
+    is no ground truth, or None without any; errors: its summary. seconds: spent estimating.
     """
 
     capture: Capture

@@ -1,10 +1,11 @@
 """Observation maps: what one pixel shows under each light, laid out by light direction.
 
-A map is a square of `size` x `size` cells over the plane (x, y) of the light directions' orthographic projection,
-[-1, 1] x [-1, 1]. Column 0 is x = -1; row 0 is y = +1, so that a map shown as a picture is the sky as the object sees
-it, y up. All cells are equally wide (2 / size) and the view axis runs through the corner shared by the four middle
-cells: rotations by 90 degrees and mirror images are exact permutations of cells. CNN-PS (Ikehata, ECCV 2018) and
-SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2), whose last cell is a single point.
+A map is a square of `size` x `size` cells over the plane (x, y) of the light directions' orthographic
+projection, [-1, 1] x [-1, 1]. Column 0 is x = -1; row 0 is y = +1, so that a map shown as a picture is the
+sky as the object sees it, y up. All cells are equally wide (2 / size) and the view axis runs through the
+corner shared by the four middle
+cells: rotations by 90 degrees and mirror images are exact permutations of cells. CNN-PS (Ikehata, ECCV 2018)
+and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2), whose last cell is a single point.
 """
 
 from __future__ import annotations

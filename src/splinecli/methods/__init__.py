@@ -9,7 +9,7 @@ from typing import Literal
 from splinecli.errors import UsageError
 from splinecli.methods.estimator import Estimator
 
-__all__ = ["DEFAULT_METHOD", "Estimator", "MethodOptions", "make_estimator", "method_names"]
+__all__ = ["DEFAULT_METHOD", "Estimator", "MethodOptions", "check_method", "make_estimator", "method_names"]
 
 DEFAULT_METHOD = "spline-net"
 
@@ -30,9 +30,14 @@ class MethodOptions:
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:  # noqa: B008 - frozen
     """An estimator ready to run. Raises UsageError for an unknown name or device, ModelError for the weights."""
+    check_method(name)
+    return _METHODS[name](options)
+
+
+def check_method(name: str) -> None:
+    """Raise UsageError for an unknown name, before anything heavy is loaded."""
     if name not in _METHODS:
         raise UsageError(f"no method named {name!r}; expected one of {', '.join(_METHODS)}")
-    return _METHODS[name](options)
 
 
 def method_names() -> list[str]:

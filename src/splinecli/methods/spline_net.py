@@ -22,10 +22,10 @@ class SplineNetEstimator:
 
     Args:
         loaded: the network with its name and checksum.
-        rotations: R, the number of views averaged. A network without a canonical azimuth sees the lights turned by
-            360 k / R degrees about the view axis, as CNN-PS does. For one with a canonical azimuth such turns change
-            nothing; its views are mirror images and small turns across 20 degrees, which move the lights over the
-            borders of the cells.
+        rotations: R, the number of views averaged. A network without a canonical azimuth sees the lights
+            turned by 360 k / R degrees about the view axis, as CNN-PS does. For one with a canonical azimuth
+            such turns change nothing; its views are mirror images and small turns across 20 degrees, which
+            move the lights over the borders of the cells.
         batch_size: pixels at a time; memory grows with it (about 0.25 MB a pixel).
     """
 
@@ -57,10 +57,17 @@ class SplineNetEstimator:
         lights = torch.as_tensor(light_directions, dtype=torch.float32, device=self.device)
         normals = np.empty((len(observations), 3), np.float32)
         for start in range(0, len(observations), self.batch_size):
-            batch = torch.as_tensor(observations[start : start + self.batch_size]).to(self.device, torch.float32)
-            with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+            batch = torch.as_tensor(observations[start : start + self.batch_size]).to(
+                self.device, torch.float32
+            )
+            with torch.autocast(
+                lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
+            ):
                 total = sum(
-                    (self._network(batch, lights, turn_deg=turn, mirror=mirror) for turn, mirror in self._views),
+                    (
+                        self._network(batch, lights, turn_deg=turn, mirror=mirror)
+                        for turn, mirror in self._views
+                    ),
                     start=torch.zeros((), device=lights.device),
                 )
             unit = torch.nn.functional.normalize(total, dim=-1)

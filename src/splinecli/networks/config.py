@@ -16,8 +16,8 @@ class NetworkConfig:
     Attributes:
         size: "paper", the layers of the authors' networks; "compact", made for laptop cores.
         map_size: cells along a side of the observation map.
-        width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's hidden
-            features of the compact size; the paper size has fixed layers and ignores them.
+        width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's
+            hidden features of the compact size; the paper size has fixed layers and ignores them.
     """
 
     size: Literal["paper", "compact"] = "compact"
@@ -48,5 +48,7 @@ class NetworkConfig:
                 if value not in ("paper", "compact"):
                     raise ModelError(f"network size is {value!r}; expected 'paper' or 'compact'")
             elif not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 4096:
-                raise ModelError(f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096")
+                raise ModelError(
+                    f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096"
+                )
         return cls(**values)

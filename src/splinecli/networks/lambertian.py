@@ -1,7 +1,8 @@
 """A robust Lambertian fit to each pixel, vectorised in torch: the networks' frame of reference.
 
-Iteratively reweighted least squares of I = l . b with two weights: observations under `SHADOW_SHARE` of the pixel's
-largest are taken for shadow and nearly left out, and large residuals count less (an approximate L1 fit).
+Iteratively reweighted least squares of I = l . b with two weights: observations under `SHADOW_SHARE` of the
+pixel's largest are taken for shadow and nearly left out, and large residuals count less (an approximate L1
+fit).
 """
 
 from __future__ import annotations

@@ -26,8 +26,10 @@ class ResidualBlock(nn.Module):
 class MapEncoder(nn.Module):
     """Maps (P, C, w, w) -> features (P, width, w / 4, w / 4).
 
-    Every 4 x 4 patch of cells becomes one position (a space-to-depth step, where a CPU is fastest), tagged with a learned
-    embedding of where it lies: cells are light directions, so a map, unlike a photograph, is not translation invariant.
+    Every 4 x 4 patch of cells becomes one position (a space-to-depth step, where a CPU is fastest), tagged
+    with a learned
+    embedding of where it lies: cells are light directions, so a map, unlike a photograph, is not translation
+    invariant.
     """
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:

@@ -11,8 +11,8 @@ from splinecli.networks.layers import PATCH, MapEncoder
 class PaperLINet(nn.Module):
     """The authors' generator (Zheng et al., ICCV 2019): (P, 1, w, w) -> (P, 1, w, w) in 0..1; 8.40 M parameters.
 
-    7x7 conv to 64; two stride-2 4x4 convs to 128 and 256; six residual blocks; two transposed convs back; 7x7 conv;
-    sigmoid; instance norm between.
+    7x7 conv to 64; two stride-2 4x4 convs to 128 and 256; six residual blocks; two transposed convs back; 7x7
+    conv; sigmoid; instance norm between.
     """
 
     def __init__(self) -> None:

@@ -2,14 +2,14 @@
 
 The compact size differs from the paper's in four ways, all of them about learning more from each pixel:
 
-1. Canonical azimuth: each pixel's lights are turned about the view axis until its robust Lambertian normal lies over
-   the +x axis, and the estimate is turned back. Normals then come in one azimuth only.
-2. Both networks correct that Lambertian fit instead of starting from nothing: LI-Net its map, NE-Net its normal. A
-   matte pixel is right from the start.
-3. Beside the sparse map stand the cells that hold an observation, and the residual of the fit there, computed with the
-   exact light directions, which a 32 x 32 grid alone would round by up to 2 degrees.
-4. The dense map shares the sparse map's scale (its largest observation), values above 1 cut off: a highlight that no
-   light has hit does not change the scale of everything else.
+1. Canonical azimuth: each pixel's lights are turned about the view axis until its robust Lambertian normal
+   lies over the +x axis, and the estimate is turned back. Normals then come in one azimuth only.
+2. Both networks correct that Lambertian fit instead of starting from nothing: LI-Net its map, NE-Net its
+   normal. A matte pixel is right from the start.
+3. Beside the sparse map stand the cells that hold an observation, and the residual of the fit there, computed
+   with the exact light directions, which a 32 x 32 grid alone would round by up to 2 degrees.
+4. The dense map shares the sparse map's scale (its largest observation), values above 1 cut off: a highlight
+   that no light has hit does not change the scale of everything else.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ RESIDUAL_LIMIT = 3.0
 class Views(NamedTuple):
     """What the networks see of P pixels, in each pixel's own frame.
 
-    sparse, holds, residual, lambertian_map: (P, 1, w, w); lambertian_normals (P, 3); scale (P, 1), the observation that
-    the maps call 1; cosine, sine (P,): the turn from the capture's frame to the pixel's; mirrored: y flipped after it.
+    sparse, holds, residual, lambertian_map: (P, 1, w, w); lambertian_normals (P, 3); scale (P, 1), the
+    observation that the maps call 1; cosine, sine (P,): the turn from the capture's frame to the pixel's;
+    mirrored: y flipped after it.
     """
 
     sparse: Tensor
@@ -135,7 +136,14 @@ class SplineNet(nn.Module):
             raw: Tensor = self.ne_net(torch.cat((views.sparse, dense), dim=1))
         else:
             inputs = torch.cat(
-                (views.sparse, views.holds, views.residual, views.lambertian_map, dense.to(views.sparse.dtype)), dim=1
+                (
+                    views.sparse,
+                    views.holds,
+                    views.residual,
+                    views.lambertian_map,
+                    dense.to(views.sparse.dtype),
+                ),
+                dim=1,
             )
             raw = views.lambertian_normals + self.ne_net(inputs)
         return nn.functional.normalize(raw.float(), dim=-1)

@@ -58,7 +58,8 @@ def save_weights(network: SplineNet, path: Path) -> None:
 def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata of one of splinecli's safetensors files, checked against the checksum inside.
 
-    Raises ModelError where the file is missing, is no such file, or is damaged; `hint` says where a right one is had.
+    Raises ModelError where the file is missing, is no such file, or is damaged; `hint` says where a right one
+    is had.
     """
     if not path.is_file():
         raise ModelError("no such file", path=path, hint=hint)
@@ -87,8 +88,8 @@ def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) ->
 
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     """Rebuild the network of a weight file. Raises ModelError."""
-    hint = f"--weights takes a file written by 'splinecli train' or one of the names {', '.join(shipped_names())}"
-    tensors, metadata = read_tensors(path, FORMAT, hint)
+    hint = f"--weights takes a file written by 'splinecli train' or one of the names {',
+    '.join(shipped_names())}" tensors, metadata = read_tensors(path, FORMAT, hint)
     try:
         values = json.loads(metadata.get("config", ""))
     except json.JSONDecodeError as error:
@@ -117,7 +118,9 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         path = Path(name_or_file)
         if path.suffix != ".safetensors" and not path.exists():
             names = ", ".join(shipped_names())
-            raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")
+            raise ModelError(
+                f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file"
+            )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:
         loaded = load_weights(path, name=name_or_file)

@@ -1,7 +1,8 @@
 """What real captures do to a pixel, each effect a function with its distribution stated.
 
-Effects of the scene (walls that shade and reflect, ambient light) are functions of the light direction and so shape
-the dense map too; effects of the capture (errors of the lights, the camera) touch the sparse observations alone.
+Effects of the scene (walls that shade and reflect, ambient light) are functions of the light direction and so
+shape the dense map too; effects of the capture (errors of the lights, the camera) touch the sparse
+observations alone.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ def dot(vectors: Tensor, directions: Tensor) -> Tensor:
 class Wall:
     """A neighbouring surface of each pixel, which hides a sector of low lights and reflects the others.
 
-    azimuth (P, 3): unit vector in the image plane towards the wall; tan_height, tan_half_width, softness, strength
-    (P, 1); facing (P, 3): the wall's normal. A pixel without a wall has tan_height = strength = 0.
+    azimuth (P, 3): unit vector in the image plane towards the wall; tan_height, tan_half_width, softness,
+    strength (P, 1); facing (P, 3): the wall's normal. A pixel without a wall has tan_height = strength = 0.
     """
 
     azimuth: Tensor
@@ -44,8 +45,8 @@ class Wall:
     def visibility(self, directions: Tensor) -> Tensor:
         """Share of each light that passes the wall (P, D): cast shadow over one connected sector of the map.
 
-        A direction is hidden where its elevation is under the wall's, l_z < tan(height) l_along, and it falls within
-        the wall's width, |l_across| < tan(half width) l_along; the edge is `softness` wide in l_z.
+        A direction is hidden where its elevation is under the wall's, l_z < tan(height) l_along, and it falls
+        within the wall's width, |l_across| < tan(half width) l_along; the edge is `softness` wide in l_z.
         """
         along = dot(self.azimuth, directions)
         quarter_turn = torch.stack((-self.azimuth[:, 1], self.azimuth[:, 0], self.azimuth[:, 2]), dim=-1)
@@ -72,14 +73,19 @@ class Wall:
 
 
 def draw_wall(
-    normals: Tensor, share: float, generator: torch.Generator, *, shadows: bool = True, interreflections: bool = True
+    normals: Tensor,
+    share: float,
+    generator: torch.Generator,
+    *,
+    shadows: bool = True,
+    interreflections: bool = True,
 ) -> Wall:
     """A wall for a `share` of the pixels with these normals (P, 3).
 
-    Azimuth: within N(0, 50 degrees) of the normal's for 60 % (in a hollow the surface looks at the wall that faces
-    it), else uniform. Height U(8, 75) degrees; half-width tan U(15, 88) degrees; edge U(0.01, 0.06). The wall leans
-    back by U(0, 60) degrees from upright; it reflects albedo U(0.05, 0.9) times the form factor (1 - cos(height)) / 2
-    times U(0.5, 2).
+    Azimuth: within N(0, 50 degrees) of the normal's for 60 % (in a hollow the surface looks at the wall that
+    faces it), else uniform. Height U(8, 75) degrees; half-width tan U(15, 88) degrees; edge U(0.01, 0.06).
+    The wall leans back by U(0, 60) degrees from upright; it reflects albedo U(0.05, 0.9) times the form
+    factor (1 - cos(height)) / 2 times U(0.5, 2).
     """
     pixels = len(normals)
     spread = torch.randn(pixels, 1, generator=generator, device=generator.device) * math.radians(50)
@@ -134,7 +140,8 @@ def disturb_light_strengths(observations: Tensor, share: float, generator: torch
 def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
     """Factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
 
-    The brightest observation lies at 10^U(-1.3, 0); for `saturated_share` of the pixels at U(1, 3), to be clipped.
+    The brightest observation lies at 10^U(-1.3, 0); for `saturated_share` of the pixels at U(1, 3), to be
+    clipped.
     """
     pixels = len(radiance)
     level = 10 ** _uniform(generator, pixels, 1, low=-1.3, high=0.0)

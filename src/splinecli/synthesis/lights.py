@@ -20,9 +20,10 @@ def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: t
 def draw_light_directions(pixels: int, lights: int, generator: torch.Generator) -> Tensor:
     """Unit light directions (P, F, 3), a rig of its own for each pixel.
 
-    A rig's lights fall uniformly, by projected area, into an ellipse of the (x, y) disc: half-axis sin U(20, 88)
-    degrees, the other U(0.5, 1) of it, turned at random. Half of the rigs lean: their centre is moved by up to 0.35 of
-    the free room around the ellipse (rigs of a copy stand, a shelf, a hand-held lamp from above).
+    A rig's lights fall uniformly, by projected area, into an ellipse of the (x, y) disc: half-axis sin U(20,
+    88) degrees, the other U(0.5, 1) of it, turned at random. Half of the rigs lean: their centre is moved by
+    up to 0.35 of the free room around the ellipse (rigs of a copy stand, a shelf, a hand-held lamp from
+    above).
     """
     device = generator.device
 
@@ -32,7 +33,10 @@ def draw_light_directions(pixels: int, lights: int, generator: torch.Generator) 
     radius = torch.sqrt(uniform(pixels, lights))
     angle = 2 * math.pi * uniform(pixels, lights)
     major = torch.sin(torch.deg2rad(20 + 68 * uniform(pixels, 1)))
-    along, across = radius * angle.cos() * major, radius * angle.sin() * major * (0.5 + 0.5 * uniform(pixels, 1))
+    along, across = (
+        radius * angle.cos() * major,
+        radius * angle.sin() * major * (0.5 + 0.5 * uniform(pixels, 1)),
+    )
     turn = 2 * math.pi * uniform(pixels, 1)
     x = turn.cos() * along - turn.sin() * across
     y = turn.sin() * along + turn.cos() * across

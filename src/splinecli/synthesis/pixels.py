@@ -1,8 +1,10 @@
 """The online pixel generator: pixels made one by one, in batches, on the device of its random generator.
 
-Each pixel is a scene of its own (normal, material, neighbouring walls, ambient light) that can be asked for its
-radiance under any light: under a random rig for the sparse observations, under every cell's direction for the complete
-dense map. After PX-Net (Logothetis et al., ICCV 2021), which trains a per-pixel network without rendered objects.
+Each pixel is a scene of its own (normal, material, neighbouring walls, ambient light) that can be asked for
+its
+radiance under any light: under a random rig for the sparse observations, under every cell's direction for the
+complete dense map. After PX-Net (Logothetis et al., ICCV 2021), which trains a per-pixel network without
+rendered objects.
 """
 
 from __future__ import annotations
@@ -69,8 +71,8 @@ class PixelScene:
         normal_z = self.normals[:, 2:]
         direct = shade(self.material, dot(self.normals, directions), normal_z, directions[..., 2])
         material = self.material
-        # Light from a wide angle meets the diffuse albedo and, averaged over the lobe, the mirror reflectance.
-        albedo = material.base + 0.08 * material.specular * (1 - material.metallic)
+        # Light from a wide angle meets the diffuse albedo and, averaged over the lobe, the mirror
+        reflectance. albedo = material.base + 0.08 * material.specular * (1 - material.metallic)
         total = direct * visible + albedo * returned
         if self.mixed is not None and self.mixed_weight is not None:
             count = len(self.mixed_weight)
@@ -146,11 +148,13 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     count = round(config.mixed_share * pixels)
     if not count:
         return PixelScene(normals, material, walls, ambient)
-    # Every second mixed pixel is an edge; its second surface has the same material, the others the same normal.
-    edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
+    # Every second mixed pixel is an edge; its second surface has the same material, the others the same
+    normal. edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
     other = draw_material(count, generator)
     own = material.take(slice(count))
-    second = Material(*(torch.where(edge, a, b) for a, b in zip(vars(own).values(), vars(other).values(), strict=True)))
+    second = Material(
+        *(torch.where(edge, a, b) for a, b in zip(vars(own).values(), vars(other).values(), strict=True))
+    )
     second_normals = torch.where(edge, draw_neighbour_normals(normals[:count], generator), normals[:count])
     mixed = PixelScene(second_normals, second, (), ambient[:count])
     weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(edge, 0.4, 0.7)
@@ -182,4 +186,3 @@ class PixelGenerator:
             observed = quantise(observed, config.eight_bit_share, generator)
         calibrated = disturb_light_directions(true_directions, config.light_direction_error_share, generator)
         return PixelBatch(observed * valid, calibrated, valid, scene, exposure)
-

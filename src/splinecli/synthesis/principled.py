@@ -1,7 +1,7 @@
 """The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for one pixel seen from +z.
 
-Isotropic and gray: a pixel's observation is the mean of its colour channels and the model is all but linear in the
-base colour, so one channel is enough. Every parameter is a tensor (P, 1).
+Isotropic and gray: a pixel's observation is the mean of its colour channels and the model is all but linear
+in the base colour, so one channel is enough. Every parameter is a tensor (P, 1).
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Material:
 def draw_material(pixels: int, generator: torch.Generator) -> Material:
     """Random materials. Classes: 35 % matte, 30 % specular, 25 % metallic, 10 % half metallic.
 
-    base U(0.05, 1); roughness U(0.05, 1), of metals U(0.2, 0.9); specular U(0, 1), of the specular class U(0, 1) with
-    half of them U(1, 4); metallic 0, 1 or U(0, 1); sheen U(0, 1) on a fifth of the dielectrics; clearcoat U(0, 1) with
-    gloss U(0, 1) on 15 % of all.
+    base U(0.05, 1); roughness U(0.05, 1), of metals U(0.2, 0.9); specular U(0, 1), of the specular class U(0,
+    1) with half of them U(1, 4); metallic 0, 1 or U(0, 1); sheen U(0, 1) on a fifth of the dielectrics;
+    clearcoat U(0, 1) with gloss U(0, 1) on 15 % of all.
     """
     device = generator.device
 
@@ -90,15 +90,17 @@ def shade(material: Material, n_dot_l: Tensor, n_dot_v: Tensor, light_z: Tensor)
     alpha_squared = (material.roughness**4).clamp(min=1e-4)
     f0 = (0.08 * material.specular * (1 - material.metallic) + material.base * material.metallic).clamp(max=1)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1
-    specular = alpha_squared * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared) / (spread * spread)
+    specular = (
+        alpha_squared * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared) / (spread * spread)
+    )
     radiance = diffuse + specular * (f0 + (1 - f0) * fresnel)
 
     if bool((material.clearcoat > 0).any()):
         coat_alpha_squared = (0.1 + (0.001 - 0.1) * material.clearcoat_gloss) ** 2
-        coat = (coat_alpha_squared - 1) / (coat_alpha_squared.log() * (1 + (coat_alpha_squared - 1) * n_dot_h_squared))
+        coat = (coat_alpha_squared - 1) / (
+            coat_alpha_squared.log() * (1 + (coat_alpha_squared - 1) * n_dot_h_squared)
+        )
         quarter = torch.full_like(n_dot_v, 0.25**2)
         coat = coat * smith_ggx(n_dot_v, quarter) * smith_ggx(lit, quarter) * (0.04 + 0.96 * fresnel)
         radiance = radiance + 0.25 * material.clearcoat * coat
     return radiance * lit
-
-

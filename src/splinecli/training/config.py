@@ -16,14 +16,14 @@ class TrainingConfig:
 
     Attributes:
         batch_size: pixels a step.
-        learning_rate: the schedule's top; it rises over `warmup_steps` and then falls, by a cosine to a hundredth, or
-            ("stepped", the authors' way) to a tenth over the last tenth.
+        learning_rate: the schedule's top; it rises over `warmup_steps` and then falls, by a cosine to a
+            hundredth, or ("stepped", the authors' way) to a tenth over the last tenth.
         steps, minutes: the run's length; minutes wins where it is above 0.
         beta1, beta2, weight_decay: of AdamW.
         gradient_limit: largest norm of the gradient.
         average_decay: decay of the running average of the weights, which is what gets saved.
-        turn_jitter_deg: canonical networks see each pixel turned further by up to this, either way, and half of the
-            batches mirrored, so that estimates from several views can be averaged.
+        turn_jitter_deg: canonical networks see each pixel turned further by up to this, either way, and half
+            of the batches mirrored, so that estimates from several views can be averaged.
         map_weight, masked_weight, angle_weight: of |D - D_gt|, |M_s o (D - D_gt)| and arccos(n . n_gt).
         precision: "bfloat16" runs the convolutions so where the device has it, "float32" never.
     """
@@ -62,7 +62,9 @@ class TrainingConfig:
             known = {item.name for item in fields(owner)}
             unknown = sorted(set(given) - known)
             if unknown:
-                raise ModelError(f"unknown training setting {unknown[0]!r}; known are {', '.join(sorted(known))}")
+                raise ModelError(
+                    f"unknown training setting {unknown[0]!r}; known are {', '.join(sorted(known))}"
+                )
         return cls(network=network, pixels=PixelGeneratorConfig(**pixels), **values)
 
 

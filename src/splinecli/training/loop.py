@@ -59,7 +59,9 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 class Trainer:
     """A run in a folder: `checkpoint.safetensors`, `weights.safetensors`, `config.json` and `metrics.csv`."""
 
-    def __init__(self, config: TrainingConfig, folder: Path, device: torch.device, *, resume: bool = False) -> None:
+    def __init__(
+        self, config: TrainingConfig, folder: Path, device: torch.device, *, resume: bool = False
+    ) -> None:
         """Start a run, or take one up. Raises ModelError, OutputError."""
         self.config = config
         self.folder = folder
@@ -80,7 +82,9 @@ class Trainer:
                 folder / CHECKPOINT, self.network, self.average, self.optimizer, self.generator
             )
         elif (folder / CHECKPOINT).exists():
-            raise OutputError("holds a run already", path=folder, hint="Go on with --resume, or choose another -o")
+            raise OutputError(
+                "holds a run already", path=folder, hint="Go on with --resume, or choose another -o"
+            )
         write_text(folder / "config.json", json.dumps(config.to_dict(), indent=2) + "\n")
         self.pixels = PixelGenerator(config.pixels, self.generator)
 
@@ -104,7 +108,9 @@ class Trainer:
             finished = self.progress >= 1
             if (count == REPORT_STEPS or finished) and count:
                 due = finished or time.monotonic() - saved > CHECKPOINT_SECONDS
-                metrics = self._metrics(sums / count, validation_deg(self.average, validation) if due else None)
+                metrics = self._metrics(
+                    sums / count, validation_deg(self.average, validation) if due else None
+                )
                 self._append(metrics)
                 if due:
                     self.save()
@@ -115,7 +121,9 @@ class Trainer:
                 if finished:
                     return metrics
             elif finished:
-                raise ModelError("the run is at its end already", path=self.folder, hint="Give it more --steps")
+                raise ModelError(
+                    "the run is at its end already", path=self.folder, hint="Give it more --steps"
+                )
             sums += self.step()
             count += 1
             self.clock.seconds = time.monotonic() - started
@@ -133,9 +141,7 @@ class Trainer:
             batch.observations, batch.light_directions, batch.valid, turn_deg=turn, mirror=mirror
         )
         dense_truth, normal_truth = truth_in_frame(batch, views.cosine, views.sine, views.scale, mirror)
-        with torch.autocast(
-            self.device.type, dtype=torch.bfloat16, enabled=config.precision == "bfloat16"
-        ):
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=config.precision == "bfloat16"):
             dense = self.network.interpolate(views)
             normals = self.network.estimate(views, dense)
         angle = angular_loss(normals, normal_truth)
@@ -143,7 +149,9 @@ class Trainer:
         masked = masked_map_loss(dense.float(), dense_truth, views.holds)
         loss = config.angle_weight * angle + config.map_weight * on_map + config.masked_weight * masked
         if not torch.isfinite(loss):
-            raise ModelError(f"the loss is {float(loss)} at step {self.clock.step}", hint="Lower the learning rate")
+            raise ModelError(
+                f"the loss is {float(loss)} at step {self.clock.step}", hint="Lower the learning rate"
+            )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
@@ -225,7 +233,9 @@ def validation_set(config: TrainingConfig, device: torch.device) -> PixelBatch:
     """Pixels under `usual_lights` lights from a generator of their own: checking never disturbs training."""
     count = config.pixels.usual_lights
     fixed = PixelGeneratorConfig(**{**vars(config.pixels), "min_lights": count, "max_lights": count})
-    return PixelGenerator(fixed, torch.Generator(device).manual_seed(2**31 + config.seed)).draw(VALIDATION_PIXELS)
+    return PixelGenerator(fixed, torch.Generator(device).manual_seed(2**31 + config.seed)).draw(
+        VALIDATION_PIXELS
+    )
 
 
 @torch.no_grad()

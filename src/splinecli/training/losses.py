@@ -9,7 +9,8 @@ from torch import Tensor
 def angular_loss(normals: Tensor, truth: Tensor) -> Tensor:
     """arccos(n . n_gt) in radians, mean over pixels; normals, truth (P, 3) unit.
 
-    As atan2(|n x n_gt|, n . n_gt): the same angle with a bounded gradient, where that of arccos is infinite at 0.
+    As atan2(|n x n_gt|, n . n_gt): the same angle with a bounded gradient, where that of arccos is infinite
+    at 0.
     """
     sine = torch.linalg.cross(normals, truth).square().sum(-1).add(1e-12).sqrt()
     return torch.atan2(sine, (normals * truth).sum(-1)).mean()

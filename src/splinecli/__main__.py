@@ -1,0 +1,5 @@
+"""`python -m splinecli`."""
+
+from splinecli.cli.main import run
+
+run()

@@ -1,0 +1,42 @@
+"""The Typer app and its commands. Importing it must stay cheap: no torch, no OpenCV."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from splinecli import __version__
+
+from splinecli.cli.infer import infer
+from splinecli.cli.train import train
+
+app = typer.Typer(
+    name="splinecli",
+    help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
+    epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
+    # Plain help reads the same on a terminal, in a pipe and in the README.
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"splinecli {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _splinecli(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
+    ] = False,
+) -> None:
+    pass
+
+
+app.command()(infer)
+
+app.command()(train)

@@ -1,0 +1,212 @@
+"""`splinecli infer`: captures in, normal maps out."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from splinecli.cli.options import (
+    BatchSizeOption,
+    Device,
+    DeviceOption,
+    JsonOption,
+    Precision,
+    PrecisionOption,
+    QuietOption,
+    RotationsOption,
+    SeedOption,
+    WeightsOption,
+    parse_indices,
+    split_commas,
+)
+from splinecli.cli.talk import Talk
+from splinecli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splinecli.capture import CaptureSource
+    from splinecli.methods import Estimator, MethodOptions
+
+FEWEST_TRAINED_LIGHTS = 4
+
+
+class NormalConvention(StrEnum):
+    """Which way green points in the picture."""
+
+    opengl = "opengl"
+    directx = "directx"
+
+
+def infer(
+    captures: Annotated[
+        list[Path], typer.Argument(metavar="CAPTURE", help="Folders of images of one object each.")
+    ],
+    lights: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Light directions, a line x y z for each image (z to the camera)."),
+    ] = None,
+    intensities: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Light intensities, a line r g b for each image.")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Picture that is bright on the object. [default: all]")
+    ] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF) to compare with.")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Results go to OUT/<capture name>/.")
+    ] = Path("out"),
+    method: Annotated[str, typer.Option(metavar="METHOD", help="spline-net or ls.")] = "spline-net",
+    weights: WeightsOption = None,
+    n_lights: Annotated[
+        int | None, typer.Option(metavar="K", help="Use K lights drawn at random. [default: all]")
+    ] = None,
+    seed: SeedOption = 0,
+    light_indices: Annotated[
+        str | None, typer.Option(metavar="I,J,...", help="Use these lights, counted from 0.")
+    ] = None,
+    rotations: RotationsOption = 1,
+    batch_size: BatchSizeOption = None,
+    device: DeviceOption = Device.auto,
+    precision: PrecisionOption = Precision.auto,
+    formats: Annotated[
+        str, typer.Option("--format", metavar="LIST", help="Any of png (16-bit), npy, tiff (both float32).")
+    ] = "png,npy",
+    convention: Annotated[
+        NormalConvention, typer.Option(help="Green of the PNG: opengl is y up, directx is y down.")
+    ] = NormalConvention.opengl,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Estimate the normal map of each CAPTURE.
+
+    A capture is a folder of images taken by a fixed camera under different lights, with a light file (in it, or given
+    by --lights). Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there is ground
+    truth. A bad capture among several is named and passed over; the exit code is then 3.
+    """
+    from splinecli.methods import MethodOptions, check_method
+
+    if n_lights is not None and light_indices is not None:
+        raise UsageError("--n-lights and --light-indices exclude each other")
+    check_method(method)
+    _refuse_same_names(captures)
+    job = _Job(
+        files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
+        output=output,
+        formats=split_commas(formats, "--format", ["png", "npy", "tiff"]),
+        convention=convention.value,
+        overwrite=overwrite,
+        n_lights=n_lights,
+        seed=seed,
+        light_indices=None if light_indices is None else parse_indices(light_indices, "--light-indices"),
+        method=method,
+        options=MethodOptions(weights, rotations, batch_size, device.value, precision.value),
+        talk=Talk(quiet=quiet),
+    )
+    reports, exit_code = [], 0
+    for folder in captures:
+        try:
+            report = job.run(folder)
+        except (InputError, UsageError) as error:
+            if len(captures) == 1:
+                raise
+            exit_code = InputError.exit_code
+            print(f"splinecli: {error}", file=sys.stderr)
+            report = {"capture": capture_name(folder), "error": str(error)}
+        else:
+            if not (quiet or as_json):
+                print(_summary(report, output))
+        reports.append(report)
+    if as_json:
+        print(json.dumps(reports[0] if len(captures) == 1 else reports, indent=2))
+    return exit_code
+
+
+@dataclass
+class _Job:
+    """What the command line asked for, the same for every capture."""
+
+    files: dict[str, Path | None]
+    output: Path
+    formats: list[str]
+    convention: Any
+    overwrite: bool
+    n_lights: int | None
+    seed: int
+    light_indices: list[int] | None
+    method: str
+    options: MethodOptions
+    talk: Talk
+
+    @cached_property
+    def estimator(self) -> Estimator:
+        """Made when the first capture has turned out to be one: loading a network takes a second."""
+        from splinecli.methods import make_estimator
+
+        return make_estimator(self.method, self.options)
+
+    def run(self, folder: Path) -> dict[str, Any]:
+        """Read, estimate and write one capture; returns its report."""
+        from splinecli.capture import open_capture
+        from splinecli.inference import estimate_normals
+        from splinecli.outputs import check_free, report_of, write_estimate
+
+        started = time.perf_counter()
+        source = open_capture(folder, **self.files)
+        target = self.output / source.files.name
+        check_free(target, overwrite=self.overwrite)
+        chosen = self._choose_lights(source)
+        count = source.n_lights if chosen is None else len(chosen)
+        with self.talk.progress(f"{source.files.name}: reading", count) as advance:
+            capture = source.read(chosen, progress=lambda: advance(1))
+        read_seconds = time.perf_counter() - started
+        estimator = self.estimator
+        with self.talk.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
+            estimate = estimate_normals(capture, estimator, progress=advance)
+        warnings = [*capture.warnings]
+        if capture.n_lights < FEWEST_TRAINED_LIGHTS and estimator.weights is not None:
+            warnings.append(f"The network was trained with {FEWEST_TRAINED_LIGHTS} lights and more, not 3.")
+        for warning in warnings:
+            self.talk.warn(f"{capture.name}: {warning}")
+        report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
+        return write_estimate(estimate, report, target, formats=self.formats, convention=self.convention)
+
+    def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
+        from splinecli.evaluation.draws import draw_lights
+
+        if self.n_lights is None:
+            return self.light_indices
+        return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
+
+
+def capture_name(folder: Path) -> str:
+    """What a capture's results are called: its folder's name, also for `.` and `obj/..`."""
+    return folder.resolve().name
+
+
+def _refuse_same_names(captures: list[Path]) -> None:
+    seen: dict[str, Path] = {}
+    for folder in captures:
+        other = seen.setdefault(capture_name(folder), folder)
+        if other is not folder:
+            raise UsageError(
+                f"{other} and {folder} have the same name, so their results would overwrite each other",
+                hint="Run them one by one with different -o",
+            )
+
+
+def _summary(report: dict[str, Any], output: Path) -> str:
+    errors = report["angular_error_deg"]
+    scored = f", MAE {errors['mean']:.2f} deg (median {errors['median']:.2f})" if errors else ""
+    counts = f"{report['n_pixels']} pixels, {report['n_lights']} lights"
+    return f"{output / report['capture']}: {counts}, {report['method']}{scored}"

@@ -1,0 +1,58 @@
+"""Entry point: runs the app and turns what goes wrong into one message and an exit code."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+
+import typer
+
+from splinecli.cli.app import app
+from splinecli.errors import SplinecliError
+
+INTERRUPTED = 130
+DEFECT = 1
+# Typer carries its own copy of click, elsewhere in each version; this is click's base of all usage errors.
+_ClickUsageError: type[Exception] = typer.BadParameter.__mro__[1]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run `splinecli ARGS` and return the exit code (the contract is in docs/conventions.md)."""
+    command = typer.main.get_command(app)
+    try:
+        result = command.main(
+            args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False
+        )
+        sys.stdout.flush()
+    except SplinecliError as error:
+        return fail(str(error), error.exit_code)
+    except _ClickUsageError as error:
+        message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context else "splinecli"
+        return fail(f"{message}. See '{where} --help'.", 2)
+    except BrokenPipeError:
+        # The reader of stdout went away, as `| head` does. Python would complain again at its exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (KeyboardInterrupt, typer.Abort):
+        return fail("interrupted.", INTERRUPTED)
+    except Exception:
+        traceback.print_exc()
+        return fail("this is a defect of splinecli; please report it with the lines above.", DEFECT)
+    if result == INTERRUPTED:
+        return fail("interrupted.", INTERRUPTED)
+    return result if isinstance(result, int) else 0
+
+
+def fail(message: str, exit_code: int) -> int:
+    """Say what went wrong, in one line on stderr, and hand back the exit code."""
+    print(f"splinecli: {message}", file=sys.stderr)
+    return exit_code
+
+
+def run() -> None:
+    """The console script."""
+    sys.exit(main())

@@ -1,0 +1,64 @@
+"""Option types that several commands share, and the parsing of their values."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from splinecli.errors import UsageError
+
+
+class Device(StrEnum):
+    """Where to compute."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+class Precision(StrEnum):
+    """What to compute in."""
+
+    auto = "auto"
+    float32 = "float32"
+    bfloat16 = "bfloat16"
+
+
+WeightsOption = Annotated[
+    str | None,
+    typer.Option("--weights", metavar="NAME|FILE", help="Shipped weights by name, or a file. [default: the method's]"),
+]
+RotationsOption = Annotated[
+    int, typer.Option("--rotations", metavar="R", min=1, help="Views of each pixel to average: slower, a little better.")
+]
+DeviceOption = Annotated[Device, typer.Option("--device", help="Where to compute; auto takes a CUDA GPU if any.")]
+PrecisionOption = Annotated[
+    Precision, typer.Option("--precision", help="auto takes bfloat16 where the hardware computes in it.")
+]
+BatchSizeOption = Annotated[
+    int | None, typer.Option("--batch-size", metavar="N", min=1, help="Pixels at a time in the network.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
+SeedOption = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the random draws.")]
+
+
+def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
+    """The items of "a,b". Raises UsageError for one that is not allowed."""
+    items = [item.strip() for item in text.split(",") if item.strip()]
+    for item in items:
+        if item not in allowed:
+            raise UsageError(f"{option} holds {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}")
+    if not items:
+        raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
+    return items
+
+
+def parse_indices(text: str, option: str) -> list[int]:
+    """Whole numbers from "0,5,12". Raises UsageError."""
+    try:
+        return [int(item) for item in text.split(",")]
+    except ValueError:
+        raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None

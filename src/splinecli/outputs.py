@@ -1,0 +1,160 @@
+"""What `infer` writes for a capture: the normal map's files, the error map and the report, whole or not at all."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli import __version__
+from splinecli.errors import OutputError
+from splinecli.files import write_bytes, write_text
+from splinecli.inference import NormalEstimate
+from splinecli.methods import Estimator
+from splinecli.normals import Convention, encode_picture
+
+Format = Literal["png", "npy", "tiff"]
+NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
+ERROR_MAP = "error_map.png"
+REPORT = "report.json"
+OWN_FILES = (*NORMALS.values(), ERROR_MAP, REPORT)
+
+
+def check_free(folder: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where the folder holds results already and may not be overwritten, or is no folder."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError("is a file; the results need a folder", path=folder, hint="Choose another place with -o")
+    if overwrite:
+        return
+    for name in OWN_FILES:
+        if (folder / name).exists():
+            raise OutputError(
+                f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
+            )
+
+
+def report_of(
+    estimate: NormalEstimate, estimator: Estimator, *, read_seconds: float, warnings: Sequence[str]
+) -> dict[str, Any]:
+    """The report of the contract (docs/conventions.md), all but `seconds.write` and `files`."""
+    capture = estimate.capture
+    return {
+        "capture": capture.name,
+        "method": estimator.name,
+        "weights": estimator.weights,
+        "n_lights": capture.n_lights,
+        "light_indices": list(capture.light_indices),
+        "n_pixels": capture.n_pixels,
+        "image_size": [capture.mask.shape[1], capture.mask.shape[0]],
+        "device": estimator.device,
+        "precision": estimator.precision,
+        "seconds": {"read": round(read_seconds, 3), "estimate": round(estimate.seconds, 3)},
+        "peak_memory_mib": peak_memory_mib(),
+        "warnings": list(warnings),
+        "angular_error_deg": None
+        if estimate.errors is None
+        else {name: round(value, 4) for name, value in asdict(estimate.errors).items()},
+        "version": __version__,
+    }
+
+
+def write_estimate(
+    estimate: NormalEstimate,
+    report: dict[str, Any],
+    folder: Path,
+    *,
+    formats: Sequence[Format],
+    convention: Convention,
+) -> dict[str, Any]:
+    """Write the files into `folder`, replacing those of an earlier run there; returns the finished report.
+
+    Everything is written into a folder beside it first, so that a failure or Ctrl-C leaves nothing half-done.
+    Raises OutputError.
+    """
+    started = time.perf_counter()
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror})", path=folder, hint="Choose another place with -o"
+        ) from error
+    try:
+        for form in formats:
+            write_bytes(stage / NORMALS[form], encode(estimate, form, convention))
+        if estimate.error_map_deg is not None:
+            from splinecli.evaluation.figures import error_map_picture
+
+            write_bytes(stage / ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg)))
+        files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
+        seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
+        report = {**report, "seconds": seconds, "files": files}
+        write_text(stage / REPORT, json.dumps(report, indent=2) + "\n")
+        _publish(stage, folder)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+    return report
+
+
+def encode(estimate: NormalEstimate, form: Format, convention: Convention) -> bytes:
+    """The normal map as a 16-bit PNG picture, or as float32 NPY or TIFF."""
+    buffer = io.BytesIO()
+    if form == "png":
+        return encode_png(encode_picture(estimate.normal_map, estimate.capture.mask, convention=convention))
+    if form == "npy":
+        np.save(buffer, estimate.normal_map, allow_pickle=False)
+    else:
+        import tifffile
+
+        tifffile.imwrite(buffer, estimate.normal_map, photometric="rgb")
+    return buffer.getvalue()
+
+
+def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:
+    """PNG of an RGB picture (H, W, 3), 8 or 16 bits."""
+    import cv2
+
+    done, encoded = cv2.imencode(".png", picture[..., ::-1])
+    if not done:
+        raise OutputError("the picture could not be encoded as PNG")
+    return encoded.tobytes()
+
+
+def peak_memory_mib() -> int | None:
+    """Largest memory of this process so far in MiB; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    import sys
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
+
+
+def _publish(stage: Path, folder: Path) -> None:
+    try:
+        if not folder.exists():
+            stage.chmod(0o755)
+            stage.rename(folder)
+            return
+        kept = {path.name for path in stage.iterdir()}
+        for name in OWN_FILES:
+            if name not in kept:
+                (folder / name).unlink(missing_ok=True)
+        # The report goes last: where it stands, the rest is complete.
+        for path in sorted(stage.iterdir(), key=lambda path: path.name == REPORT):
+            path.replace(folder / path.name)
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror})", path=folder, hint="Choose another place with -o"
+        ) from error

@@ -1,0 +1,110 @@
+"""A small analytic capture, a way to run the command line in this process, and golden files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.cli import main
+
+GOLDEN = Path(__file__).resolve().parents[1] / "golden"
+SIZE = 24
+LIGHTS = np.array(
+    [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0, -0.5, 1), (0.4, 0.4, 1), (-0.4, 0.4, 1), (0.4, -0.4, 1)],
+    dtype=float,
+)
+
+
+def sphere_normals() -> np.ndarray:
+    """Normals (SIZE, SIZE, 3) of the upper part of a matte sphere, which no light above leaves in shadow."""
+    axis = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    x, y = np.meshgrid(axis, -axis)
+    return np.stack((x, y, np.full_like(x, 2.5)), axis=-1) / np.sqrt(x**2 + y**2 + 2.5**2)[..., None]
+
+
+def write_capture(folder: Path) -> Path:
+    """A capture with ground truth; its disc-shaped mask holds 448 of 576 pixels."""
+    folder.mkdir(parents=True)
+    normals = sphere_normals()
+    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+    for index, light in enumerate(lights):
+        picture = np.rint(normals @ light * 60_000).astype(np.uint16)
+        cv2.imwrite(str(folder / f"image{index + 1}.png"), picture)
+    np.savetxt(folder / "light_directions.txt", lights, fmt="%.9f")
+    disc = np.hypot(*np.meshgrid(*[np.arange(SIZE) - SIZE / 2 + 0.5] * 2)) < SIZE / 2
+    cv2.imwrite(str(folder / "mask.png"), disc.astype(np.uint8) * 255)
+    np.save(folder / "normals_gt.npy", normals.astype(np.float32))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def truth() -> np.ndarray:
+    """True normals (SIZE, SIZE, 3) of the capture."""
+    return sphere_normals()
+
+
+@pytest.fixture
+def make_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Write captures by name into the working folder, so that messages hold short paths."""
+    monkeypatch.chdir(tmp_path)
+
+    def make(name: str) -> Path:
+        write_capture(tmp_path / name)
+        return Path(name)
+
+    return make
+
+
+@pytest.fixture
+def capture(make_capture: Callable[[str], Path]) -> Path:
+    """The capture `sphere` in the working folder."""
+    return make_capture("sphere")
+
+
+@dataclass(frozen=True)
+class Run:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
+    """Run the command line: run("infer", folder, "--json") -> Run(code, out, err)."""
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERMINAL_WIDTH", "100")
+
+    def call(*args: object) -> Run:
+        code = main([str(arg) for arg in args])
+        return Run(code, *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
+    """Compare a text with tests/golden/<name>; `pytest --update-golden` writes it anew, and the diff is read.
+
+    What differs from run to run (seconds, memory, version) is blanked out.
+    """
+
+    def check(name: str, text: str) -> None:
+        path = GOLDEN / name
+        text = _without_measurements(text)
+        if request.config.getoption("--update-golden"):
+            path.write_text(text, "utf-8")
+        assert text == path.read_text("utf-8")
+
+    return check
+
+
+def _without_measurements(text: str) -> str:
+    """The text with seconds, memory and version blanked out."""
+    text = re.sub(r'("(?:read|estimate|write|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text)
+    return re.sub(r'("version": )"[^"]*"', r'\1"..."', text)

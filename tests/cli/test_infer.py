@@ -1,0 +1,208 @@
+"""`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes wrong on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from splinecli.methods.least_squares import LeastSquares
+from splinecli.normals import angle_between_deg, decode_picture
+
+PIXELS = 448
+
+
+def read_report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text("utf-8"))
+
+
+def test_writes_the_contract(capture, truth, run, golden):
+    result = run("infer", capture, "--method", "ls", "--format", "png,npy,tiff")
+    assert (result.code, result.err) == (0, "")
+    assert result.out == "out/sphere: 448 pixels, 8 lights, ls, MAE 0.00 deg (median 0.00)\n"
+    out = Path("out/sphere")
+    golden("report_ls.json", (out / "report.json").read_text("utf-8"))
+    assert sorted(path.name for path in out.iterdir()) == sorted(read_report(out)["files"])
+    assert [path.name for path in Path("out").iterdir()] == ["sphere"]
+
+    normals = np.load(out / "normals.npy")
+    assert normals.dtype == np.float32
+    mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    # 16-bit images of up to 60000 counts: half a count is 5e-4 degrees, a handful of them at most 5e-3.
+    assert angle_between_deg(normals[mask], truth[mask]).max() < 5e-3
+    assert not normals[~mask].any()
+    np.testing.assert_array_equal(tifffile.imread(out / "normals.tiff"), normals)
+    picture = cv2.imread(str(out / "normals.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    assert picture.dtype == np.uint16
+    assert angle_between_deg(decode_picture(picture)[mask], normals[mask]).max() < 5e-3
+    assert cv2.imread(str(out / "error_map.png")).shape[0] >= mask.shape[0]
+
+
+def test_directx_flips_green(capture, run):
+    run("infer", capture, "--method", "ls", "-o", "gl")
+    run("infer", capture, "--method", "ls", "-o", "dx", "--convention", "directx")
+    opengl, directx = (cv2.imread(f"{out}/sphere/normals.png", cv2.IMREAD_UNCHANGED).astype(int) for out in ("gl", "dx"))
+    inside = opengl.any(axis=-1)
+    assert (np.abs(opengl + directx - 65535)[inside][:, 1] <= 1).all()
+    np.testing.assert_array_equal(opengl[..., [0, 2]], directx[..., [0, 2]])
+
+
+def test_no_ground_truth_no_error_map(capture, run):
+    (capture / "normals_gt.npy").unlink()
+    assert run("infer", capture, "--method", "ls", "--json").code == 0
+    report = read_report(Path("out/sphere"))
+    assert report["angular_error_deg"] is None
+    assert report["files"] == ["normals.npy", "normals.png", "report.json"]
+
+
+def test_json_is_the_report_and_nothing_else(capture, run):
+    result = run("infer", capture, "--method", "ls", "--json")
+    assert json.loads(result.out) == read_report(Path("out/sphere"))
+    assert result.err == ""
+
+
+def test_quiet_says_nothing(capture, run):
+    assert run("infer", capture, "--method", "ls", "--quiet") == type(run("--version"))(0, "", "")
+
+
+def test_lights_by_index_and_by_draw(capture, run):
+    chosen = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
+    assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])
+    draws = [
+        json.loads(run("infer", capture, "--method", "ls", "--n-lights", 4, "--seed", s, "--json", "--overwrite").out)
+        for s in (0, 0, 1)
+    ]
+    assert [draw["n_lights"] for draw in draws] == [4, 4, 4]
+    assert draws[0]["light_indices"] == draws[1]["light_indices"] != draws[2]["light_indices"]
+
+
+def test_files_given_go_before_the_folders(capture, run):
+    lights = np.loadtxt(capture / "light_directions.txt")
+    (capture / "light_directions.txt").unlink()
+    np.savetxt("l.txt", lights)
+    cv2.imwrite("m.png", np.pad(np.full((2, 3), 255, np.uint8), ((4, 18), (5, 16))))
+    report = json.loads(run("infer", capture, "--method", "ls", "--lights", "l.txt", "--mask", "m.png", "--json").out)
+    assert report["n_pixels"] == 6
+    assert report["angular_error_deg"]["mean"] < 1e-3
+
+
+def test_network_on_a_matte_sphere(capture, run):
+    """All that is shipped, from the command line: a matte sphere without shadows is easy."""
+    report = json.loads(run("infer", capture, "--precision", "float32", "--json").out)
+    assert report["method"] == "spline-net"
+    assert report["weights"]["name"] == "spline-net"
+    assert len(report["weights"]["sha256"]) == 64
+    assert report["angular_error_deg"]["mean"] < 2.5
+
+
+def test_three_lights_are_warned_about(capture, run):
+    result = run("infer", capture, "--light-indices", "1,2,3")
+    assert result.code == 0
+    assert "trained with 4 lights and more" in result.err
+    assert any("trained with 4" in text for text in read_report(Path("out/sphere"))["warnings"])
+
+
+def test_rotations_change_little_and_batches_nothing(capture, run):
+    run("infer", capture, "-o", "one", "--precision", "float32")
+    run("infer", capture, "-o", "five", "--precision", "float32", "--rotations", 5)
+    run("infer", capture, "-o", "small", "--precision", "float32", "--batch-size", 7)
+    one, five, small = (np.load(f"{out}/sphere/normals.npy") for out in ("one", "five", "small"))
+    inside = one.any(axis=-1)
+    difference = angle_between_deg(one[inside], five[inside])
+    assert 0 < difference.mean() < 3
+    assert angle_between_deg(one[inside], small[inside]).max() < 0.05
+
+
+def test_refuses_to_overwrite(capture, run, golden):
+    run("infer", capture, "--method", "ls")
+    before = read_report(Path("out/sphere"))
+    result = run("infer", capture, "--method", "ls", "--n-lights", 4)
+    assert (result.code, result.out) == (5, "")
+    golden("error_exists.txt", result.err)
+    assert read_report(Path("out/sphere")) == before
+    assert run("infer", capture, "--method", "ls", "--n-lights", 4, "--overwrite").code == 0
+    assert read_report(Path("out/sphere"))["n_lights"] == 4
+
+
+def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
+    run("infer", capture, "--method", "ls")
+    Path("out/sphere/notes.txt").write_text("mine")
+    (capture / "normals_gt.npy").unlink()
+    run("infer", capture, "--method", "ls", "--overwrite")
+    names = sorted(path.name for path in Path("out/sphere").iterdir())
+    assert names == ["normals.npy", "normals.png", "notes.txt", "report.json"]
+
+
+def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
+    make_capture("broken")
+    Path("broken/image3.png").write_bytes(b"no picture")
+    make_capture("third")
+    result = run("infer", capture, "broken", "third", "--method", "ls")
+    assert result.code == 3
+    golden("batch.out.txt", result.out)
+    golden("batch.err.txt", result.err)
+    assert sorted(path.name for path in Path("out").iterdir()) == ["sphere", "third"]
+
+    documents = json.loads(run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out)
+    assert documents[0] == read_report(Path("out/sphere"))
+    assert documents[1]["capture"] == "broken"
+    assert "image3.png" in documents[1]["error"]
+
+
+def test_output_that_cannot_be_written(capture, run, golden):
+    Path("out").write_text("a file where the folder should be")
+    result = run("infer", capture, "--method", "ls")
+    assert result.code == 5
+    golden("error_output.txt", result.err)
+
+
+def test_interrupted_while_estimating(capture, run, monkeypatch):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LeastSquares, "estimate", interrupt)
+    result = run("infer", capture, "--method", "ls")
+    assert (result.code, result.out, result.err) == (130, "", "splinecli: interrupted.\n")
+    assert not Path("out").exists()
+
+
+def test_interrupted_while_writing(capture, run, monkeypatch):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("splinecli.outputs.encode_png", interrupt)
+    assert run("infer", capture, "--method", "ls").code == 130
+    assert list(Path("out").iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_ctrl_c_ends_a_real_process(capture):
+    command = [sys.executable, "-m", "splinecli", "train", "-o", "run", "--minutes", "10"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not Path("run/config.json").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "splinecli: interrupted.\n")
+    assert not [path for path in Path("run").iterdir() if path.name.startswith(".")]
+
+
+def test_a_defect_is_called_one(capture, run, monkeypatch):
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr(LeastSquares, "estimate", fail)
+    result = run("infer", capture, "--method", "ls")
+    assert result.code == 1
+    assert "ZeroDivisionError: oops" in result.err
+    assert result.err.endswith("splinecli: this is a defect of splinecli; please report it with the lines above.\n")
