@@ -52,7 +52,17 @@ def main() -> None:
         seconds = []
         for _ in range(3):
             with tempfile.TemporaryDirectory() as out:
-                command = [sys.executable, "-m", "splinecli", "infer", sys.argv[1], "--n-lights", "10", "-o", out]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "splinecli",
+                    "infer",
+                    sys.argv[1],
+                    "--n-lights",
+                    "10",
+                    "-o",
+                    out,
+                ]
                 started = time.perf_counter()
                 subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
                 seconds.append(time.perf_counter() - started)

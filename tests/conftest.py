@@ -8,7 +8,9 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff")
+    parser.addoption(
+        "--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff"
+    )
 
 
 @pytest.fixture(scope="session")

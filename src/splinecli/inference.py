@@ -38,7 +38,7 @@ def estimate_normals(
     tile_pixels: int = TILE_PIXELS,
     progress: Callable[[int], None] | None = None,
 ) -> NormalEstimate:
-    """Run an estimator over a capture, `tile_pixels` at a time; `progress` is called with the pixels just done."""
+    """Run an estimator over a capture, `tile_pixels` at a time; `progress` is told the pixels just done."""
     started = time.perf_counter()
     normals = np.empty((capture.n_pixels, 3), np.float32)
     for start in range(0, capture.n_pixels, tile_pixels):

@@ -5,18 +5,21 @@ Frame: x right, y up, z to the camera (docs/conventions.md).
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Convention = Literal["opengl", "directx"]
 
+_Float = TypeVar("_Float", bound=np.floating)
 
-def unit(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+
+def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
     """Scale vectors (..., 3) to unit length; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    scaled: NDArray[_Float] = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    return scaled
 
 
 def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -38,18 +41,19 @@ def encode_picture(
     bits: int = 16,
     convention: Convention = "opengl",
 ) -> NDArray[np.unsignedinteger]:
-    """A normal map (H, W, 3) as an RGB picture, (n + 1) / 2 scaled to 8 or 16 bits; black outside the mask (H, W).
+    """A normal map (H, W, 3) as an RGB picture, (n + 1) / 2 in 8 or 16 bits; black outside the mask (H, W).
 
     "opengl" keeps green for y up; "directx" flips it.
     """
     signs = np.array([1.0, 1.0 if convention == "opengl" else -1.0, 1.0])
     top = 2**bits - 1
-    picture = np.rint((normals * signs + 1) / 2 * top) * mask[..., None]
-    return picture.astype(np.uint8 if bits == 8 else np.uint16)
+    picture: NDArray[np.float64] = np.rint((normals * signs + 1) / 2 * top) * mask[..., None]
+    return picture.astype(np.uint8) if bits == 8 else picture.astype(np.uint16)
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     """Unit normals (H, W, 3) from an 8- or 16-bit RGB picture (y up); black pixels become zero vectors."""
     top = np.iinfo(picture.dtype).max
     decoded: NDArray[np.float64] = unit(picture.astype(np.float64) * 2 / top - 1)
-    return decoded * (picture != 0).any(axis=-1, keepdims=True)
+    decoded[~picture.any(axis=-1)] = 0
+    return decoded

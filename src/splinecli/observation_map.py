@@ -3,9 +3,9 @@
 A map is a square of `size` x `size` cells over the plane (x, y) of the light directions' orthographic
 projection, [-1, 1] x [-1, 1]. Column 0 is x = -1; row 0 is y = +1, so that a map shown as a picture is the
 sky as the object sees it, y up. All cells are equally wide (2 / size) and the view axis runs through the
-corner shared by the four middle
-cells: rotations by 90 degrees and mirror images are exact permutations of cells. CNN-PS (Ikehata, ECCV 2018)
-and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2), whose last cell is a single point.
+corner shared by the four middle cells: rotations by 90 degrees and mirror images are exact permutations of
+cells. CNN-PS (Ikehata, ECCV 2018) and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2),
+whose last cell is a single point.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def light_cells(light_directions: Tensor, size: int = MAP_SIZE) -> Tensor:
 
 @lru_cache(maxsize=8)
 def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
-    """Light directions at the cells' centres, (size, size, 3), and the cells inside the unit disc, (size, size) bool.
+    """Light directions at the cells' centres (size, size, 3), and which are in the unit disc (size, size).
 
     Cells outside the disc hold no possible light; their direction is a zero vector.
     """
@@ -71,7 +71,7 @@ def sparse_map(
 
 
 def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:
-    """The largest valid observation of each pixel (P, 1), by which its maps are divided; 1 for an all-zero pixel."""
+    """The largest valid observation of each pixel (P, 1), which divides its maps; 1 for an all-zero pixel."""
     if valid is not None:
         observations = observations * valid
     largest = observations.amax(dim=1, keepdim=True)
@@ -79,6 +79,6 @@ def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:
 
 
 def rotate_about_view_axis(vectors: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-    """Turn vectors (..., 3) counterclockwise about +z by the angle with this cosine and sine (broadcast over ...)."""
+    """Turn vectors (..., 3) counterclockwise about +z; cosine and sine of the angle broadcast over (...)."""
     x, y, z = vectors.unbind(-1)
     return torch.stack((cosine * x - sine * y, sine * x + cosine * y, z), dim=-1)

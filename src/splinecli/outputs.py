@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
 
-Format = Literal["png", "npy", "tiff"]
 NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
 ERROR_MAP = "error_map.png"
 REPORT = "report.json"
@@ -32,7 +31,9 @@ OWN_FILES = (*NORMALS.values(), ERROR_MAP, REPORT)
 def check_free(folder: Path, *, overwrite: bool) -> None:
     """Raise OutputError where the folder holds results already and may not be overwritten, or is no folder."""
     if folder.exists() and not folder.is_dir():
-        raise OutputError("is a file; the results need a folder", path=folder, hint="Choose another place with -o")
+        raise OutputError(
+            "is a file; the results need a folder", path=folder, hint="Choose another place with -o"
+        )
     if overwrite:
         return
     for name in OWN_FILES:
@@ -72,7 +73,7 @@ def write_estimate(
     report: dict[str, Any],
     folder: Path,
     *,
-    formats: Sequence[Format],
+    formats: Sequence[str],
     convention: Convention,
 ) -> dict[str, Any]:
     """Write the files into `folder`, replacing those of an earlier run there; returns the finished report.
@@ -105,7 +106,7 @@ def write_estimate(
     return report
 
 
-def encode(estimate: NormalEstimate, form: Format, convention: Convention) -> bytes:
+def encode(estimate: NormalEstimate, form: str, convention: Convention) -> bytes:
     """The normal map as a 16-bit PNG picture, or as float32 NPY or TIFF."""
     buffer = io.BytesIO()
     if form == "png":

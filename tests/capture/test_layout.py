@@ -192,3 +192,13 @@ def test_find_captures_finds_none(tmp_path: Path) -> None:
     assert str(caught.value) == f"{tmp_path / 'empty'}: {message}"
     with pytest.raises(InputError, match="the folder does not exist"):
         find_captures(tmp_path / "nowhere")
+
+
+def test_psbox(tmp_path: Path) -> None:
+    folder = fill(
+        tmp_path / "demo", "Objects/b2.png", "Objects/b10.png", "LightProbe-1/ref.jpg", "light_directions.txt"
+    )
+    files = find_capture_files(folder)
+    assert files.images == (folder / "Objects/b2.png", folder / "Objects/b10.png")
+    assert (files.name, files.light_directions) == ("demo", folder / "light_directions.txt")
+    assert (files.mask, files.ground_truth) == (None, None)

@@ -1,4 +1,4 @@
-"""`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes wrong on the way."""
+"""`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes wrong."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def test_writes_the_contract(capture, truth, run, golden):
 def test_directx_flips_green(capture, run):
     run("infer", capture, "--method", "ls", "-o", "gl")
     run("infer", capture, "--method", "ls", "-o", "dx", "--convention", "directx")
-    opengl, directx = (cv2.imread(f"{out}/sphere/normals.png", cv2.IMREAD_UNCHANGED).astype(int) for out in ("gl", "dx"))
+    opengl, directx = (
+        cv2.imread(f"{out}/sphere/normals.png", cv2.IMREAD_UNCHANGED).astype(int) for out in ("gl", "dx")
+    )
     inside = opengl.any(axis=-1)
     assert (np.abs(opengl + directx - 65535)[inside][:, 1] <= 1).all()
     np.testing.assert_array_equal(opengl[..., [0, 2]], directx[..., [0, 2]])
@@ -78,7 +80,9 @@ def test_lights_by_index_and_by_draw(capture, run):
     chosen = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
     assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])
     draws = [
-        json.loads(run("infer", capture, "--method", "ls", "--n-lights", 4, "--seed", s, "--json", "--overwrite").out)
+        json.loads(
+            run("infer", capture, "--method", "ls", "--n-lights", 4, "--seed", s, "--json", "--overwrite").out
+        )
         for s in (0, 0, 1)
     ]
     assert [draw["n_lights"] for draw in draws] == [4, 4, 4]
@@ -90,7 +94,9 @@ def test_files_given_go_before_the_folders(capture, run):
     (capture / "light_directions.txt").unlink()
     np.savetxt("l.txt", lights)
     cv2.imwrite("m.png", np.pad(np.full((2, 3), 255, np.uint8), ((4, 18), (5, 16))))
-    report = json.loads(run("infer", capture, "--method", "ls", "--lights", "l.txt", "--mask", "m.png", "--json").out)
+    report = json.loads(
+        run("infer", capture, "--method", "ls", "--lights", "l.txt", "--mask", "m.png", "--json").out
+    )
     assert report["n_pixels"] == 6
     assert report["angular_error_deg"]["mean"] < 1e-3
 
@@ -205,4 +211,6 @@ def test_a_defect_is_called_one(capture, run, monkeypatch):
     result = run("infer", capture, "--method", "ls")
     assert result.code == 1
     assert "ZeroDivisionError: oops" in result.err
-    assert result.err.endswith("splinecli: this is a defect of splinecli; please report it with the lines above.\n")
+    assert result.err.endswith(
+        "splinecli: this is a defect of splinecli; please report it with the lines above.\n"
+    )

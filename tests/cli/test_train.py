@@ -15,7 +15,9 @@ def small_runs(tmp_path, monkeypatch):
     from splinecli.networks.config import NetworkConfig
     from splinecli.training import config, loop
 
-    tiny = config.TrainingConfig(network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16)
+    tiny = config.TrainingConfig(
+        network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16
+    )
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(loop, "VALIDATION_PIXELS", 32)
     monkeypatch.chdir(tmp_path)
@@ -40,7 +42,9 @@ def test_a_run_and_its_continuation(run):
 
 def test_the_weights_work(run, make_capture):
     run("train", "-o", "run", "--steps", 1, "--quiet")
-    report = json.loads(run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out)
+    report = json.loads(
+        run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
+    )
     assert report["weights"]["name"] == "weights"
     assert report["angular_error_deg"]["mean"] < 5
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from splinecli.capture import diligent, plain_folder
+from splinecli.capture import diligent, plain_folder, psbox
 from splinecli.capture.capture_files import (
     FILENAMES,
     LIGHT_DIRECTIONS,
@@ -20,7 +20,7 @@ from splinecli.errors import InputError
 StrPath = str | os.PathLike[str]
 
 # Special before general: a plain folder takes whatever holds images.
-_LAYOUTS = (diligent.find, plain_folder.find)
+_LAYOUTS = (diligent.find, psbox.find, plain_folder.find)
 
 
 def find_capture_files(

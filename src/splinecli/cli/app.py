@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from splinecli import __version__
-
+from splinecli.cli.evaluate import evaluate
 from splinecli.cli.infer import infer
 from splinecli.cli.train import train
 
@@ -31,12 +31,14 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _splinecli(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
+        bool,
+        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
     ] = False,
 ) -> None:
     pass
 
 
 app.command()(infer)
+app.command()(evaluate)
 
 app.command()(train)

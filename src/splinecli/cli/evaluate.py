@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,13 +25,18 @@ from splinecli.cli.options import (
 from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
+if TYPE_CHECKING:
+    from splinecli.evaluation.records import Evaluation, Progress
+
 
 def evaluate(
     datasets: Annotated[
-        list[Path], typer.Argument(metavar="DATASET", help="Folders of captures with ground truth, or such captures.")
+        list[Path],
+        typer.Argument(metavar="DATASET", help="Folders of captures with ground truth, or such captures."),
     ],
     method: Annotated[
-        list[str] | None, typer.Option(metavar="M", help="Method to score; may be repeated. [default: spline-net]")
+        list[str] | None,
+        typer.Option(metavar="M", help="Method to score; may be repeated. [default: spline-net]"),
     ] = None,
     weights: WeightsOption = None,
     n_lights: Annotated[
@@ -39,7 +45,14 @@ def evaluate(
     trials: Annotated[int, typer.Option(metavar="T", min=1, help="Random draws of the lights.")] = 20,
     seed: SeedOption = 0,
     draws: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Use these draws: a line of light indices, from 0, each.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Use these draws: a line of light indices, from 0, each."),
+    ] = None,
+    light_noise_deg: Annotated[
+        list[float] | None,
+        typer.Option(
+            metavar="SIGMA", min=0, help="Tilt the lights by Gaussian errors; may be repeated. [default: 0]"
+        ),
     ] = None,
     max_pixels: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Score a random part of each capture's pixels.")
@@ -49,8 +62,8 @@ def evaluate(
     device: DeviceOption = Device.auto,
     precision: PrecisionOption = Precision.auto,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results. [default: evaluation]")
-    ] = None,
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")
+    ] = Path("evaluation"),
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
@@ -59,3 +72,88 @@ def evaluate(
     All methods see the same draws. Writes OUT/results.json, results.csv and table.md, and prints the table. A capture
     that cannot be scored is named and passed over; the exit code is then 3.
     """
+    from splinecli.capture import find_captures
+    from splinecli.evaluation.protocol import evaluate as score
+    from splinecli.evaluation.records import Protocol
+    from splinecli.evaluation.tables import markdown, results_csv, results_document
+    from splinecli.files import write_text
+    from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, make_estimator
+
+    if draws is not None and n_lights:
+        raise UsageError("--draws and --n-lights exclude each other", hint="The draws say how many lights")
+    counts = [None] if draws is not None else [_light_count(text) for text in n_lights or ["10"]]
+    protocols = [
+        Protocol(count, trials, seed, draws, light_noise_deg=noise, max_pixels=max_pixels)
+        for count in counts
+        for noise in light_noise_deg or [0.0]
+    ]
+    methods = method or [DEFAULT_METHOD]
+    for name in methods:
+        check_method(name)
+    captures = [capture for dataset in datasets for capture in find_captures(dataset)]
+    options = MethodOptions(weights, rotations, batch_size, device.value, precision.value)
+    estimators = [make_estimator(name, options) for name in methods]
+    talk = Talk(quiet=quiet)
+    evaluations = []
+    with talk.progress("evaluating", len(protocols)) as advance:
+        for protocol in protocols:
+            evaluations.append(score(captures, estimators, protocol, on_progress=_follow(advance, methods)))
+    document = results_document(evaluations)
+    text = json.dumps(document, indent=2) + "\n"
+    write_text(output / "results.csv", results_csv(evaluations))
+    write_text(output / "table.md", markdown(evaluations))
+    write_text(output / "results.json", text)
+    for skipped in document["skipped"]:
+        print(f"splinecli: {skipped['capture']} was passed over: {skipped['reason']}", file=sys.stderr)
+    if as_json:
+        print(text, end="")
+    elif not quiet:
+        for evaluation in evaluations:
+            _print_table(evaluation, with_title=len(evaluations) > 1)
+    return InputError.exit_code if document["skipped"] else 0
+
+
+def _light_count(text: str) -> int | None:
+    """A number of lights, None for "all". Raises UsageError."""
+    if text == "all":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
+
+
+def _follow(advance: Callable[[float], None], methods: list[str]) -> Callable[[Progress], None]:
+    """A callback that advances a bar by 1 over all captures and methods; reading counts for nothing."""
+    shown = 0.0
+
+    def follow(progress: Progress) -> None:
+        nonlocal shown
+        if progress.method is None:
+            return
+        within = (methods.index(progress.method) + progress.done / progress.total) / len(methods)
+        now = (progress.number - 1 + within) / progress.n_captures
+        advance(now - shown)
+        shown = now
+
+    return follow
+
+
+def _print_table(evaluation: Evaluation, *, with_title: bool) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from splinecli.evaluation.tables import best_cells, heading, table_rows
+
+    rows = table_rows(evaluation)
+    best = best_cells(rows)
+    title = f"MAE in degrees, {heading(evaluation.protocol)}" if with_title else None
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    for column, name in enumerate(rows[0]):
+        table.add_column(name, justify="right" if column else "left", no_wrap=True)
+    for number, row in enumerate(rows[1:], start=1):
+        table.add_row(
+            *(f"[bold]{cell}[/]" if (number, column) in best else cell for column, cell in enumerate(row))
+        )
+    Console(highlight=False).print(table)

@@ -60,7 +60,8 @@ def infer(
         Path | None, typer.Option(metavar="FILE", help="Picture that is bright on the object. [default: all]")
     ] = None,
     ground_truth: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF) to compare with.")
+        Path | None,
+        typer.Option(metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF) to compare with."),
     ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Results go to OUT/<capture name>/.")
@@ -182,10 +183,10 @@ class _Job:
         return write_estimate(estimate, report, target, formats=self.formats, convention=self.convention)
 
     def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
-        from splinecli.evaluation.draws import draw_lights
-
         if self.n_lights is None:
             return self.light_indices
+        from splinecli.evaluation.draws import draw_lights
+
         return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
 
 

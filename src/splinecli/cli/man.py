@@ -29,7 +29,10 @@ FILES = (
     ("OUT/NAME/normals.png", "Normal map, 16-bit RGB, (n + 1) / 2."),
     ("OUT/NAME/normals.npy", "Normal map, float32, H x W x 3, zero outside the mask."),
     ("OUT/NAME/error_map.png", "Angular error with a colour bar, where there is ground truth."),
-    ("OUT/NAME/report.json", "What was done, with which weights, how long it took, how large the errors are."),
+    (
+        "OUT/NAME/report.json",
+        "What was done, with which weights, how long it took, how large the errors are.",
+    ),
 )
 ENVIRONMENT = (
     ("COLUMNS", "Width of the help texts and tables."),
@@ -41,8 +44,14 @@ EXAMPLES = (
     ("splinecli infer obj/ --lights l.txt", "Normals of one object from all its images."),
     ("splinecli infer catPNG --n-lights 10 --seed 0 --json", "From ten lights, the report on stdout."),
     ("splinecli infer captures/* -o results --overwrite", "A folder of captures."),
-    ("splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20", "Methods compared."),
-    ("splinecli train -o runs/mine --minutes 90", "New weights; then --weights runs/mine/weights.safetensors."),
+    (
+        "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
+        "Methods compared.",
+    ),
+    (
+        "splinecli train -o runs/mine --minutes 90",
+        "New weights; then --weights runs/mine/weights.safetensors.",
+    ),
 )
 
 
@@ -57,15 +66,22 @@ def man_page() -> str:
         ".SH SYNOPSIS",
     ]
     commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
-    contexts = {name: command.context_class(command, info_name=name, parent=context) for name, command in commands.items()}
+    contexts = {
+        name: command.context_class(command, info_name=name, parent=context)
+        for name, command in commands.items()
+    }
     for name, command in commands.items():
-        lines += [f".B splinecli {name}", _escape(" ".join(command.collect_usage_pieces(contexts[name]))), ".br"]
+        lines += [
+            f".B splinecli {name}",
+            _escape(" ".join(command.collect_usage_pieces(contexts[name]))),
+            ".br",
+        ]
     lines += [".SH DESCRIPTION", _escape(group.help), ".SH COMMANDS"]
     for name, command in commands.items():
         lines += [f".SS {name}"]
         for paragraph in inspect.cleandoc(command.help).split("\n\n"):
             lines += [_escape(" ".join(paragraph.split())), ".PP"]
-        for parameter in command.params:
+        for parameter in command.get_params(contexts[name]):
             record = parameter.get_help_record(contexts[name])
             if record:
                 lines += _entry(*record)

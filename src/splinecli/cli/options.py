@@ -28,12 +28,19 @@ class Precision(StrEnum):
 
 WeightsOption = Annotated[
     str | None,
-    typer.Option("--weights", metavar="NAME|FILE", help="Shipped weights by name, or a file. [default: the method's]"),
+    typer.Option(
+        "--weights", metavar="NAME|FILE", help="Shipped weights by name, or a file. [default: the method's]"
+    ),
 ]
 RotationsOption = Annotated[
-    int, typer.Option("--rotations", metavar="R", min=1, help="Views of each pixel to average: slower, a little better.")
+    int,
+    typer.Option(
+        "--rotations", metavar="R", min=1, help="Views of each pixel to average: slower, a little better."
+    ),
 ]
-DeviceOption = Annotated[Device, typer.Option("--device", help="Where to compute; auto takes a CUDA GPU if any.")]
+DeviceOption = Annotated[
+    Device, typer.Option("--device", help="Where to compute; auto takes a CUDA GPU if any.")
+]
 PrecisionOption = Annotated[
     Precision, typer.Option("--precision", help="auto takes bfloat16 where the hardware computes in it.")
 ]
@@ -41,7 +48,9 @@ BatchSizeOption = Annotated[
     int | None, typer.Option("--batch-size", metavar="N", min=1, help="Pixels at a time in the network.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")
+]
 SeedOption = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the random draws.")]
 
 
@@ -50,7 +59,9 @@ def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
     items = [item.strip() for item in text.split(",") if item.strip()]
     for item in items:
         if item not in allowed:
-            raise UsageError(f"{option} holds {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}")
+            raise UsageError(
+                f"{option} holds {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}"
+            )
     if not items:
         raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
     return items

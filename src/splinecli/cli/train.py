@@ -26,7 +26,9 @@ def train(
         float | None, typer.Option(metavar="M", min=0.01, help="Length in minutes, instead of steps.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
-    seed: Annotated[int | None, typer.Option(metavar="S", min=0, help="Seed of the run. [default: 0]")] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="S", min=0, help="Seed of the run. [default: 0]")
+    ] = None,
     device: DeviceOption = Device.auto,
     quiet: QuietOption = False,
 ) -> None:

@@ -12,8 +12,11 @@ from splinecli.normals import angle_between_deg
 
 @dataclass(frozen=True)
 class AngularErrors:
-    """Over the pixels that have a ground truth: mean (MAE), median and 90th percentile in degrees; and the shares of
-    pixels, 0 to 1, with an error under 5 and under 10 degrees."""
+    """Over the pixels that have a ground truth.
+
+    mean (MAE), median, p90 (90th percentile): degrees; under_5, under_10: shares of the pixels, 0 to 1,
+    with an error under 5 and 10 degrees.
+    """
 
     mean: float
     median: float
@@ -25,7 +28,7 @@ class AngularErrors:
 def angular_error_map_deg(
     normals: NDArray[np.floating], ground_truth: NDArray[np.floating], mask: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Errors (H, W) of normal maps (H, W, 3) inside the mask; NaN elsewhere and where the ground truth is zero.
+    """Errors (H, W) of normal maps (H, W, 3) in the mask; NaN elsewhere and where the ground truth is zero.
 
     Signed directions count: a normal that points the wrong way is 180 degrees off, not 0.
     """

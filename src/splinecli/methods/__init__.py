@@ -1,4 +1,4 @@
-"""The methods by name. A new method is one new file and one entry here; imports happen when a method is made."""
+"""The methods by name. A new method is one new file and one entry here, imported when it is made."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class MethodOptions:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
 
-def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:  # noqa: B008 - frozen
-    """An estimator ready to run. Raises UsageError for an unknown name or device, ModelError for the weights."""
+def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
+    """An estimator ready to run. Raises UsageError (unknown name or device), ModelError (weights)."""
     check_method(name)
     return _METHODS[name](options)
 

@@ -26,7 +26,7 @@ class Estimator(Protocol):
 
     def estimate(
         self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    ) -> NDArray[np.floating]:
         """Unit normals (P, 3), x right, y up, z to the camera.
 
         Args:

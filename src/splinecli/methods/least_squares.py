@@ -1,4 +1,7 @@
-"""LS: Lambertian least squares (R. J. Woodham, "Photometric method for determining surface orientation", 1980)."""
+"""LS: Lambertian least squares.
+
+R. J. Woodham, "Photometric method for determining surface orientation from multiple images", 1980.
+"""
 
 from __future__ import annotations
 

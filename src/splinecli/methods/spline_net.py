@@ -1,4 +1,4 @@
-"""SPLINE-Net as an estimator: batches, devices, precision, and the average over several views of each pixel."""
+"""SPLINE-Net as an estimator: batches, devices, precision, and the average over several views of a pixel."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class NetworkConfig:
 
     @property
     def is_canonical(self) -> bool:
-        """Whether each pixel's lights are turned about the view axis until its Lambertian normal has azimuth zero."""
+        """Whether each pixel's lights are turned until its robust Lambertian normal has azimuth zero."""
         return self.size == "compact"
 
     def to_dict(self) -> dict[str, Any]:
@@ -51,4 +51,10 @@ class NetworkConfig:
                 raise ModelError(
                     f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096"
                 )
-        return cls(**values)
+        config = cls(**values)
+        # Both sizes halve the map twice; an instance norm needs more than one cell after that.
+        if config.map_size % 4 or not 8 <= config.map_size <= 128:
+            raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
+        if config.width < 2:
+            raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
+        return config

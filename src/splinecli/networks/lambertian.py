@@ -15,7 +15,7 @@ ITERATIONS = 5
 
 
 def solve_3x3(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve matrix (P, 3, 3) x = vector (P, 3) by Cramer's rule: far faster than LAPACK for many small systems."""
+    """Solve matrix (P, 3, 3) x = vector (P, 3) by Cramer's rule: far faster than LAPACK for many systems."""
     first, second, third = matrix.unbind(-1)
     minor = torch.linalg.cross(second, third)
     determinant = (first * minor).sum(-1, keepdim=True)

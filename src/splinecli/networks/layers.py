@@ -9,7 +9,7 @@ PATCH = 4
 
 
 class ResidualBlock(nn.Module):
-    """x + conv3x3(relu(conv3x3(relu(x)))), (P, C, h, w) -> the same. Starts as the identity, so needs no norm."""
+    """x + conv3x3(relu(conv3x3(relu(x)))), (P, C, h, w) -> the same. Starts as the identity, with no norm."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -27,9 +27,8 @@ class MapEncoder(nn.Module):
     """Maps (P, C, w, w) -> features (P, width, w / 4, w / 4).
 
     Every 4 x 4 patch of cells becomes one position (a space-to-depth step, where a CPU is fastest), tagged
-    with a learned
-    embedding of where it lies: cells are light directions, so a map, unlike a photograph, is not translation
-    invariant.
+    with a learned embedding of where it lies: cells are light directions, so a map, unlike a photograph, is
+    not translation invariant.
     """
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:

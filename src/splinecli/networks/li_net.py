@@ -9,7 +9,7 @@ from splinecli.networks.layers import PATCH, MapEncoder
 
 
 class PaperLINet(nn.Module):
-    """The authors' generator (Zheng et al., ICCV 2019): (P, 1, w, w) -> (P, 1, w, w) in 0..1; 8.40 M parameters.
+    """The authors' generator (Zheng et al., ICCV 2019): (P, 1, w, w) -> the same, in 0..1; 8.40 M parameters.
 
     7x7 conv to 64; two stride-2 4x4 convs to 128 and 256; six residual blocks; two transposed convs back; 7x7
     conv; sigmoid; instance norm between.
@@ -52,7 +52,7 @@ class _PaperResidualBlock(nn.Module):
 
 
 class CompactLINet(nn.Module):
-    """An encoder-decoder on quarter-resolution patches: (P, C, w, w) -> (P, 1, w, w), a correction, zero at first."""
+    """An encoder-decoder on 4 x 4 patches: (P, C, w, w) -> a correction (P, 1, w, w), zero at first."""
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
         super().__init__()

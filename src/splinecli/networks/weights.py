@@ -1,4 +1,4 @@
-"""Weight files: safetensors that carry their network's configuration and a checksum. Nothing is ever unpickled."""
+"""Weight files: safetensors with their network's configuration and a checksum. Nothing is ever unpickled."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -24,7 +25,7 @@ SHIPPED = resources.files("splinecli") / "assets"
 
 @dataclass(frozen=True)
 class LoadedNetwork:
-    """A network ready to estimate (float32, evaluation mode), the name it was asked by and its file's SHA-256."""
+    """A network ready to estimate (float32, evaluation mode), the name it was asked by, the SHA-256."""
 
     network: SplineNet
     name: str
@@ -66,15 +67,27 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
+            found = metadata.get("format", "no format entry")
+            if found != expected_format:
+                problem = f"not splinecli's: found {found}, expected {expected_format}"
+                raise ModelError(problem, path=path, hint=hint)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
         raise ModelError(f"not a safetensors file, or cut short ({error})", path=path, hint=hint) from error
-    found = metadata.get("format", "no format entry")
-    if found != expected_format:
-        raise ModelError(f"not splinecli's: found {found}, expected {expected_format}", path=path, hint=hint)
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
         raise ModelError("damaged: the tensors do not match the checksum in the file", path=path, hint=hint)
     return tensors, metadata
+
+
+def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str, Any]:
+    """The JSON object under a key of a file's metadata, which no checksum covers. Raises ModelError."""
+    try:
+        values = json.loads(metadata.get(key, ""))
+    except json.JSONDecodeError as error:
+        raise ModelError(f"the entry {key!r} in the file is not JSON", path=path) from error
+    if not isinstance(values, dict):
+        raise ModelError(f"the entry {key!r} in the file is not a JSON object", path=path)
+    return values
 
 
 def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) -> None:
@@ -88,15 +101,12 @@ def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) ->
 
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     """Rebuild the network of a weight file. Raises ModelError."""
-    hint = f"--weights takes a file written by 'splinecli train' or one of the names {',
-    '.join(shipped_names())}" tensors, metadata = read_tensors(path, FORMAT, hint)
-    try:
-        values = json.loads(metadata.get("config", ""))
-    except json.JSONDecodeError as error:
-        raise ModelError("the configuration in the file is not JSON", path=path) from error
-    network = SplineNet(NetworkConfig.from_dict(values))
+    names = ", ".join(shipped_names())
+    hint = f"--weights takes a file written by 'splinecli train' or one of the names {names}"
+    tensors, metadata = read_tensors(path, FORMAT, hint)
+    network = SplineNet(NetworkConfig.from_dict(read_json_entry(metadata, "config", path)))
     load_strictly(network, tensors, path)
-    network.eval().to(memory_format=torch.channels_last)
+    network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return LoadedNetwork(network, name or path.stem, hashlib.sha256(path.read_bytes()).hexdigest())
 
 

@@ -112,13 +112,13 @@ def draw_wall(
 
 
 def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tensor:
-    """Light from everywhere (P, 1), as a share of the pixel's albedo: 10^U(-3, -1) for a `share` of pixels, else 0."""
+    """Light from everywhere (P, 1), to be scaled by albedo: 10^U(-3, -1) for a `share` of pixels, else 0."""
     present = _uniform(generator, pixels, 1) < share
     return 10 ** _uniform(generator, pixels, 1, low=-3.0, high=-1.0) * present
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """The directions as calibrated (P, F, 3): each turned by a Gaussian error, sigma U(0, 2) degrees, for a `share`."""
+    """Directions as calibrated (P, F, 3): Gaussian error, sigma U(0, 2) degrees, for a `share` of pixels."""
     pixels = len(directions)
     sigma = _uniform(generator, pixels, 1, 1, high=math.radians(2.0)) * (
         _uniform(generator, pixels, 1, 1) < share

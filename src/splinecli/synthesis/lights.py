@@ -22,8 +22,8 @@ def draw_light_directions(pixels: int, lights: int, generator: torch.Generator) 
 
     A rig's lights fall uniformly, by projected area, into an ellipse of the (x, y) disc: half-axis sin U(20,
     88) degrees, the other U(0.5, 1) of it, turned at random. Half of the rigs lean: their centre is moved by
-    up to 0.35 of the free room around the ellipse (rigs of a copy stand, a shelf, a hand-held lamp from
-    above).
+    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp held above; what then lies
+    outside 0.996 of the disc is drawn in to its rim.
     """
     device = generator.device
 

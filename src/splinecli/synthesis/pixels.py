@@ -1,9 +1,8 @@
 """The online pixel generator: pixels made one by one, in batches, on the device of its random generator.
 
 Each pixel is a scene of its own (normal, material, neighbouring walls, ambient light) that can be asked for
-its
-radiance under any light: under a random rig for the sparse observations, under every cell's direction for the
-complete dense map. After PX-Net (Logothetis et al., ICCV 2021), which trains a per-pixel network without
+its radiance under any light: under a random rig for the sparse observations, under every cell's direction for
+the complete dense map. After PX-Net (Logothetis et al., ICCV 2021), which trains a per-pixel network without
 rendered objects.
 """
 
@@ -52,7 +51,7 @@ class PixelGeneratorConfig:
 
 @dataclass(frozen=True)
 class PixelScene:
-    """P pixels seen from +z. `mixed` holds a second surface for the first M pixels (edges, blends of materials)."""
+    """P pixels seen from +z. `mixed` is a second surface of the first M of them (an edge, two materials)."""
 
     normals: Tensor
     material: Material
@@ -62,7 +61,7 @@ class PixelScene:
     mixed_weight: Tensor | None = None
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Radiance (P, D) under unit lights from directions (D, 3) or (P, D, 3); matte white facing its light is 1."""
+        """Radiance (P, D) under unit lights (D, 3) or (P, D, 3); matte white that faces its light is 1."""
         visible = torch.ones((), device=self.normals.device)
         returned = self.ambient
         for wall in self.walls:
@@ -71,8 +70,8 @@ class PixelScene:
         normal_z = self.normals[:, 2:]
         direct = shade(self.material, dot(self.normals, directions), normal_z, directions[..., 2])
         material = self.material
-        # Light from a wide angle meets the diffuse albedo and, averaged over the lobe, the mirror
-        reflectance. albedo = material.base + 0.08 * material.specular * (1 - material.metallic)
+        # Light from a wide angle meets the diffuse albedo and, averaged over its lobe, the mirror.
+        albedo = material.base + 0.08 * material.specular * (1 - material.metallic)
         total = direct * visible + albedo * returned
         if self.mixed is not None and self.mixed_weight is not None:
             count = len(self.mixed_weight)
@@ -97,7 +96,7 @@ class PixelScene:
         )
 
     def dense_map(self, size: int = MAP_SIZE) -> Tensor:
-        """The complete map (P, 1, size, size): the radiance at every cell's centre, zero outside the unit disc."""
+        """The complete map (P, 1, size, size): radiance at the cells' centres, zero outside the unit disc."""
         directions, inside = cell_directions(size)
         directions, inside = directions.to(self.normals.device), inside.to(self.normals.device)
         dense = self.normals.new_zeros(len(self.normals), 1, size, size)
@@ -107,7 +106,7 @@ class PixelScene:
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """What a capture would hold of P pixels: observations (P, F), light_directions (P, F, 3), valid (P, F) bool.
+    """What a capture holds of P pixels: observations, valid (bool) (P, F) and light_directions (P, F, 3).
 
     `scene` is the truth behind them and `exposure` (P, 1) the factor from its radiance to the observations.
     """
@@ -120,14 +119,14 @@ class PixelBatch:
 
 
 def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
-    """Unit normals (P, 3) towards the camera, uniform by projected area: as often as a sphere's pixels show them."""
+    """Unit normals (P, 3) towards the camera, uniform by projected area: as a sphere's pixels show them."""
     radius = 0.997 * torch.sqrt(torch.rand(pixels, generator=generator, device=generator.device))
     azimuth = 2 * torch.pi * torch.rand(pixels, generator=generator, device=generator.device)
     return torch.stack((radius * azimuth.cos(), radius * azimuth.sin(), (1 - radius**2).sqrt()), dim=-1)
 
 
 def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tensor:
-    """Normals across an edge: each turned by a random amount (Gaussian, sigma 0.5), still towards the camera."""
+    """Normals across an edge: each moved by a Gaussian of sigma 0.5 and kept towards the camera."""
     moved = normals + 0.5 * torch.randn(normals.shape, generator=generator, device=normals.device)
     moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
     return torch.nn.functional.normalize(moved, dim=1)
@@ -148,8 +147,8 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     count = round(config.mixed_share * pixels)
     if not count:
         return PixelScene(normals, material, walls, ambient)
-    # Every second mixed pixel is an edge; its second surface has the same material, the others the same
-    normal. edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
+    # Every second mixed pixel is an edge, with one material on two normals; the others are two materials.
+    edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
     other = draw_material(count, generator)
     own = material.take(slice(count))
     second = Material(
@@ -162,14 +161,14 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
 
 
 class PixelGenerator:
-    """Draws batches of pixels; reproducible from the seed of `generator`, on whose device everything is made."""
+    """Draws batches of pixels; reproducible from the seed of `generator`, on whose device all is made."""
 
     def __init__(self, config: PixelGeneratorConfig, generator: torch.Generator) -> None:
         self.config = config
         self.generator = generator
 
     def draw(self, pixels: int) -> PixelBatch:
-        """A batch of P pixels, each with lights of its own number and spread; F is the largest number drawn."""
+        """A batch of P pixels, each with lights of its own number and spread; F is the largest number."""
         config, generator = self.config, self.generator
         scene = draw_scene(pixels, config, generator)
         counts = draw_light_counts(

@@ -1,11 +1,15 @@
-"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for one pixel seen from +z.
+"""The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for pixels seen from +z.
 
 Isotropic and gray: a pixel's observation is the mean of its colour channels and the model is all but linear
 in the base colour, so one channel is enough. Every parameter is a tensor (P, 1).
+
+As in Disney's own later code, Smith's shadowing takes the roughness as it is, without the remapping of 2012;
+and the lobe is never narrower than at roughness 0.1, which float32 still resolves.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import torch
@@ -14,7 +18,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Material:
-    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (`specular` may reach 4, as in CyclesPS)."""
+    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (specular to 4, as in CyclesPS)."""
 
     base: Tensor
     metallic: Tensor
@@ -85,7 +89,7 @@ def shade(material: Material, n_dot_l: Tensor, n_dot_v: Tensor, light_z: Tensor)
 
     grazing_90 = 2 * material.roughness * l_dot_h * l_dot_h - 0.5
     diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
-    diffuse = (1 - material.metallic) * (material.base * diffuse + material.sheen * fresnel)
+    diffuse = (1 - material.metallic) * (material.base * diffuse + math.pi * material.sheen * fresnel)
 
     alpha_squared = (material.roughness**4).clamp(min=1e-4)
     f0 = (0.08 * material.specular * (1 - material.metallic) + material.base * material.metallic).clamp(max=1)

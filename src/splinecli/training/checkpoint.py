@@ -10,10 +10,9 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from splinecli.errors import ModelError
 from splinecli.files import write_bytes
 from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import load_strictly, read_tensors, tensors_sha256
+from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, tensors_sha256
 from splinecli.training.config import TrainingConfig
 
 FORMAT = "splinecli-checkpoint-1"
@@ -59,7 +58,7 @@ def save_checkpoint(
 def read_checkpoint_config(path: Path) -> TrainingConfig:
     """The configuration of the run behind a checkpoint. Raises ModelError."""
     _, metadata = _read(path)
-    return TrainingConfig.from_dict(json.loads(metadata["config"]))
+    return TrainingConfig.from_dict(read_json_entry(metadata, "config", path))
 
 
 def load_checkpoint(
@@ -84,12 +83,8 @@ def load_checkpoint(
         states.setdefault(int(index), {})[key] = tensor
     optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
     generator.set_state(tensors["generator"])
-    return Clock(**json.loads(metadata["clock"]))
+    return Clock(**read_json_entry(metadata, "clock", path))
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    tensors, metadata = read_tensors(path, FORMAT, "Start a run with 'splinecli train -o RUN' first")
-    for key in ("config", "clock"):
-        if key not in metadata:
-            raise ModelError(f"the checkpoint holds no {key}", path=path)
-    return tensors, metadata
+    return read_tensors(path, FORMAT, "Start a run with 'splinecli train -o RUN' first")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields, replace
+import math
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from splinecli.errors import ModelError, UsageError
@@ -54,18 +55,42 @@ class TrainingConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainingConfig:
-        """Rebuild a configuration. Raises ModelError for an unknown key."""
+        """Rebuild a configuration. Raises ModelError for an unknown key or a value that cannot be."""
         values = dict(values)
-        network = NetworkConfig.from_dict(values.pop("network", {}))
-        pixels = values.pop("pixels", {})
-        for given, owner in ((values, cls), (pixels, PixelGeneratorConfig)):
-            known = {item.name for item in fields(owner)}
-            unknown = sorted(set(given) - known)
-            if unknown:
-                raise ModelError(
-                    f"unknown training setting {unknown[0]!r}; known are {', '.join(sorted(known))}"
-                )
-        return cls(network=network, pixels=PixelGeneratorConfig(**pixels), **values)
+        network, pixels = values.pop("network", {}), values.pop("pixels", {})
+        for name, table in (("network", network), ("pixels", pixels)):
+            if not isinstance(table, dict):
+                raise ModelError(f"training setting {name!r} is {table!r}; expected a table of settings")
+        _check_settings(values, cls())
+        _check_settings(pixels, PixelGeneratorConfig())
+        return cls(network=NetworkConfig.from_dict(network), pixels=PixelGeneratorConfig(**pixels), **values)
+
+
+_CHOICES = {"schedule": ("cosine", "stepped"), "precision": ("bfloat16", "float32")}
+_AT_LEAST_ONE = ("batch_size", "steps", "min_lights", "max_lights", "usual_lights")
+
+
+def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGeneratorConfig) -> None:
+    """Raise ModelError for a setting that `defaults` does not have, or of another kind than there."""
+    known = vars(defaults)
+    for name, value in values.items():
+        if name not in known or name in ("network", "pixels"):
+            raise ModelError(f"unknown training setting {name!r}; known are {', '.join(sorted(known))}")
+        default = known[name]
+        if name in _CHOICES:
+            expected, fits = " or ".join(map(repr, _CHOICES[name])), value in _CHOICES[name]
+        elif isinstance(default, bool):
+            expected, fits = "true or false", isinstance(value, bool)
+        elif isinstance(default, int):
+            lowest = int(name in _AT_LEAST_ONE)
+            expected = f"a whole number from {lowest}"
+            fits = isinstance(value, int) and not isinstance(value, bool) and value >= lowest
+        else:
+            highest = 1.0 if name.endswith("_share") else math.inf
+            expected = "a number from 0 to 1" if highest == 1 else "a number from 0"
+            fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= highest
+        if not fits:
+            raise ModelError(f"training setting {name!r} is {value!r}; expected {expected}")
 
 
 PRESETS = {

@@ -11,17 +11,19 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
 from splinecli.files import write_text
 from splinecli.networks.spline_net import SplineNet, to_pixel_frame
 from splinecli.networks.weights import save_weights
-from splinecli.synthesis.pixels import PixelBatch, PixelGenerator, PixelGeneratorConfig
+from splinecli.observation_map import MAP_SIZE
+from splinecli.synthesis.pixels import PixelBatch, PixelGenerator
 from splinecli.training.checkpoint import Clock, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.losses import angular_loss, map_loss, masked_map_loss
@@ -67,7 +69,8 @@ class Trainer:
         self.folder = folder
         self.device = device
         torch.manual_seed(config.seed)
-        self.network = SplineNet(config.network).to(device, memory_format=torch.channels_last)
+        self.network = SplineNet(config.network).to(device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(),
@@ -76,15 +79,21 @@ class Trainer:
             weight_decay=config.weight_decay,
         )
         self.generator = torch.Generator(device).manual_seed(config.seed)
+        # Where it is emulated, bfloat16 is slower than float32 and gains nothing.
+        self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
         self.clock = Clock()
         if resume:
             self.clock = load_checkpoint(
                 folder / CHECKPOINT, self.network, self.average, self.optimizer, self.generator
             )
+            _drop_metrics_after(self.clock.step, folder / METRICS)
         elif (folder / CHECKPOINT).exists():
             raise OutputError(
                 "holds a run already", path=folder, hint="Go on with --resume, or choose another -o"
             )
+        else:
+            # Of a run that ended before its first checkpoint.
+            (folder / METRICS).unlink(missing_ok=True)
         write_text(folder / "config.json", json.dumps(config.to_dict(), indent=2) + "\n")
         self.pixels = PixelGenerator(config.pixels, self.generator)
 
@@ -102,15 +111,16 @@ class Trainer:
         """
         validation = validation_set(self.config, self.device)
         sums, count = torch.zeros(3), 0
-        saved = started = time.monotonic() - self.clock.seconds
         saved = time.monotonic()
+        started = saved - self.clock.seconds
         while True:
             finished = self.progress >= 1
             if (count == REPORT_STEPS or finished) and count:
                 due = finished or time.monotonic() - saved > CHECKPOINT_SECONDS
-                metrics = self._metrics(
-                    sums / count, validation_deg(self.average, validation) if due else None
+                checked_deg = (
+                    validation_deg(self.average, validation, bfloat16=self.bfloat16) if due else None
                 )
+                metrics = self._metrics(sums / count, checked_deg)
                 self._append(metrics)
                 if due:
                     self.save()
@@ -131,6 +141,8 @@ class Trainer:
     def step(self) -> Tensor:
         """One update of both networks on a fresh batch; returns loss, angle in degrees and map error."""
         config = self.config
+        # Dropout draws from the global generator; seeded by the step, it is the same in a resumed run.
+        torch.manual_seed((config.seed * 1_000_003 + self.clock.step) % 2**63)
         rate = learning_rate(config, self.clock.step, self.progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -140,8 +152,11 @@ class Trainer:
         views = self.network.look(
             batch.observations, batch.light_directions, batch.valid, turn_deg=turn, mirror=mirror
         )
-        dense_truth, normal_truth = truth_in_frame(batch, views.cosine, views.sine, views.scale, mirror)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=config.precision == "bfloat16"):
+        size = config.network.map_size
+        dense_truth, normal_truth = truth_in_frame(
+            batch, views.cosine, views.sine, views.scale, mirror, size=size
+        )
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bfloat16):
             dense = self.network.interpolate(views)
             normals = self.network.estimate(views, dense)
         angle = angular_loss(normals, normal_truth)
@@ -153,7 +168,7 @@ class Trainer:
                 f"the loss is {float(loss)} at step {self.clock.step}", hint="Lower the learning rate"
             )
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
         self.optimizer.step()
         self._follow()
@@ -216,12 +231,22 @@ class Trainer:
             raise OutputError(f"cannot be written ({error.strerror})", path=path) from error
 
 
+def _drop_metrics_after(step: int, path: Path) -> None:
+    # Lines come oftener than checkpoints: those after the last one are about to be written again.
+    if path.exists():
+        header, *lines = path.read_text("utf-8").splitlines() or [""]
+        kept = [
+            line for line in lines if line.partition(",")[0].isdigit() and int(line.partition(",")[0]) <= step
+        ]
+        write_text(path, "\n".join([header, *kept]) + "\n")
+
+
 def truth_in_frame(
-    batch: PixelBatch, cosine: Tensor, sine: Tensor, scale: Tensor, mirror: bool
+    batch: PixelBatch, cosine: Tensor, sine: Tensor, scale: Tensor, mirror: bool, *, size: int = MAP_SIZE
 ) -> tuple[Tensor, Tensor]:
-    """Dense map D_gt (P, 1, w, w), at the sparse map's scale and cut at 1, and normals (P, 3), in the pixels' frames."""
+    """In the pixels' frames: D_gt (P, 1, w, w), at the sparse map's scale, cut at 1; normals (P, 3)."""
     scene = batch.scene.rotate(cosine, sine)
-    dense = (scene.dense_map() * (batch.exposure / scale)[..., None, None]).clamp(max=1)
+    dense = (scene.dense_map(size) * (batch.exposure / scale)[..., None, None]).clamp(max=1)
     normals = scene.normals
     if mirror:
         # The cells' centres lie symmetrically, so mirroring y is turning the rows over.
@@ -232,17 +257,17 @@ def truth_in_frame(
 def validation_set(config: TrainingConfig, device: torch.device) -> PixelBatch:
     """Pixels under `usual_lights` lights from a generator of their own: checking never disturbs training."""
     count = config.pixels.usual_lights
-    fixed = PixelGeneratorConfig(**{**vars(config.pixels), "min_lights": count, "max_lights": count})
+    fixed = replace(config.pixels, min_lights=count, max_lights=count)
     return PixelGenerator(fixed, torch.Generator(device).manual_seed(2**31 + config.seed)).draw(
         VALIDATION_PIXELS
     )
 
 
 @torch.no_grad()
-def validation_deg(network: SplineNet, batch: PixelBatch) -> float:
+def validation_deg(network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False) -> float:
     """Mean angular error in degrees."""
     network.eval()
     views = network.look(batch.observations, batch.light_directions, batch.valid)
-    with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16):
+    with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
         normals = network.estimate(views, network.interpolate(views))
     return math.degrees(angular_loss(normals, to_pixel_frame(batch.scene.normals, views)).item())

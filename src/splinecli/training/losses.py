@@ -17,7 +17,7 @@ def angular_loss(normals: Tensor, truth: Tensor) -> Tensor:
 
 
 def map_loss(dense: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
-    """|D - D_gt|, mean over the cells inside the unit disc; dense, truth (P, 1, w, w), inside (1, 1, w, w)."""
+    """|D - D_gt|, mean over the cells in the unit disc; dense, truth (P, 1, w, w), inside (1, 1, w, w)."""
     return ((dense - truth).abs() * inside).sum() / (inside.sum() * len(dense))
 
 

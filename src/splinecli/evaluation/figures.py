@@ -1,0 +1,115 @@
+"""Pictures of angular errors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import UsageError
+
+TOP_DEG = 30.0
+"""Errors from here on share the last colour: large ones are failures alike, small ones need the colours."""
+
+TITLE = "angular error (deg)"
+
+_SMALLEST_HEIGHT = 256  # pixels: a bar with its text fits, and a small map can be seen
+_LARGEST_ENLARGED = 1024  # pixels: no width grows beyond it
+_TEXT_SIZE = 0.45  # OpenCV's font scale in a picture of _USUAL_HEIGHT: capitals of 10 pixels
+_USUAL_HEIGHT = 400
+_BACKGROUND, _INK = 255, 0
+_TICK_STEPS_DEG = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 45)
+_MOST_STEPS = 4
+
+Picture = NDArray[np.uint8]
+
+
+def error_map_picture(error_map_deg: NDArray[np.floating], *, top_deg: float = TOP_DEG) -> Picture:
+    """An error map as an RGB picture (H', W', 3) with a colour bar in degrees at its right.
+
+    Colours go from 0 (viridis' violet) to top_deg and beyond (its yellow); white where there is no error. A
+    map of fewer than 256 rows is enlarged by a whole factor, pixel by pixel, as far as its width stays within
+    1024, and then padded to 256 rows.
+
+    Args:
+        error_map_deg: (H, W) degrees, NaN where there is none.
+
+    Raises:
+        UsageError: top_deg is not a finite angle over 0.
+    """
+    if not 0 < top_deg < math.inf:
+        raise UsageError(f"the error map's scale ends at {top_deg:g} degrees, expected more than 0")
+    picture = colour_errors(error_map_deg, top_deg)
+    height, width = picture.shape[:2]
+    factor = max(1, min(-(-_SMALLEST_HEIGHT // height), _LARGEST_ENLARGED // width))
+    picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    missing = max(0, _SMALLEST_HEIGHT - len(picture))
+    picture = np.pad(
+        picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=_BACKGROUND
+    )
+    return np.hstack([picture, _colour_bar(len(picture), top_deg)])
+
+
+def colour_errors(error_map_deg: NDArray[np.floating], top_deg: float) -> Picture:
+    """The colours (H, W, 3) of errors (H, W), white for NaN."""
+    import cv2
+
+    known = np.isfinite(error_map_deg)
+    shares = np.where(known, error_map_deg, 0) / top_deg
+    levels = np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
+    picture: Picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
+    picture[~known] = _BACKGROUND
+    return picture
+
+
+def _colour_bar(height: int, top_deg: float) -> Picture:
+    """The bar with ticks, labels and the title set upwards: (height, as wide as it needs, 3)."""
+    scale = max(1.0, height / _USUAL_HEIGHT)
+    labels = [(value, f"{value:g}") for value in _ticks_deg(top_deg)]
+    labels[-1] = (top_deg, f"{top_deg:g}+")
+    texts = [_text(label, scale) for _, label in labels]
+    title = np.rot90(_text(TITLE, scale))
+    gap, bar_width, line = round(8 * scale), round(18 * scale), max(1, round(scale))
+    margin = texts[0].shape[0]  # so that the outermost labels are not cut
+    bar_height = height - 2 * margin
+
+    label_x = 3 * gap + bar_width
+    title_x = label_x + max(text.shape[1] for text in texts) + gap
+    panel = np.full((height, title_x + title.shape[1] + gap, 3), _BACKGROUND, np.uint8)
+    column = np.linspace(top_deg, 0, bar_height)[:, None].repeat(bar_width, axis=1)
+    panel[margin : margin + bar_height, 2 * gap : 2 * gap + bar_width] = colour_errors(column, top_deg)
+    for (value, _), text in zip(labels, texts, strict=True):
+        y = margin + round((1 - value / top_deg) * (bar_height - 1))
+        top = min(y - line // 2, margin + bar_height - line)
+        panel[top : top + line, 2 * gap + bar_width : label_x - gap // 2] = _INK
+        _paste(panel, text, y - text.shape[0] // 2, label_x)
+    _paste(panel, title, (height - title.shape[0]) // 2, title_x)
+    return panel
+
+
+def _ticks_deg(top_deg: float) -> list[float]:
+    """Round angles from 0, and the top itself."""
+    step = next((step for step in _TICK_STEPS_DEG if top_deg / step <= _MOST_STEPS), top_deg)
+    ticks = [float(tick) for tick in np.arange(0, top_deg, step)]
+    # A label too near to the top's would run into it.
+    return [tick for tick in ticks if top_deg - tick >= step / 2] + [top_deg]
+
+
+def _text(text: str, scale: float) -> Picture:
+    """A line of text, black on white, cropped to its ink: (h, w)."""
+    import cv2
+
+    font, size, thickness = cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE * scale, max(1, round(scale))
+    (width, height), below = cv2.getTextSize(text, font, size, thickness)
+    canvas = np.full((height + below + 2 * thickness, width + 2 * thickness), _BACKGROUND, np.uint8)
+    cv2.putText(canvas, text, (thickness, height + thickness), font, size, _INK, thickness, cv2.LINE_AA)
+    # OpenCV 4 and 5 draw with different fonts and report different heights; the ink is what it is.
+    ink = canvas < _BACKGROUND
+    rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
+    return canvas[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+
+def _paste(panel: Picture, gray: Picture, y: int, x: int) -> None:
+    height, width = gray.shape
+    panel[y : y + height, x : x + width] = gray[..., None]

@@ -1,0 +1,28 @@
+"""Networks small enough for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.spline_net import SplineNet
+
+
+@pytest.fixture
+def random_network() -> Callable[..., SplineNet]:
+    """Make a network all of whose layers are random: the last ones start at zero, where every symmetry holds."""
+
+    def make(**settings: object) -> SplineNet:
+        tiny = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width": 16}
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            network = SplineNet(NetworkConfig.from_dict(tiny | settings)).eval()
+            for parameter in network.parameters():
+                if not parameter.any():
+                    torch.nn.init.normal_(parameter, std=0.1)
+        return network
+
+    return make

@@ -1,0 +1,42 @@
+"""Network configurations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from splinecli.errors import ModelError
+from splinecli.networks.config import NetworkConfig
+
+
+def test_round_trip() -> None:
+    config = NetworkConfig(size="paper", map_size=16, width=5)
+    assert NetworkConfig.from_dict(config.to_dict()) == config
+    assert NetworkConfig.from_dict({}) == NetworkConfig()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"depth": 3}, "unknown network setting 'depth'; known are size, map_size, width"),
+        ({"size": "huge"}, "network size is 'huge'; expected 'paper' or 'compact'"),
+        ({"width": 0}, "network setting 'width' is 0; expected a whole number from 1 to 4096"),
+        ({"width": 1}, "network setting 'width' is 1; expected at least 2"),
+        ({"width": 64.0}, "'width' is 64.0"),
+        ({"ne_blocks": True}, "'ne_blocks' is True"),
+        ({"head_width": "256"}, "'head_width' is '256'"),
+        ({"li_blocks": 5000}, "'li_blocks' is 5000"),
+        ({"map_size": 30}, "'map_size' is 30; expected 8 to 128 in fours"),
+        ({"map_size": 4}, "'map_size' is 4"),
+        ({"map_size": 4096}, "'map_size' is 4096"),
+    ],
+)
+def test_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        NetworkConfig.from_dict(values)
+
+
+def test_only_the_compact_size_is_canonical() -> None:
+    assert NetworkConfig(size="compact").is_canonical
+    assert not NetworkConfig(size="paper").is_canonical

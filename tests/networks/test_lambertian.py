@@ -1,0 +1,102 @@
+"""The robust Lambertian fit, on pixels made by the Lambertian law."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from splinecli.networks.lambertian import fit_lambertian, solve_3x3
+from splinecli.normals import angle_between_deg
+
+
+def normals_under(limit_deg: float, count: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    azimuth = 2 * torch.pi * torch.rand(count, generator=generator)
+    zenith = torch.deg2rad(limit_deg * torch.rand(count, generator=generator).sqrt())
+    return torch.stack((zenith.sin() * azimuth.cos(), zenith.sin() * azimuth.sin(), zenith.cos()), dim=1)
+
+
+def ring(count: int, zenith_deg: float) -> Tensor:
+    azimuth = torch.arange(count) * (2 * torch.pi / count) + 0.1
+    zenith = torch.deg2rad(torch.tensor(zenith_deg)).expand(count)
+    return torch.stack((zenith.sin() * azimuth.cos(), zenith.sin() * azimuth.sin(), zenith.cos()), dim=1)
+
+
+def error_deg(scaled_normals: Tensor, truth: Tensor) -> np.ndarray:
+    return angle_between_deg(torch.nn.functional.normalize(scaled_normals, dim=1).numpy(), truth.numpy())
+
+
+def to_unit_scale(observations: Tensor) -> Tensor:
+    return observations / observations.amax(dim=1, keepdim=True)
+
+
+def test_pixels_without_shadow_are_recovered_with_their_albedo() -> None:
+    truth, lights = normals_under(30, 500), ring(10, 40)
+    observations = to_unit_scale(truth @ lights.T)
+    assert observations.min() > 0.05  # no light is taken for a shadow
+    scaled = fit_lambertian(observations, lights)
+    assert error_deg(scaled, truth).max() < 0.1
+    albedo = 1 / (truth @ lights.T).amax(dim=1)
+    torch.testing.assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
+
+
+def test_shadows_over_a_third_of_the_lights_are_seen_through() -> None:
+    truth, lights = normals_under(25, 500), ring(12, 40)
+    observations = truth @ lights.T
+    # Four neighbours of the ring lie in cast shadow, elsewhere for every pixel.
+    first = torch.arange(len(truth)) % 12
+    shadowed = (torch.arange(12) - first[:, None]) % 12 < 4
+    observations = to_unit_scale(observations.masked_fill(shadowed, 0.0))
+    plain = observations @ torch.linalg.pinv(lights).T
+    assert error_deg(plain, truth).mean() > 5
+    assert error_deg(fit_lambertian(observations, lights), truth).max() < 0.5
+
+
+def test_a_highlight_counts_less_than_in_least_squares() -> None:
+    truth, lights = normals_under(20, 200), ring(12, 40)
+    observations = truth @ lights.T
+    observations[:, 3] *= 2
+    observations = to_unit_scale(observations)
+    plain = error_deg(observations @ torch.linalg.pinv(lights).T, truth)
+    assert plain.mean() > 4
+    assert error_deg(fit_lambertian(observations, lights), truth).mean() < 0.1 * plain.mean()
+
+
+def test_lights_that_are_not_valid_do_not_count() -> None:
+    truth, lights = normals_under(25, 50), ring(12, 40)
+    observations = to_unit_scale(truth @ lights.T)
+    valid = (torch.arange(12) % 4 != 0).expand(50, 12)
+    garbage = observations.where(valid, torch.tensor(0.9))
+    torch.testing.assert_close(
+        fit_lambertian(garbage, lights, valid),
+        fit_lambertian(observations[:, valid[0]], lights[valid[0]]),
+        atol=1e-5,
+        rtol=1e-4,
+    )
+
+
+@pytest.mark.parametrize("lit", [0, 1, 2])
+def test_too_few_lit_lights_still_give_a_finite_answer(lit: int) -> None:
+    lights = ring(10, 40)
+    observations = torch.zeros(1, 10)
+    observations[:, :lit] = 1
+    scaled = fit_lambertian(observations, lights)
+    assert torch.isfinite(scaled).all()
+    assert scaled.norm() > 0
+    if lit == 0:
+        assert error_deg(scaled, torch.tensor([[0.0, 0.0, 1.0]])).max() < 1e-3
+
+
+def test_solve_3x3_agrees_with_lapack() -> None:
+    generator = torch.Generator().manual_seed(0)
+    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
+    vector = torch.randn(1000, 3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(
+        solve_3x3(matrix, vector), torch.linalg.solve(matrix, vector), rtol=1e-9, atol=1e-9
+    )
+
+
+def test_solve_3x3_of_a_singular_matrix_is_finite() -> None:
+    assert torch.isfinite(solve_3x3(torch.zeros(2, 3, 3), torch.ones(2, 3))).all()

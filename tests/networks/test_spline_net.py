@@ -1,0 +1,187 @@
+"""The whole network between observations and normals: shapes, limits and symmetries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from splinecli.networks.lambertian import fit_lambertian
+from splinecli.networks.spline_net import SplineNet, to_capture_frame, to_pixel_frame
+from splinecli.observation_map import cell_directions, map_scale, rotate_about_view_axis
+from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+
+Make = Callable[..., SplineNet]
+PAPER = {"size": "paper", "map_size": 8}
+FLIP = torch.tensor((1.0, -1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def pixels() -> tuple[Tensor, Tensor]:
+    """64 generated pixels under ten shared lights, in float64 so that no rounding moves a light to another cell."""
+    config = PixelGeneratorConfig(min_lights=10, max_lights=10, light_direction_error_share=0.0)
+    generator = torch.Generator().manual_seed(5)
+    lights = PixelGenerator(config, generator).draw(1).light_directions[0].double()
+    scene = PixelGenerator(config, generator).draw(64).scene
+    return scene.radiance(lights.float()).double(), torch.nn.functional.normalize(lights, dim=1)
+
+
+def turn(vectors: Tensor, degrees: float) -> Tensor:
+    angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
+
+
+@pytest.mark.parametrize("settings", [{}, {"map_size": 16}, PAPER])
+def test_normals_are_unit_vectors(
+    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
+) -> None:
+    observations, lights = pixels
+    with torch.no_grad():
+        normals = random_network(**settings)(observations.float(), lights.float())
+    assert normals.shape == (64, 3)
+    assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("settings", [{}, PAPER])
+def test_dense_map_ends_with_the_unit_disc(
+    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
+) -> None:
+    network = random_network(**settings)
+    with torch.no_grad():
+        dense = network.interpolate(network.look(pixels[0].float(), pixels[1].float()))
+    size = network.config.map_size
+    assert dense.shape == (64, 1, size, size)
+    _, inside = cell_directions(size)
+    assert not dense[:, 0, ~inside].any()
+    assert (dense[:, 0, inside] != 0).float().mean() > 0.9
+
+
+def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
+    pixels: tuple[Tensor, Tensor],
+) -> None:
+    from splinecli.networks.config import NetworkConfig
+
+    observations, lights = pixels
+    network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)).double()
+    expected = torch.nn.functional.normalize(
+        fit_lambertian(observations / map_scale(observations), lights), dim=1
+    )
+    visible = expected[:, 2] > 0.05
+    assert visible.sum() > 50
+    with torch.no_grad():
+        normals = network(observations, lights)
+        dense = network.interpolate(network.look(observations, lights))
+    torch.testing.assert_close(normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False)
+    # Its dense map is that normal's Lambertian one, turned to azimuth 0: symmetric about the x axis.
+    torch.testing.assert_close(dense, dense.flip(2), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("degrees", [90.0, 33.0, -171.5])
+def test_compact_estimates_turn_with_the_lights(
+    random_network: Make, pixels: tuple[Tensor, Tensor], degrees: float
+) -> None:
+    observations, lights = pixels
+    network = random_network().double()
+    with torch.no_grad():
+        here, there = network(observations, lights), network(observations, turn(lights, degrees))
+    torch.testing.assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
+    # The correction is not nothing: without it the fit alone would pass.
+    fit = fit_lambertian(observations / map_scale(observations), lights)
+    assert (here - torch.nn.functional.normalize(fit, dim=1)).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("settings", [{}, PAPER])
+def test_brightness_does_not_matter(
+    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
+) -> None:
+    observations, lights = pixels
+    network = random_network(**settings).double()
+    with torch.no_grad():
+        torch.testing.assert_close(
+            network(observations, lights), network(observations * 137.5, lights), atol=1e-5, rtol=0
+        )
+
+
+@pytest.mark.parametrize("settings", [{}, PAPER])
+def test_order_of_the_lights_does_not_matter(
+    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
+) -> None:
+    observations, lights = pixels
+    order = torch.tensor([3, 1, 4, 0, 5, 9, 2, 6, 8, 7])
+    network = random_network(**settings).double()
+    with torch.no_grad():
+        torch.testing.assert_close(
+            network(observations, lights), network(observations[:, order], lights[order]), atol=1e-5, rtol=0
+        )
+
+
+def test_observations_that_are_not_valid_do_not_matter(
+    random_network: Make, pixels: tuple[Tensor, Tensor]
+) -> None:
+    observations, lights = pixels
+    network = random_network().double()
+    valid = (torch.arange(10) < 7).expand(64, 10)
+    garbage = observations.where(valid, torch.tensor(9.0, dtype=torch.float64))
+    with torch.no_grad():
+        expected = network(observations[:, :7], lights[:7])
+        torch.testing.assert_close(network(garbage, lights, valid), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("settings", [{}, PAPER])
+def test_all_zero_pixels_give_a_unit_normal(
+    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
+) -> None:
+    with torch.no_grad():
+        normals = random_network(**settings)(torch.zeros(3, 10), pixels[1].float())
+    assert torch.isfinite(normals).all()
+    assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
+
+
+def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
+    random_network: Make, pixels: tuple[Tensor, Tensor]
+) -> None:
+    # Turned by t and then mirrored is mirrored and then turned by -t.
+    observations, lights = pixels
+    network = random_network().double()
+    with torch.no_grad():
+        mirrored = network(observations, lights, turn_deg=7.0, mirror=True)
+        expected = network(observations, lights * FLIP, turn_deg=-7.0) * FLIP
+    torch.testing.assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
+    with torch.no_grad():
+        plain = network(observations, lights, turn_deg=7.0)
+    assert (mirrored - plain).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
+    observations, lights = pixels
+    network = random_network().double()
+    views = network.look(observations, lights, turn_deg=torch.linspace(-15, 15, 64), mirror=mirror)
+    vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
+    torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
+    # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or not.
+    fit = fit_lambertian(observations / map_scale(observations), lights)
+    tilted = fit[:, :2].norm(dim=1) > 0.01
+    azimuth = torch.rad2deg(torch.atan2(*to_pixel_frame(fit, views)[:, [1, 0]].unbind(1)))
+    expected = torch.linspace(-15, 15, 64) * (-1 if mirror else 1)
+    torch.testing.assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
+
+
+def test_the_paper_size_looks_without_turning(random_network: Make, pixels: tuple[Tensor, Tensor]) -> None:
+    views = random_network(**PAPER).look(pixels[0].float(), pixels[1].float())
+    assert torch.equal(views.cosine, torch.ones(64))
+    assert not views.sine.any()
+    assert views.sparse.amax(dim=(1, 2, 3)).max() <= 1
+
+
+def test_autocast_does_not_round_the_geometry(random_network: Make, pixels: tuple[Tensor, Tensor]) -> None:
+    observations, lights = pixels[0].float(), pixels[1].float()
+    network = random_network()
+    torch.nn.init.zeros_(network.ne_net.out.weight)  # type: ignore[union-attr,arg-type]
+    torch.nn.init.zeros_(network.ne_net.out.bias)  # type: ignore[union-attr,arg-type]
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        coarse = network(observations, lights)
+    with torch.no_grad():
+        torch.testing.assert_close(coarse, network(observations, lights), atol=1e-6, rtol=0)

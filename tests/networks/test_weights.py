@@ -1,0 +1,172 @@
+"""Weight files: what goes in comes out, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from splinecli.errors import ModelError
+from splinecli.networks import weights
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import FORMAT, load_weights, resolve_weights, save_weights, tensors_sha256
+
+Make = Callable[..., SplineNet]
+
+
+@pytest.fixture
+def saved(random_network: Make, tmp_path: Path) -> Path:
+    save_weights(random_network(), tmp_path / "tiny.safetensors")
+    return tmp_path / "tiny.safetensors"
+
+
+def write_like_splinecli(path: Path, network: SplineNet, tensors: dict[str, Tensor], **changes: str) -> None:
+    metadata = {
+        "format": FORMAT,
+        "config": json.dumps(network.config.to_dict()),
+        "tensors_sha256": tensors_sha256(tensors),
+    }
+    save_file(tensors, path, metadata | changes)
+
+
+@pytest.mark.parametrize("settings", [{}, {"size": "paper", "map_size": 8}])
+def test_round_trip(random_network: Make, tmp_path: Path, settings: dict[str, object]) -> None:
+    network = random_network(**settings)
+    path = tmp_path / "tiny.safetensors"
+    save_weights(network, path)
+    loaded = load_weights(path)
+    assert loaded.network.config == network.config
+    assert not loaded.network.training
+    assert loaded.name == "tiny"
+    assert loaded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    for name, tensor in network.state_dict().items():
+        # float16 keeps 11 bits.
+        torch.testing.assert_close(loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24)
+    lights = torch.nn.functional.normalize(torch.tensor([[0.3, 0, 1], [-0.3, 0.2, 1], [0, -0.4, 1]]), dim=1)
+    observations = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        torch.testing.assert_close(
+            loaded.network(observations, lights), network(observations, lights), atol=5e-3, rtol=0
+        )
+
+
+def test_saving_a_loaded_file_gives_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+    save_weights(load_weights(saved).network, tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
+
+
+def test_every_tensor_and_no_other(random_network: Make, tmp_path: Path) -> None:
+    network, path = random_network(), tmp_path / "odd.safetensors"
+    tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    write_like_splinecli(path, network, tensors)
+    load_weights(path)
+    write_like_splinecli(path, network, tensors | {"extra": torch.zeros(1)})
+    with pytest.raises(ModelError, match="do not fit the configuration"):
+        load_weights(path)
+    write_like_splinecli(path, network, {name: tensors[name] for name in list(tensors)[1:]})
+    with pytest.raises(ModelError, match="do not fit the configuration"):
+        load_weights(path)
+    first = next(iter(tensors))
+    write_like_splinecli(path, network, tensors | {first: tensors[first][:-1].clone()})
+    with pytest.raises(ModelError, match="do not fit the configuration"):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("config", ["", "{", "3", '["width"]', '{"width": -1}', '{"height": 3}'])
+def test_a_configuration_that_cannot_be(random_network: Make, tmp_path: Path, config: str) -> None:
+    network = random_network()
+    tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    write_like_splinecli(tmp_path / "odd.safetensors", network, tensors, config=config)
+    with pytest.raises(ModelError):
+        load_weights(tmp_path / "odd.safetensors")
+
+
+def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
+    whole = saved.read_bytes()
+    for position in range(0, len(whole), 61):
+        saved.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        with pytest.raises(ModelError):
+            load_weights(saved)
+    saved.write_bytes(whole)
+    load_weights(saved)
+
+
+def test_a_changed_weight_is_told_by_the_checksum(saved: Path) -> None:
+    whole = saved.read_bytes()
+    saved.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(ModelError, match="damaged: the tensors do not match the checksum in the file"):
+        load_weights(saved)
+
+
+def test_a_file_cut_short(saved: Path) -> None:
+    saved.write_bytes(saved.read_bytes()[:-100])
+    with pytest.raises(ModelError, match="not a safetensors file, or cut short"):
+        load_weights(saved)
+
+
+def test_somebody_else_s_safetensors(tmp_path: Path) -> None:
+    path = tmp_path / "other.safetensors"
+    # bfloat16, which numpy does not know: the format is read before any tensor.
+    save_file({"weight": torch.zeros(3, dtype=torch.bfloat16)}, path)
+    with pytest.raises(
+        ModelError, match="not splinecli's: found no format entry, expected splinecli-weights-1"
+    ):
+        load_weights(path)
+
+
+def test_nothing_is_unpickled(tmp_path: Path) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[object, tuple[Path]]:
+            return Path.touch, (tmp_path / "exploded",)
+
+    path = tmp_path / "weights.pth"
+    path.write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(ModelError, match="not a safetensors file"):
+        resolve_weights(str(path))
+    torch.save({"weight": torch.zeros(3)}, path)
+    with pytest.raises(ModelError, match="not a safetensors file"):
+        resolve_weights(str(path))
+    assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64])
+def test_files_of_other_kinds(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match="not a safetensors file"):
+        load_weights(path)
+
+
+def test_files_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no such file"):
+        resolve_weights(str(tmp_path / "weights.safetensors"))
+    with pytest.raises(ModelError, match="no such file"):
+        resolve_weights(str(tmp_path))
+    with pytest.raises(ModelError, match="no weights named 'spine-net'"):
+        resolve_weights("spine-net")
+
+
+def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights, "SHIPPED", saved.parent)
+    entry = {"file": saved.name, "sha256": hashlib.sha256(saved.read_bytes()).hexdigest()}
+    (saved.parent / "weights.json").write_text(
+        json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}})
+    )
+    assert resolve_weights("good").name == "good"
+    assert resolve_weights(str(saved)).name == "tiny"
+    with pytest.raises(ModelError, match="the shipped weights 'bad' were changed"):
+        resolve_weights("bad")
+    with pytest.raises(ModelError, match="expected one of bad, good, or a .safetensors file"):
+        resolve_weights("better")
+
+
+def test_what_the_package_ships_is_whole() -> None:
+    for name in weights.shipped_names():
+        assert resolve_weights(name).name == name

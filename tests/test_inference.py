@@ -1,0 +1,71 @@
+"""From a capture to a normal map, with an estimator that is known by heart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture
+from splinecli.inference import estimate_normals
+from splinecli.methods.least_squares import LeastSquares
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+
+
+def bowl(height: int = 13, width: int = 11) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Normals (H, W, 3) that all lights reach, and a mask with holes."""
+    y, x = np.mgrid[1 : -1 : height * 1j, -1 : 1 : width * 1j]
+    normals = np.stack((0.2 * x, 0.2 * y, np.ones_like(x)), axis=-1)
+    mask = x**2 + y**2 < 1
+    mask[height // 2, width // 2] = False
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True), mask
+
+
+def capture(ground_truth: NDArray[np.float64] | None = None) -> Capture:
+    normals, mask = bowl()
+    return Capture("bowl", 0.7 * normals[mask] @ LIGHTS.T, LIGHTS, (0, 1, 2, 3), mask, ground_truth)
+
+
+def test_normals_stand_where_their_pixels_are() -> None:
+    normals, mask = bowl()
+    estimate = estimate_normals(capture(), LeastSquares())
+    assert estimate.normal_map.dtype == np.float32
+    # The observations were rounded to float32.
+    np.testing.assert_allclose(estimate.normal_map[mask], normals[mask], atol=1e-6)
+    assert not estimate.normal_map[~mask].any()
+    assert estimate.error_map_deg is None
+    assert estimate.errors is None
+
+
+@pytest.mark.parametrize("tile_pixels", [1, 7, 10_000])
+def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
+    whole, done = estimate_normals(capture(), LeastSquares()), []
+    tiled = estimate_normals(capture(), LeastSquares(), tile_pixels=tile_pixels, progress=done.append)
+    # Matrix products of other heights may add up in another order.
+    np.testing.assert_allclose(tiled.normal_map, whole.normal_map, atol=1e-6)
+    n_pixels = capture().n_pixels
+    assert sum(done) == n_pixels
+    assert len(done) == -(-n_pixels // tile_pixels)
+    assert max(done) <= tile_pixels
+
+
+def test_errors_against_the_ground_truth() -> None:
+    normals, mask = bowl()
+    # Half of the truth is flipped, and the first row of the mask has none.
+    truth = np.where(np.arange(normals.shape[1])[:, None] % 2, normals, -normals)
+    first = np.flatnonzero(mask.any(axis=1))[0]
+    truth[first] = 0
+    estimate = estimate_normals(capture(truth), LeastSquares())
+    assert estimate.error_map_deg is not None
+    assert estimate.errors is not None
+    scored = mask.copy()
+    scored[first] = False
+    assert np.isnan(estimate.error_map_deg[~scored]).all()
+    expected = np.where(np.arange(mask.shape[1]) % 2, 0.0, 180.0)
+    np.testing.assert_allclose(
+        estimate.error_map_deg[scored], np.broadcast_to(expected, mask.shape)[scored], atol=1e-4
+    )
+    flipped = np.broadcast_to(expected > 0, mask.shape)[scored].mean()
+    assert estimate.errors.mean == pytest.approx(180 * flipped, abs=1e-3)
+    assert estimate.errors.under_5 == pytest.approx(1 - flipped)

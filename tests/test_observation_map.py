@@ -1,0 +1,172 @@
+"""Observation maps: which cell a direction falls on, and the symmetries of what is laid out there."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from splinecli.observation_map import (
+    cell_directions,
+    light_cells,
+    map_scale,
+    rotate_about_view_axis,
+    sparse_map,
+)
+
+SEEDS = st.integers(0, 2**31)
+quick = settings(max_examples=25, deadline=None)
+
+
+def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
+    """Observations (P, F) and shared directions (F, 3) in float64: no light falls on the border of a cell."""
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.randn(lights, 3, generator=generator, dtype=torch.float64)
+    directions[:, 2] = directions[:, 2].abs() + 0.05
+    observations = torch.rand(pixels, lights, generator=generator, dtype=torch.float64)
+    return observations, torch.nn.functional.normalize(directions, dim=-1)
+
+
+# A cell is 1/16 wide; the axis runs between columns 15 and 16 and rows 15 and 16; row 0 is y = +1.
+@pytest.mark.parametrize(
+    ("x", "y", "row", "column"),
+    [
+        (0.01, 0.01, 15, 16),
+        (-0.01, 0.01, 15, 15),
+        (0.01, -0.01, 16, 16),
+        (-0.01, -0.01, 16, 15),
+        (0.0, 0.99, 0, 16),
+        (0.0, 1.0, 0, 16),
+        (0.0, -1.0, 31, 16),
+        (1.0, 0.0, 16, 31),
+        (-1.0, 0.0, 16, 0),
+        (1.0000001, 0.0, 16, 31),
+        # (0.6 + 1) * 16 = 25.6 and (1 - 0.3) * 16 = 11.2
+        (0.6, 0.3, 11, 25),
+    ],
+)
+def test_cell_of_a_known_direction(x: float, y: float, row: int, column: int) -> None:
+    z = math.sqrt(max(0.0, 1 - x * x - y * y))
+    assert light_cells(torch.tensor((x, y, z), dtype=torch.float64)).item() == row * 32 + column
+
+
+@pytest.mark.parametrize("size", [8, 31, 32, 64])
+def test_every_cell_centre_lies_in_its_own_cell(size: int) -> None:
+    directions, inside = cell_directions(size)
+    expected = torch.arange(size * size).view(size, size)
+    assert torch.equal(light_cells(directions, size)[inside], expected[inside])
+    assert directions[inside].norm(dim=-1).sub(1).abs().max() < 1e-6
+    assert not directions[~inside].any()
+
+
+def test_cells_inside_the_disc_fill_a_circle() -> None:
+    _, inside = cell_directions(256)
+    # pi / 4 of the square; the border of 2 pi r cells is counted right to well under one cell in a hundred.
+    assert inside.double().mean().item() == pytest.approx(math.pi / 4, abs=1e-3)
+
+
+def test_values_stand_on_their_cells_and_nowhere_else() -> None:
+    observations = torch.tensor([[0.5, 0.25]])
+    directions = torch.tensor([[0.6, 0.3, 0.7416], [-0.01, -0.01, 0.9999]])
+    maps = sparse_map(observations, directions)
+    expected = torch.zeros(1, 1, 32, 32)
+    expected[0, 0, 11, 25], expected[0, 0, 16, 15] = 0.5, 0.25
+    assert torch.equal(maps.values, expected)
+    assert torch.equal(maps.holds, (expected > 0).float())
+
+
+def test_lights_in_one_cell_are_averaged() -> None:
+    directions = torch.tensor([[0.01, 0.01, 1.0], [0.02, 0.03, 1.0], [0.05, 0.01, 1.0], [0.5, 0.5, 0.7]])
+    values = torch.tensor([[[1.0, 10.0], [0.0, 20.0], [0.5, 60.0], [0.3, 7.0]]])
+    maps = sparse_map(values, directions)
+    torch.testing.assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
+    assert maps.holds.sum() == 2
+    assert maps.holds[0, 0, 15, 16] == 1
+
+
+def test_lights_that_are_not_valid_leave_no_trace() -> None:
+    observations, directions = random_rig(1, 3, 12)
+    valid = torch.arange(12) % 3 != 0
+    with_flags = sparse_map(observations, directions, valid.expand(3, 12))
+    without = sparse_map(observations[:, valid], directions[valid])
+    torch.testing.assert_close(with_flags.values, without.values)
+    assert torch.equal(with_flags.holds, without.holds)
+    bright = torch.where(valid, observations, 100.0)
+    assert torch.equal(map_scale(bright, valid.expand(3, 12)), map_scale(observations[:, valid]))
+
+
+def test_a_zero_observation_still_holds_its_cell() -> None:
+    maps = sparse_map(torch.zeros(1, 1), torch.tensor([[0.0, 0.0, 1.0]]))
+    assert maps.holds.sum() == 1
+    assert not maps.values.any()
+
+
+def test_all_zero_pixels_give_finite_maps() -> None:
+    _, directions = random_rig(2, 1, 10)
+    observations = torch.zeros(4, 10, dtype=torch.float64)
+    scale = map_scale(observations)
+    assert torch.equal(scale, torch.ones(4, 1, dtype=torch.float64))
+    maps = sparse_map(observations / scale, directions)
+    assert torch.isfinite(maps.values).all()
+    assert not maps.values.any()
+
+
+@quick
+@given(SEEDS)
+def test_order_of_lights_does_not_matter(seed: int) -> None:
+    observations, directions = random_rig(seed, 3, 40)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(seed))
+    one, other = sparse_map(observations, directions), sparse_map(observations[:, order], directions[order])
+    torch.testing.assert_close(one.values, other.values)
+    assert torch.equal(one.holds, other.holds)
+
+
+@quick
+@given(SEEDS, st.floats(1e-4, 1e4))
+def test_scaled_images_give_the_same_map(seed: int, factor: float) -> None:
+    observations, directions = random_rig(seed, 3, 10)
+    brighter = observations * factor
+    torch.testing.assert_close(
+        sparse_map(observations / map_scale(observations), directions).values,
+        sparse_map(brighter / map_scale(brighter), directions).values,
+    )
+
+
+@quick
+@given(SEEDS)
+def test_lights_turned_by_90_degrees_turn_the_map(seed: int) -> None:
+    observations, directions = random_rig(seed, 3, 20)
+    zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    turned = sparse_map(observations, rotate_about_view_axis(directions, zero, one))
+    # rot90 with k = 1 turns a picture counterclockwise, as the lights were.
+    torch.testing.assert_close(turned.values, sparse_map(observations, directions).values.rot90(1, (2, 3)))
+
+
+def test_counterclockwise_takes_x_to_y() -> None:
+    turned = rotate_about_view_axis(torch.tensor((1.0, 0.0, 0.5)), torch.tensor(0.0), torch.tensor(1.0))
+    assert torch.equal(turned, torch.tensor((0.0, 1.0, 0.5)))
+
+
+@quick
+@given(SEEDS)
+def test_lights_mirrored_in_y_turn_the_rows_over(seed: int) -> None:
+    observations, directions = random_rig(seed, 3, 20)
+    mirrored = sparse_map(observations, directions * torch.tensor((1.0, -1.0, 1.0)))
+    torch.testing.assert_close(mirrored.values, sparse_map(observations, directions).values.flip(2))
+
+
+def test_lights_of_each_pixel_s_own_are_like_shared_ones() -> None:
+    observations, directions = random_rig(3, 5, 10)
+    shared = sparse_map(observations, directions)
+    own = sparse_map(observations, directions.expand(5, 10, 3))
+    assert torch.equal(shared.values, own.values)
+    assert torch.equal(shared.holds, own.holds)
+    # And they are looked at pixel by pixel.
+    others = random_rig(4, 1, 10)[1]
+    mixed = sparse_map(observations[:2], torch.stack((directions, others)))
+    assert torch.equal(mixed.values[0], shared.values[0])
+    assert torch.equal(mixed.values[1:], sparse_map(observations[1:2], others).values)
