@@ -57,9 +57,11 @@ def test_round_trip(random_network: Make, tmp_path: Path, settings: dict[str, ob
         )
 
 
-def test_saving_a_loaded_file_gives_the_same_bytes(saved: Path, tmp_path: Path) -> None:
-    save_weights(load_weights(saved).network, tmp_path / "again.safetensors")
-    assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
+def test_saving_loaded_weights_loses_nothing_more(saved: Path, tmp_path: Path) -> None:
+    loaded = load_weights(saved).network
+    save_weights(loaded, tmp_path / "again.safetensors")
+    again = load_weights(tmp_path / "again.safetensors").network
+    assert tensors_sha256(again.state_dict()) == tensors_sha256(loaded.state_dict())
 
 
 def test_every_tensor_and_no_other(random_network: Make, tmp_path: Path) -> None:
@@ -163,7 +165,7 @@ def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -
     assert resolve_weights(str(saved)).name == "tiny"
     with pytest.raises(ModelError, match="the shipped weights 'bad' were changed"):
         resolve_weights("bad")
-    with pytest.raises(ModelError, match="expected one of bad, good, or a .safetensors file"):
+    with pytest.raises(ModelError, match=r"expected one of bad, good, or a \.safetensors file"):
         resolve_weights("better")
 
 

@@ -81,13 +81,13 @@ def evaluate(
 
     if draws is not None and n_lights:
         raise UsageError("--draws and --n-lights exclude each other", hint="The draws say how many lights")
-    counts = [None] if draws is not None else [_light_count(text) for text in n_lights or ["10"]]
+    counts = [None] if draws is not None else [_light_count(text) for text in dict.fromkeys(n_lights or ["10"])]
     protocols = [
         Protocol(count, trials, seed, draws, light_noise_deg=noise, max_pixels=max_pixels)
         for count in counts
-        for noise in light_noise_deg or [0.0]
+        for noise in dict.fromkeys(light_noise_deg or [0.0])
     ]
-    methods = method or [DEFAULT_METHOD]
+    methods = list(dict.fromkeys(method or [DEFAULT_METHOD]))
     for name in methods:
         check_method(name)
     captures = [capture for dataset in datasets for capture in find_captures(dataset)]

@@ -13,13 +13,7 @@ import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, open_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.draws import (
-    NOISE_STREAM,
-    Draw,
-    DrawsFile,
-    draw_lights,
-    read_draws,
-)
+from splinecli.evaluation.draws import NOISE_STREAM, Draw, DrawsFile, draw_lights, read_draws
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.records import Evaluation, OnProgress, Progress, Protocol, Result, Skipped
 from splinecli.evaluation.scored_pixels import keep_scored_pixels

@@ -59,6 +59,7 @@ class CompactLINet(nn.Module):
         self.encoder = MapEncoder(channels, width, blocks, map_size)
         self.decoder = nn.Conv2d(width, PATCH**2, 1)
         nn.init.zeros_(self.decoder.weight)
+        nn.init.zeros_(self.decoder.bias)  # type: ignore[arg-type]
 
     def forward(self, maps: Tensor) -> Tensor:
         return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)

@@ -165,7 +165,7 @@ class Trainer:
         loss = config.angle_weight * angle + config.map_weight * on_map + config.masked_weight * masked
         if not torch.isfinite(loss):
             raise ModelError(
-                f"the loss is {float(loss)} at step {self.clock.step}", hint="Lower the learning rate"
+                f"the loss is {loss.item()} at step {self.clock.step}", hint="Lower the learning rate"
             )
         self.optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)

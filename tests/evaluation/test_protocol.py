@@ -1,0 +1,289 @@
+"""Whole evaluations: against analytic captures, hand-computed errors, and the published errors of DiLiGenT."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import read_capture
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.evaluation.draws import draw_lights
+from splinecli.evaluation.protocol import Progress, Protocol, evaluate
+from splinecli.methods import make_estimator
+
+WriteDome = Callable[..., Path]
+N_PIXELS = 100
+
+
+class Fake:
+    """Gives the folder's truth, turned by the next of the angles; remembers what it saw."""
+
+    weights, device, precision = None, "cpu", "float64"
+
+    def __init__(self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake") -> None:
+        self.name = name
+        self.lights: list[NDArray[np.float64]] = []
+        self.observations: list[NDArray[np.float32]] = []
+        capture = read_capture(folder)
+        assert capture.ground_truth is not None
+        truth = capture.ground_truth[capture.mask]
+        self._truth = truth[truth.any(axis=1)].astype(np.float64)
+        self._angles = np.radians(angles_deg)
+
+    def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+        angle = self._angles[len(self.lights) % len(self._angles)]
+        self.lights.append(lights)
+        self.observations.append(observations)
+        # Perpendicular to each normal, so that turning towards it turns by the whole angle.
+        across = np.cross(self._truth, [0, 1, 0])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        normals: NDArray[np.float64] = np.cos(angle) * self._truth + np.sin(angle) * across
+        return normals
+
+
+class Constant(Fake):
+    """Gives one vector for every pixel, whatever it sees."""
+
+    def __init__(self, vector: Sequence[float]) -> None:
+        self.name, self._vector = "constant", vector
+
+    def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.tile(self._vector, (len(observations), 1))
+
+
+def test_the_truth_scores_zero(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    (result,) = evaluate([folder], [Fake(folder)], Protocol(n_lights=5, trials=4)).results
+    assert (result.method, result.capture, result.n_lights, result.trials) == ("fake", "dome", 5, 4)
+    assert result.mae_deg == pytest.approx(0, abs=1e-5)  # normals are kept in float32
+    assert result.std_deg == pytest.approx(0, abs=1e-5)
+    assert result.seconds > 0
+
+
+def test_mean_and_deviation_over_trials(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    fake = Fake(folder, angles_deg=(1, 3, 5))
+    (result,) = evaluate([folder], [fake], Protocol(n_lights=5, trials=3)).results
+    assert result.maes_deg == pytest.approx((1, 3, 5), abs=1e-4)
+    assert result.mae_deg == pytest.approx(3, abs=1e-4)
+    assert result.std_deg == pytest.approx(np.sqrt((4 + 0 + 4) / 3), abs=1e-4)
+
+
+def test_averages_are_means_over_captures(write_dome: WriteDome) -> None:
+    folders = [write_dome("a"), write_dome("b")]
+    estimators = [Fake(folders[0], (1, 2), "one"), Fake(folders[0], (10, 20), "ten")]
+    evaluation = evaluate(folders, estimators, Protocol())
+    assert evaluation.averages == {
+        "one": pytest.approx(1.5, abs=1e-4),
+        "ten": pytest.approx(15, abs=1e-4),
+    }
+    assert [(r.capture, r.method) for r in evaluation.results] == [
+        ("a", "one"),
+        ("a", "ten"),
+        ("b", "one"),
+        ("b", "ten"),
+    ]
+
+
+@pytest.mark.parametrize("n_lights", [3, 5, None])
+def test_least_squares_is_exact_on_a_dome(write_dome: WriteDome, n_lights: int | None) -> None:
+    protocol = Protocol(n_lights=n_lights, trials=5, seed=1)
+    (result,) = evaluate([write_dome()], [make_estimator("ls")], protocol).results
+    # Half a step of 16 bits against values near 0.5 is 1e-3 degrees; few lights close together enlarge it.
+    assert result.mae_deg < 0.02
+    assert result.trials == (1 if n_lights is None else 5)
+
+
+def test_all_methods_and_captures_see_the_same_draws(write_dome: WriteDome) -> None:
+    folders = [write_dome("a"), write_dome("b")]
+    first, second = Fake(folders[0], name="first"), Fake(folders[0], name="second")
+    protocol = Protocol(n_lights=4, trials=3, seed=5, light_noise_deg=3)
+    evaluate(folders, [first, second], protocol)
+    np.testing.assert_array_equal(first.lights, second.lights)
+    np.testing.assert_array_equal(first.lights[:3], first.lights[3:])
+    backwards = Fake(folders[0])
+    evaluate(folders[::-1], [backwards], protocol)
+    np.testing.assert_array_equal(first.lights, backwards.lights)
+
+
+def test_a_trial_sees_the_lights_of_its_draw(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    fake, whole = Fake(folder), read_capture(folder)
+    evaluate([folder], [fake], Protocol(n_lights=3, trials=2, seed=0))
+    draws = draw_lights(whole.light_directions, 3, trials=2, seed=0)
+    for draw, lights, observations in zip(draws, fake.lights, fake.observations, strict=True):
+        np.testing.assert_array_equal(lights, whole.light_directions[list(draw)])
+        np.testing.assert_array_equal(observations, whole.observations[:, list(draw)])
+
+
+def test_a_draws_file_goes_before_random_draws(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder = write_dome()
+    (tmp_path / "draws.txt").write_text("5 0 1\n2 3 7\n")
+    fake, whole = Fake(folder), read_capture(folder)
+    evaluation = evaluate([folder], [fake], Protocol(trials=99, draws_file=tmp_path / "draws.txt"))
+    assert (evaluation.protocol.n_lights, evaluation.protocol.trials) == (3, 2)
+    assert (evaluation.results[0].n_lights, evaluation.results[0].trials) == (3, 2)
+    np.testing.assert_array_equal(fake.observations[0], whole.observations[:, [5, 0, 1]])
+    np.testing.assert_array_equal(fake.lights[1], whole.light_directions[[2, 3, 7]])
+    with pytest.raises(UsageError, match=r"10 lights a draw wanted, the draws in .*draws\.txt have 3"):
+        evaluate([folder], [fake], Protocol(n_lights=10, draws_file=tmp_path / "draws.txt"))
+
+
+def test_a_draws_file_that_does_not_fit_a_capture(write_dome: WriteDome, tmp_path: Path) -> None:
+    (tmp_path / "draws.txt").write_text("0 1 2\n0 1 9\n")
+    folders = [write_dome("eight"), write_dome("ten", n_lights=10)]
+    protocol = Protocol(draws_file=tmp_path / "draws.txt")
+    evaluation = evaluate(folders, [make_estimator("ls")], protocol)
+    assert evaluation.captures == ("ten",)
+    assert [(s.capture, s.reason) for s in evaluation.skipped] == [
+        (
+            "eight",
+            f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights.",
+        )
+    ]
+
+
+def test_only_pixels_with_ground_truth_are_estimated(write_dome: WriteDome) -> None:
+    folder = write_dome(without_truth=4)
+    fake = Fake(folder)
+    (result,) = evaluate([folder], [fake], Protocol()).results
+    assert [len(seen) for seen in fake.observations] == [N_PIXELS - 4]
+    assert result.mae_deg == pytest.approx(0, abs=1e-5)
+
+
+def test_a_part_of_the_pixels(write_dome: WriteDome) -> None:
+    class Spy(Constant):
+        def estimate(self, observations: NDArray[Any], lights: NDArray[Any]) -> NDArray[np.float64]:
+            seen.append(observations[:, 0])
+            return super().estimate(observations, lights)
+
+    seen: list[NDArray[Any]] = []
+    folder = write_dome()
+    evaluate([folder], [Spy((0, 0, 1))], Protocol(max_pixels=20))
+    evaluate([folder], [Spy((0, 0, 1))], Protocol(max_pixels=20))
+    assert len(seen[0]) == 20
+    np.testing.assert_array_equal(seen[0], seen[1])
+
+
+def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    errors = [
+        evaluate([folder], [make_estimator("ls")], Protocol(trials=20, light_noise_deg=sigma)).results[0]
+        for sigma in (0, 1, 4)
+    ]
+    assert [result.trials for result in errors] == [1, 20, 20]  # all lights, other noise in each trial
+    assert len(set(errors[1].maes_deg)) == 20
+    assert errors[0].mae_deg < 0.02 < 0.2 < errors[1].mae_deg
+    # The trials' noise is the same but for its size, and small errors grow in proportion.
+    assert errors[2].mae_deg == pytest.approx(4 * errors[1].mae_deg, rel=0.1)
+
+
+def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_path: Path) -> None:
+    good, untrue, few = (
+        write_dome("good"),
+        write_dome("untrue", ground_truth=False),
+        write_dome("few", n_lights=4),
+    )
+    broken = write_dome("broken")
+    (broken / "003.png").write_bytes(b"no image")
+    folders = [untrue, good, broken, few, tmp_path / "missing"]
+    evaluation = evaluate(folders, [make_estimator("ls")], Protocol(n_lights=5, trials=10))
+    assert evaluation.captures == ("good",)
+    assert [skipped.capture for skipped in evaluation.skipped] == ["untrue", "broken", "few", "missing"]
+    reasons = [skipped.reason for skipped in evaluation.skipped]
+    assert reasons[0].startswith(f"{untrue}: no ground truth, so nothing to score against.")
+    assert str(broken / "003.png") in reasons[1]
+    assert reasons[2] == "5 lights wanted, the capture has 4. Ask for at most 4 lights."
+    assert str(tmp_path / "missing") in reasons[3]
+
+
+def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> None:
+    ls = make_estimator("ls")
+    untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
+    with pytest.raises(
+        InputError, match=r"none of the 2 captures could be scored; the first: .*untrue: no gro"
+    ):
+        evaluate([untrue, few], [ls], Protocol(n_lights=5))
+    with pytest.raises(InputError, match="untrue: no ground truth"):
+        evaluate([untrue], [ls], Protocol())
+    with pytest.raises(UsageError, match="5 lights wanted, the capture has 4"):
+        evaluate([few], [ls], Protocol(n_lights=5))
+
+
+def test_names_tell_captures_apart(write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = [write_dome("few/dome", n_lights=4), write_dome("many/dome"), write_dome("many/bowl")]
+    ls = [make_estimator("ls")]
+    assert evaluate(folders, ls, Protocol()).captures == ("few/dome", "many/dome", "many/bowl")
+    monkeypatch.chdir(folders[1])
+    assert evaluate([Path(), folders[1], folders[2]], ls, Protocol()).captures == ("dome", "bowl")
+
+
+@pytest.mark.parametrize("vector", [(0, 0, 0), (0, 0, np.nan), (0, 0, 0.5)])
+def test_normals_that_are_none_are_not_scored(write_dome: WriteDome, vector: Sequence[float]) -> None:
+    with pytest.raises(SplinecliError, match="method constant gave normals that are not unit vectors"):
+        evaluate([write_dome()], [Constant(vector)], Protocol())
+
+
+def test_progress(write_dome: WriteDome) -> None:
+    folders = [write_dome("a"), write_dome("b")]
+    seen: list[Progress] = []
+    protocol = Protocol(n_lights=7, trials=2, seed=0)
+    evaluate(folders, [make_estimator("ls")], protocol, on_progress=seen.append)
+    draws = draw_lights(read_capture(folders[0]).light_directions, 7, trials=2, seed=0)
+    n_read = len(set().union(*draws))
+    expected = [
+        Progress(name, number, 2, method, done + 1, total)
+        for number, name in ((1, "a"), (2, "b"))
+        for method, total in ((None, n_read), ("ls", 2))
+        for done in range(total)
+    ]
+    assert seen == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_lights": 2}, "2 lights wanted, expected at least 3."),
+        ({"trials": 0}, "0 trials wanted, expected at least 1."),
+        ({"seed": -3}, "the seed is -3, expected a whole number from 0."),
+        ({"light_noise_deg": -1.0}, "light noise of -1 degrees, expected 0 to 30."),
+        ({"light_noise_deg": float("nan")}, "light noise of nan degrees, expected 0 to 30."),
+        ({"max_pixels": 0}, "at most 0 pixels to score, expected at least 1."),
+    ],
+)
+def test_a_protocol_out_of_range(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as raised:
+        Protocol(**settings)
+    assert str(raised.value) == message
+
+
+def test_what_to_score_is_needed_once(write_dome: WriteDome) -> None:
+    folder, ls = write_dome(), make_estimator("ls")
+    with pytest.raises(UsageError, match="method ls comes twice"):
+        evaluate([folder], [ls, ls], Protocol())
+    with pytest.raises(UsageError, match="nothing to score"):
+        evaluate([], [ls], Protocol())
+
+
+@pytest.mark.parametrize(("name", "mae_deg"), [("ballPNG", 4.29), ("catPNG", 8.45)])
+def test_least_squares_on_diligent(shared_data: Path, name: str, mae_deg: float) -> None:
+    folder = shared_data / "DiLiGenT/pmsData" / name
+    (result,) = evaluate([folder], [make_estimator("ls")], Protocol()).results
+    assert (result.n_lights, result.trials, result.std_deg) == (96, 1, 0)
+    assert result.mae_deg == pytest.approx(mae_deg, abs=0.02)
+
+
+def test_importing_is_light() -> None:
+    heavy = {"cv2", "scipy", "tifffile", "torch", "rich", "typer"}
+    modules = ("draws", "figures", "protocol", "tables")
+    imports = ", ".join(f"splinecli.evaluation.{module}" for module in modules)
+    code = f"import {imports}, sys; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

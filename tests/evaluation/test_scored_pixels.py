@@ -1,0 +1,53 @@
+"""The pixels that are scored: those with ground truth, or a part of them, with their own observations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splinecli.capture import Capture
+from splinecli.errors import InputError
+from splinecli.evaluation.scored_pixels import keep_scored_pixels
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+MASK = np.random.default_rng(5).random((9, 7)) < 0.7
+
+
+@pytest.fixture
+def capture() -> Capture:
+    """Observation 0 of a pixel is its flat index in the image; columns 3 and 4 have no ground truth."""
+    index = np.flatnonzero(MASK)
+    truth = np.zeros((9, 7, 3), np.float32)
+    truth[..., 2] = 1
+    truth[:, 3:5] = 0
+    return Capture("c", np.stack([index] * 3, axis=1), LIGHTS, (4, 7, 9), MASK, truth)
+
+
+def test_pixels_without_ground_truth_go(capture: Capture) -> None:
+    kept = keep_scored_pixels(capture)
+    wanted = MASK.copy()
+    wanted[:, 3:5] = False
+    np.testing.assert_array_equal(kept.mask, wanted)
+    np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
+    assert kept.light_indices == (4, 7, 9)
+
+
+def test_a_part_of_the_pixels(capture: Capture) -> None:
+    parts = [keep_scored_pixels(capture, max_pixels=10, seed=seed) for seed in (0, 0, 1)]
+    for part in parts:
+        assert part.n_pixels == 10
+        assert not part.mask[:, 3:5].any()
+        np.testing.assert_array_equal(part.observations[:, 0], np.flatnonzero(part.mask))
+    np.testing.assert_array_equal(parts[0].mask, parts[1].mask)
+    assert (parts[0].mask != parts[2].mask).any()
+
+
+def test_more_than_there_are_is_all(capture: Capture) -> None:
+    assert keep_scored_pixels(capture, max_pixels=1000).n_pixels == keep_scored_pixels(capture).n_pixels
+
+
+def test_without_ground_truth(capture: Capture) -> None:
+    with pytest.raises(InputError, match="c: no ground truth"):
+        keep_scored_pixels(replace(capture, ground_truth=None))

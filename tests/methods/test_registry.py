@@ -1,0 +1,80 @@
+"""Methods by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splinecli.errors import ModelError, UsageError
+from splinecli.methods import DEFAULT_METHOD, MethodOptions, make_estimator, method_names
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import save_weights
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> str:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16))
+    save_weights(network, tmp_path / "tiny.safetensors")
+    return str(tmp_path / "tiny.safetensors")
+
+
+def test_unknown_method() -> None:
+    with pytest.raises(UsageError, match="no method named 'l1'; expected one of spline-net, ls"):
+        make_estimator("l1")
+
+
+def test_the_default_is_one_of_them() -> None:
+    assert DEFAULT_METHOD in method_names()
+
+
+def test_every_method_says_what_it_is_and_estimates(weights: str) -> None:
+    truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
+    observations = (truth @ LIGHTS.T * 0.5).astype(np.float32)
+    for name in method_names():
+        estimator = make_estimator(name, MethodOptions(weights=weights, device="cpu", precision="float32"))
+        assert estimator.name == name
+        assert estimator.device == "cpu"
+        # A matte pixel without shadow is easy for all of them; the network starts from the Lambertian fit.
+        normals = estimator.estimate(observations, LIGHTS)
+        assert normals.shape == (3, 3)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+        np.testing.assert_allclose(normals, truth, atol=0.01)
+
+
+def test_options_reach_the_network(weights: str) -> None:
+    options = MethodOptions(weights=weights, batch_size=7, rotations=4, device="cpu", precision="bfloat16")
+    estimator = make_estimator("spline-net", options)
+    assert estimator.precision == "bfloat16"
+    assert estimator.weights is not None
+    assert estimator.weights["name"] == "tiny"
+    assert len(estimator.weights["sha256"]) == 64
+    assert vars(estimator)["batch_size"] == 7
+    assert len(vars(estimator)["_views"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (MethodOptions(weights="/nowhere/at/all.safetensors"), ModelError),
+        (MethodOptions(device="tpu"), UsageError),  # type: ignore[arg-type]
+    ],
+)
+def test_options_that_cannot_be(options: MethodOptions, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        make_estimator("spline-net", options)
+
+
+@pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
+def test_counts_from_one(options: MethodOptions, weights: str) -> None:
+    from dataclasses import replace
+
+    with pytest.raises(UsageError, match="whole numbers from 1"):
+        make_estimator("spline-net", replace(options, weights=weights))

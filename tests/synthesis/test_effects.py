@@ -1,0 +1,248 @@
+"""Each effect against the distribution that its docstring states. Seeds are fixed: nothing here is left to chance."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+from torch import Tensor
+
+from splinecli.normals import angle_between_deg
+from splinecli.observation_map import cell_directions, rotate_about_view_axis
+from splinecli.synthesis.effects import (
+    add_sensor_noise,
+    disturb_light_directions,
+    disturb_light_strengths,
+    dot,
+    draw_ambient,
+    draw_exposure,
+    draw_wall,
+    quantise,
+)
+from splinecli.synthesis.pixels import draw_visible_normals
+
+N = 20_000
+# Four standard deviations of a share of 20 000.
+SHARE = 0.015
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def assert_uniform(values: Tensor | NDArray[Any], low: float, high: float) -> None:
+    flat = np.asarray(values, np.float64).ravel()
+    margin = 1e-4 * (high - low)
+    assert flat.min() >= low - margin
+    assert flat.max() <= high + margin
+    assert stats.kstest(flat, stats.uniform(low, high - low).cdf).pvalue > 1e-3
+
+
+def test_dot_of_shared_and_of_own_directions() -> None:
+    vectors, directions = torch.randn(5, 3, generator=generator()), torch.randn(7, 3, generator=generator(1))
+    expected = np.asarray(vectors) @ np.asarray(directions).T
+    np.testing.assert_allclose(dot(vectors, directions), expected, atol=1e-6)
+    np.testing.assert_allclose(dot(vectors, directions.expand(5, 7, 3)), expected, atol=1e-6)
+
+
+def test_walls_have_the_stated_shapes() -> None:
+    normals = draw_visible_normals(N, generator(1))
+    wall = draw_wall(normals, 0.4, generator())
+    present = wall.tan_height[:, 0] > 0
+    assert present.float().mean().item() == pytest.approx(0.4, abs=SHARE)
+    assert_uniform(torch.rad2deg(wall.tan_height[present].atan()), 8, 75)
+    assert_uniform(torch.rad2deg(wall.tan_half_width.atan()), 15, 88)
+    assert_uniform(wall.softness, 0.01, 0.06)
+    assert_uniform(torch.rad2deg(wall.facing[:, 2].asin()), 0, 60)
+    torch.testing.assert_close(wall.facing.norm(dim=1), torch.ones(N))
+    torch.testing.assert_close(wall.azimuth.norm(dim=1), torch.ones(N))
+    assert not wall.azimuth[:, 2].any()
+    # It faces back over the pixel.
+    assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
+    assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
+    assert not wall.strength[~present].any()
+
+
+def test_walls_stand_where_the_surface_looks() -> None:
+    normals = draw_visible_normals(N, generator(1))
+    azimuth = draw_wall(normals, 1.0, generator()).azimuth
+    turned = torch.atan2(azimuth[:, 1], azimuth[:, 0]) - torch.atan2(normals[:, 1], normals[:, 0])
+    degrees = (np.degrees(turned.double().numpy()) + 180) % 360 - 180
+
+    def cdf(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        wrapped = sum(
+            stats.norm.cdf(x, 360 * k, 50) - stats.norm.cdf(-180, 360 * k, 50) for k in range(-3, 4)
+        )
+        return np.asarray(0.6 * wrapped + 0.4 * (x + 180) / 360)
+
+    assert stats.kstest(degrees, cdf).pvalue > 1e-3
+
+
+def test_walls_reflect_what_they_see_of_the_sky() -> None:
+    wall = draw_wall(draw_visible_normals(N, generator(1)), 1.0, generator())
+    form_factor = (1 - (1 + wall.tan_height.double() ** 2) ** -0.5) / 2
+    share = (wall.strength / form_factor).numpy().ravel()
+    fresh = np.random.default_rng(0)
+    expected = fresh.uniform(0.05, 0.9, N) * fresh.uniform(0.5, 2, N)
+    assert stats.ks_2samp(share, expected).pvalue > 1e-3
+
+
+def test_walls_reflect_by_the_cosine_law() -> None:
+    wall = draw_wall(draw_visible_normals(50, generator(1)), 1.0, generator())
+    directions, inside = cell_directions()
+    returned = wall.reflected(directions[inside])
+    assert (returned >= 0).all()
+    # The light that faces the wall straight on, where there is one above the horizon, and the one behind it.
+    head_on = (wall.reflected(wall.facing[:, None])[:, 0] / wall.strength[:, 0]).numpy()
+    np.testing.assert_allclose(head_on, 1, rtol=1e-5)
+    assert not wall.reflected(-wall.facing[:, None]).any()
+
+
+def test_walls_can_be_switched_off() -> None:
+    normals = draw_visible_normals(200, generator(1))
+    directions, inside = cell_directions()
+    nothing = draw_wall(normals, 0.0, generator())
+    assert (nothing.visibility(directions[inside]) == 1).all()
+    assert not nothing.reflected(directions[inside]).any()
+    shadows_only = draw_wall(normals, 1.0, generator(), interreflections=False)
+    assert not shadows_only.reflected(directions[inside]).any()
+    assert (shadows_only.visibility(directions[inside]) < 1).any(dim=1).float().mean() > 0.8
+    light_only = draw_wall(normals, 1.0, generator(), shadows=False)
+    assert (light_only.visibility(directions[inside]) == 1).all()
+    assert (light_only.reflected(directions[inside]) > 0).any(dim=1).all()
+
+
+def test_the_zenith_is_never_hidden() -> None:
+    wall = draw_wall(draw_visible_normals(N, generator(1)), 1.0, generator())
+    assert (wall.visibility(torch.tensor([[0.0, 0.0, 1.0]])) == 1).all()
+
+
+def test_the_hidden_lights_are_one_connected_sector() -> None:
+    # A picture of elevation by azimuth, the wall in its middle: the map, but without cells too coarse for its rim.
+    wall = draw_wall(draw_visible_normals(300, generator(1)), 1.0, generator())
+    elevation, azimuth = np.meshgrid(np.geomspace(1e-4, np.pi / 2, 100), np.radians(np.arange(-180, 180, 2)))
+    grid = np.stack(
+        (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation))
+    )
+    cosine, sine = wall.azimuth[:, :1], wall.azimuth[:, 1:2]
+    directions = torch.from_numpy(grid).float().reshape(3, -1).T.expand(300, -1, 3)
+    hidden = wall.visibility(rotate_about_view_axis(directions, cosine, sine)).numpy() < 1
+    for picture in hidden.reshape(300, *elevation.shape):
+        assert ndimage.label(picture)[1] == 1
+        # Towards the wall, from the horizon up.
+        assert picture[90, 0]
+        assert not picture[0].any()
+
+
+def test_a_known_wall_hides_the_lights_behind_it() -> None:
+    wall = draw_wall(draw_visible_normals(1, generator()), 1.0, generator())
+    wall = type(wall)(
+        azimuth=torch.tensor([[0.0, 1.0, 0.0]]),
+        tan_height=torch.tensor([[1.0]]),
+        tan_half_width=torch.tensor([[math.tan(math.radians(30))]]),
+        softness=torch.tensor([[0.01]]),
+        facing=wall.facing,
+        strength=wall.strength,
+    )
+
+    def towards(azimuth_deg: float, elevation_deg: float) -> list[float]:
+        a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
+        return [math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]
+
+    # Azimuths from the wall's: 45 degrees high and 30 to either side.
+    lights = torch.tensor(
+        [towards(*a) for a in [(0, 40), (0, 50), (25, 20), (35, 20), (-25, 20), (-35, 20), (180, 10)]]
+    )
+    assert wall.visibility(lights)[0].tolist() == [0, 1, 0, 1, 0, 1, 1]
+
+
+def test_ambient_light() -> None:
+    ambient = draw_ambient(N, 0.3, generator())
+    assert ambient.shape == (N, 1)
+    assert (ambient > 0).float().mean().item() == pytest.approx(0.3, abs=SHARE)
+    assert_uniform(ambient[ambient > 0].log10(), -3, -1)
+    assert not draw_ambient(N, 0.0, generator()).any()
+
+
+def tilted_lights(pixels: int, lights: int) -> Tensor:
+    directions = torch.randn(pixels, lights, 3, generator=generator(3))
+    directions[..., 2] = directions[..., 2].abs() + 0.5
+    return torch.nn.functional.normalize(directions, dim=-1)
+
+
+def test_errors_of_light_directions() -> None:
+    directions = tilted_lights(4000, 40)
+    moved = disturb_light_directions(directions, 0.6, generator())
+    torch.testing.assert_close(moved.norm(dim=-1), torch.ones(4000, 40))
+    assert (moved[..., 2] > 0).all()
+    error = angle_between_deg(moved.numpy(), directions.numpy())
+    # A pixel's angles have two components of its sigma each: sigma^2 is half of their mean square.
+    sigma = np.sqrt((error**2).mean(axis=1) / 2)
+    disturbed = sigma > 1e-4
+    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
+    # Sigma itself is estimated from 80 numbers, to 8 per cent.
+    assert stats.kstest(sigma[disturbed], stats.uniform(0, 2).cdf).statistic < 0.04
+    assert sigma.max() < 2.6
+    np.testing.assert_allclose(disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6)
+
+
+def test_errors_of_light_strengths() -> None:
+    observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
+    factor = (disturb_light_strengths(observations, 0.6, generator()) / observations).numpy()
+    sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
+    disturbed = sigma > 1e-5
+    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
+    assert stats.kstest(sigma[disturbed], stats.uniform(0, 0.05).cdf).statistic < 0.04
+    assert factor[disturbed].mean() == pytest.approx(1, abs=1e-3)
+    assert torch.equal(disturb_light_strengths(observations, 0.0, generator()), observations)
+
+
+def test_exposure() -> None:
+    radiance = torch.rand(N, 5, generator=generator(3)) * 30
+    brightest = (radiance * draw_exposure(radiance, 0.25, generator())).amax(dim=1)
+    over = brightest > 1
+    assert over.float().mean().item() == pytest.approx(0.25, abs=SHARE)
+    assert_uniform(brightest[over], 1, 3)
+    assert_uniform(brightest[~over].log10(), -1.3, 0)
+    unclipped = (radiance * draw_exposure(radiance, 0.0, generator())).amax(dim=1)
+    assert unclipped.max() <= 1 + 1e-6
+    assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, generator())).all()
+
+
+def mean_square_of_power(low: float, high: float) -> float:
+    """E[(10^U(low, high))^2]."""
+    return (10 ** (2 * high) - 10 ** (2 * low)) / (2 * math.log(10) * (high - low))
+
+
+@pytest.mark.parametrize("level", [0.5, 0.1])
+def test_sensor_noise(level: float) -> None:
+    noisy = add_sensor_noise(torch.full((N, 20), level), generator())
+    expected = mean_square_of_power(-4, -2.5) + level * mean_square_of_power(-3.5, -2)
+    variance = (noisy.double() - level).square().mean().item()
+    assert variance == pytest.approx(expected, rel=0.05)
+    assert noisy.double().mean().item() == pytest.approx(level, abs=1e-4)
+
+
+def test_sensor_noise_stays_in_the_sensor_s_range() -> None:
+    noisy = add_sensor_noise(torch.tensor([0.0, 1.0]).expand(N, 2), generator())
+    assert noisy.min() == 0
+    assert noisy.max() == 1
+    assert (noisy[:, 0] > 0).float().mean().item() == pytest.approx(0.5, abs=SHARE)
+
+
+def test_quantisation() -> None:
+    exposed = torch.rand(N, 8, generator=generator(3), dtype=torch.float64)
+    rounded = quantise(exposed, 0.3, generator())
+    eight = ((rounded * 255 - (rounded * 255).round()).abs() < 1e-9).all(dim=1)
+    assert eight.double().mean().item() == pytest.approx(0.3, abs=SHARE)
+    assert ((rounded * 65535 - (rounded * 65535).round()).abs() < 1e-9).all()
+    error = (rounded - exposed).abs()
+    # Half a step, which the worst of many comes close to.
+    assert error[eight].max().item() == pytest.approx(0.5 / 255, rel=1e-2)
+    assert error[~eight].max().item() == pytest.approx(0.5 / 65535, rel=1e-2)
+    assert (quantise(exposed, 0.0, generator()) - exposed).abs().max() <= 0.5 / 65535 + 1e-9

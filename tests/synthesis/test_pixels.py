@@ -1,0 +1,212 @@
+"""The pixel generator: scenes that turn as a whole, and batches that a capture could hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from splinecli.observation_map import cell_directions, sparse_map
+from splinecli.synthesis.pixels import (
+    PixelBatch,
+    PixelGenerator,
+    PixelGeneratorConfig,
+    draw_neighbour_normals,
+    draw_scene,
+    draw_visible_normals,
+)
+
+PLAIN = PixelGeneratorConfig(
+    light_direction_error_share=0.0, light_strength_error_share=0.0, saturated_share=0.0, sensor_noise=False
+)
+NOTHING = replace(PLAIN, wall_share=0.0, second_wall_share=0.0, ambient_share=0.0, mixed_share=0.0)
+
+
+def draw(pixels: int, config: PixelGeneratorConfig | None = None, seed: int = 0) -> PixelBatch:
+    return PixelGenerator(config or PixelGeneratorConfig(), torch.Generator().manual_seed(seed)).draw(pixels)
+
+
+def test_batches_hold_what_a_capture_would() -> None:
+    batch = draw(4000)
+    pixels, lights = batch.observations.shape
+    assert pixels == 4000
+    assert batch.light_directions.shape == (pixels, lights, 3)
+    assert batch.valid.shape == (pixels, lights)
+    assert batch.valid.dtype == torch.bool
+    assert batch.exposure.shape == (pixels, 1)
+    counts = batch.valid.sum(dim=1)
+    assert counts.min() == 4
+    assert counts.max() == lights <= 96
+    assert (counts == 10).float().mean() > 0.3
+    assert batch.light_directions.norm(dim=-1).sub(1).abs().max() < 1e-5
+    assert (batch.light_directions[..., 2] > 0).all()
+    assert torch.isfinite(batch.observations).all()
+    assert batch.observations.min() >= 0
+    assert batch.observations.max() <= 1
+    assert not batch.observations[~batch.valid].any()
+    # A pixel that none of its few, low lights reaches happens, but not often.
+    assert (batch.observations.amax(dim=1) == 0).float().mean() < 0.02
+
+
+def test_a_seed_says_everything() -> None:
+    one, other, third = draw(50), draw(50), draw(50, seed=1)
+    assert torch.equal(one.observations, other.observations)
+    assert torch.equal(one.light_directions, other.light_directions)
+    assert torch.equal(one.scene.dense_map(), other.scene.dense_map())
+    assert not torch.equal(one.scene.normals, third.scene.normals)
+
+
+def test_the_global_generator_is_left_alone() -> None:
+    state = torch.get_rng_state()
+    draw(50)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_matte_pixels_obey_lambert_s_law() -> None:
+    batch = draw(500, NOTHING)
+    scene = replace(
+        batch.scene,
+        material=replace(
+            batch.scene.material,
+            **{name: torch.zeros(500, 1) for name in ("metallic", "specular", "sheen", "clearcoat")},
+        ),
+    )
+    lights = batch.light_directions
+    observed = scene.radiance(lights)
+    cosine = (scene.normals[:, None] * lights).sum(dim=-1).clamp(min=0)
+    # Burley's diffuse lobe differs from Lambert's by its Fresnel factors alone, near 1 away from grazing angles.
+    steep = (cosine > 0.6) & (scene.normals[:, 2:] > 0.6)
+    ratio = (observed / (scene.material.base * cosine))[steep]
+    assert ratio.min() > 0.97
+    assert ratio.max() < 1.1
+    assert not observed[cosine == 0].any()
+
+
+@pytest.mark.parametrize("config", [PixelGeneratorConfig(), replace(PixelGeneratorConfig(), mixed_share=1.0)])
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_scene_turned_by_90_degrees_turns_its_map(config: PixelGeneratorConfig, quarters: int) -> None:
+    scene = draw_scene(300, config, torch.Generator().manual_seed(0))
+    cosine, sine = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters]
+    turned = scene.rotate(torch.full((300,), cosine), torch.full((300,), sine))
+    torch.testing.assert_close(
+        turned.dense_map(), scene.dense_map().rot90(quarters, (2, 3)), rtol=2e-3, atol=1e-4
+    )
+
+
+def test_each_pixel_is_turned_by_its_own_angle() -> None:
+    scene = draw_scene(100, PixelGeneratorConfig(), torch.Generator().manual_seed(0))
+    angle = 2 * torch.pi * torch.rand(100, generator=torch.Generator().manual_seed(1))
+    turned = scene.rotate(angle.cos(), angle.sin())
+    # Turning scene and lights together changes nothing.
+    directions, inside = cell_directions()
+    lights = directions[inside][::9].expand(100, -1, 3)
+    c, s = angle.cos()[:, None], angle.sin()[:, None]
+    x, y, z = lights.unbind(-1)
+    turned_lights = torch.stack((c * x - s * y, s * x + c * y, z), dim=-1)
+    torch.testing.assert_close(turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4)
+
+
+def test_shared_and_own_lights_give_the_same_radiance() -> None:
+    scene = draw_scene(60, PixelGeneratorConfig(), torch.Generator().manual_seed(0))
+    lights = cell_directions()[0][cell_directions()[1]]
+    torch.testing.assert_close(
+        scene.radiance(lights), scene.radiance(lights.expand(60, -1, 3)), rtol=1e-3, atol=1e-5
+    )
+
+
+def test_dense_map_has_no_holes_in_the_disc_and_nothing_outside() -> None:
+    # With some ambient light everywhere, every possible light leaves something to see.
+    scene = draw_scene(
+        500, replace(PixelGeneratorConfig(), ambient_share=1.0), torch.Generator().manual_seed(0)
+    )
+    dense = scene.dense_map()
+    _, inside = cell_directions()
+    assert dense.shape == (500, 1, 32, 32)
+    assert torch.isfinite(dense).all()
+    assert (dense[:, 0, inside] > 0).all()
+    assert not dense[:, 0, ~inside].any()
+    assert scene.dense_map(16).shape == (500, 1, 16, 16)
+
+
+def test_without_a_camera_s_faults_observations_are_exposed_radiance() -> None:
+    batch = draw(200, PLAIN)
+    expected = batch.scene.radiance(batch.light_directions) * batch.exposure * batch.valid
+    # The directions come back from an error of zero, rounded.
+    torch.testing.assert_close(batch.observations, expected.clamp(max=1), rtol=1e-3, atol=1e-5)
+
+
+def test_sparse_and_dense_map_agree_where_a_light_is_in_its_cell_s_centre() -> None:
+    batch = draw(100, PLAIN)
+    directions, inside = cell_directions()
+    lights = directions[inside][5::23]
+    observed = batch.scene.radiance(lights) * batch.exposure
+    sparse = sparse_map(observed, lights)
+    dense = batch.scene.dense_map() * batch.exposure[..., None, None]
+    assert sparse.holds[0].sum() == len(lights)
+    torch.testing.assert_close(sparse.values, dense * sparse.holds, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"])
+def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> None:
+    def scene(config: PixelGeneratorConfig) -> object:
+        return draw_scene(400, config, torch.Generator().manual_seed(0)).dense_map().numpy()
+
+    assert np.abs(scene(replace(NOTHING, **{share: 1.0})) - scene(NOTHING)).max() > 0.01  # type: ignore[operator]
+    off = draw_scene(400, replace(PixelGeneratorConfig(), **{share: 0.0}), torch.Generator().manual_seed(0))
+    if share == "mixed_share":
+        assert off.mixed is None
+    elif share == "ambient_share":
+        assert not off.ambient.any()
+    else:
+        assert len(off.walls) == 1
+
+
+def test_no_walls_without_shadows_and_interreflections() -> None:
+    config = replace(PixelGeneratorConfig(), cast_shadows=False, interreflections=False)
+    assert draw_scene(50, config, torch.Generator().manual_seed(0)).walls == ()
+
+
+def test_mixed_pixels_lie_between_their_surfaces() -> None:
+    scene = draw_scene(400, replace(NOTHING, mixed_share=0.5), torch.Generator().manual_seed(0))
+    assert scene.mixed is not None
+    assert scene.mixed_weight is not None
+    assert len(scene.mixed.normals) == len(scene.mixed_weight) == 200
+    lights = cell_directions()[0][cell_directions()[1]]
+    alone = replace(scene, mixed=None, mixed_weight=None).radiance(lights)
+    second, blended = scene.mixed.radiance(lights), scene.radiance(lights)
+    weight = scene.mixed_weight
+    torch.testing.assert_close(
+        blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5
+    )
+    assert torch.equal(blended[200:], alone[200:])
+    # Edges have another normal and the same material; blends the reverse.
+    edge = torch.arange(200) % 2 == 0
+    same_normal = (scene.mixed.normals == scene.normals[:200]).all(dim=1)
+    same_base = (scene.mixed.material.base == scene.material.base[:200])[:, 0]
+    assert torch.equal(same_normal, ~edge)
+    assert torch.equal(same_base, edge)
+    assert weight[edge].max() <= 0.4 < weight[~edge].max() <= 0.7
+
+
+def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
+    normals = draw_visible_normals(20_000, torch.Generator().manual_seed(0)).double()
+    assert normals.norm(dim=1).sub(1).abs().max() < 1e-6
+    assert (normals[:, 2] > 0).all()
+    # Uniform by projected area: r^2 is uniform over 0..0.997^2, and so is the azimuth over the circle.
+    squared = (normals[:, 0] ** 2 + normals[:, 1] ** 2).numpy()
+    assert stats.kstest(squared, stats.uniform(0, 0.997**2).cdf).pvalue > 1e-3
+    azimuth = torch.atan2(normals[:, 1], normals[:, 0]).numpy()
+    assert stats.kstest(azimuth, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
+
+
+def test_neighbours_face_the_camera_too() -> None:
+    normals = draw_visible_normals(5000, torch.Generator().manual_seed(0))
+    moved = draw_neighbour_normals(normals, torch.Generator().manual_seed(1))
+    assert moved.norm(dim=1).sub(1).abs().max() < 1e-6
+    assert (moved[:, 2] > 0).all()
+    cosine = (normals * moved).sum(dim=1)
+    # Moved by 0.5 in each of two tangential directions: a median of some 30 degrees.
+    assert 0.8 < cosine.median() < 0.95

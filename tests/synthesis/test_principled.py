@@ -1,0 +1,204 @@
+"""The principled BRDF against its equations, written out a second time in numpy with explicit vectors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from splinecli.synthesis.principled import Material, draw_material, shade
+
+Vectors = NDArray[np.float64]
+NAMES = ("base", "metallic", "specular", "roughness", "sheen", "clearcoat", "clearcoat_gloss")
+
+
+def material(**values: float) -> Material:
+    plain = dict.fromkeys(NAMES, 0.0) | {"base": 0.5, "roughness": 0.5} | values
+    return Material(**{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()})
+
+
+def hemisphere(count: int, seed: int = 0) -> Vectors:
+    vectors = np.random.default_rng(seed).normal(size=(count, 3))
+    vectors[:, 2] = np.abs(vectors[:, 2])
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def radiance(surface: Material, normal: Vectors, lights: Vectors) -> Vectors:
+    n_dot_l = torch.from_numpy(lights @ normal)[None]
+    return shade(surface, n_dot_l, torch.tensor([[normal[2]]]), torch.from_numpy(lights[:, 2])).numpy()[0]
+
+
+def burley(surface: Material, n: Vectors, lights: Vectors) -> Vectors:
+    """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012 remapping."""
+    base, metallic, specular, roughness, sheen, clearcoat, gloss = (
+        float(getattr(surface, name)) for name in NAMES
+    )
+    v = np.array([0.0, 0.0, 1.0])
+    result = []
+    for light in lights:
+        nl, nv = n @ light, n @ v
+        if nl <= 0:
+            result.append(0.0)
+            continue
+        h = (light + v) / np.linalg.norm(light + v)
+        nh, lh = n @ h, light @ h
+
+        def schlick(cosine: float) -> float:
+            return float((1 - cosine) ** 5)
+
+        def g1(cosine: float, alpha: float) -> float:
+            tangent = np.sqrt(1 - cosine**2) / cosine
+            return float(2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)))
+
+        fd90 = 0.5 + 2 * roughness * lh**2
+        diffuse = base / np.pi * (1 + (fd90 - 1) * schlick(nl)) * (1 + (fd90 - 1) * schlick(nv))
+        alpha = max(roughness, 0.1) ** 2
+        ndf = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
+        f0 = (1 - metallic) * 0.08 * specular + metallic * base
+        fresnel = f0 + (1 - f0) * schlick(lh)
+        lobe = ndf * fresnel * g1(nl, alpha) * g1(nv, alpha) / (4 * nl * nv)
+        coat_alpha = 0.1 * (1 - gloss) + 0.001 * gloss
+        coat_ndf = (coat_alpha**2 - 1) / (np.pi * np.log(coat_alpha**2) * (1 + (coat_alpha**2 - 1) * nh**2))
+        coat_fresnel = 0.04 + 0.96 * schlick(lh)
+        coat = coat_ndf * coat_fresnel * g1(nl, 0.25) * g1(nv, 0.25) / (4 * nl * nv)
+        f = (1 - metallic) * (diffuse + sheen * schlick(lh)) + lobe + 0.25 * clearcoat * coat
+        result.append(np.pi * f * nl)
+    return np.array(result)
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        material(roughness=0.0),
+        material(roughness=1.0, base=0.9),
+        material(specular=0.5, roughness=0.3),
+        material(specular=4.0, roughness=0.15),
+        material(metallic=1.0, base=0.8, roughness=0.4),
+        material(metallic=0.3, specular=1.0, roughness=0.7),
+        material(sheen=1.0),
+        material(clearcoat=1.0, clearcoat_gloss=0.0),
+        material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
+    ],
+)
+def test_agrees_with_the_published_equations(surface: Material) -> None:
+    lights = hemisphere(300)
+    for normal in hemisphere(4, seed=1):
+        expected = burley(surface, normal, lights)
+        assert expected.any()
+        np.testing.assert_allclose(radiance(surface, normal, lights), expected, rtol=1e-5, atol=1e-12)
+
+
+def test_a_matte_surface_that_faces_light_and_camera_shows_its_base() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    # Specular 0 leaves no reflection at normal incidence.
+    for base, roughness in ((0.2, 0.3), (1.0, 1.0)):
+        assert radiance(material(base=base, roughness=roughness), up, up[None])[0] == pytest.approx(base)
+
+
+def test_attached_shadow_is_black() -> None:
+    lights, normal = hemisphere(500), np.array([0.8, 0.0, 0.6])
+    shiny = material(specular=1.0, clearcoat=1.0, sheen=1.0, metallic=0.5)
+    shaded = lights @ normal <= 0
+    assert shaded.any()
+    seen = radiance(shiny, normal, lights)
+    assert not seen[shaded].any()
+    assert (seen[~shaded] > 0).all()
+
+
+def test_mirror_images_in_the_plane_of_normal_and_view_look_the_same() -> None:
+    lights, normal = hemisphere(200), np.array([0.6, 0.0, 0.8])
+    surface = material(specular=1.0, metallic=0.4, clearcoat=0.5, roughness=0.2)
+    np.testing.assert_allclose(
+        radiance(surface, normal, lights), radiance(surface, normal, lights * (1, -1, 1)), rtol=1e-9
+    )
+
+
+def hemispherical_reflectance(
+    surface: Material, normal: Vectors, *, rings: int = 400, sectors: int = 800
+) -> float:
+    """The integral of f cos over all lights above the surface, by the midpoint rule in azimuth and sin^2."""
+    sine_squared = (np.arange(rings) + 0.5) / rings
+    azimuth = (np.arange(sectors) + 0.5) * (2 * np.pi / sectors)
+    s, a = (grid.ravel() for grid in np.meshgrid(np.sqrt(sine_squared), azimuth))
+    c = np.sqrt(1 - s**2)
+    # Cells of equal projected area about the normal, turned into the camera's frame (about the y axis).
+    x, y = s * np.cos(a), s * np.sin(a)
+    lights = np.stack((normal[2] * x + normal[0] * c, y, normal[2] * c - normal[0] * x), axis=1)
+    # Lights under the camera's horizon are none of ours (z < 0); shade is defined for the upper half alone.
+    lights = lights[lights[:, 2] > 0]
+    # d(projected area) = cos dw, and radiance = pi f cos, so the integral is the mean of radiance / cos.
+    return float((radiance(surface, normal, lights) / (lights @ normal)).sum() / len(s))
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 40.0, 75.0])
+@pytest.mark.parametrize(
+    ("surface", "limit"),
+    [
+        # Burley's diffuse lobe of roughness 1 gains at grazing angles; the model is only nearly conserving.
+        (material(base=1.0, roughness=1.0), 1.1),
+        (material(base=1.0, roughness=0.5), 1.02),
+        (material(base=1.0, roughness=0.5, metallic=1.0), 1.0),
+        (material(base=1.0, roughness=0.2, metallic=1.0), 1.0),
+        (material(base=0.0, roughness=0.3, specular=1.0), 0.3),
+    ],
+)
+def test_no_more_light_comes_out_than_goes_in(surface: Material, limit: float, tilt_deg: float) -> None:
+    normal = np.array([np.sin(np.radians(tilt_deg)), 0.0, np.cos(np.radians(tilt_deg))])
+    reflectance = hemispherical_reflectance(surface, normal)
+    assert 0 < reflectance <= limit
+
+
+def test_a_smooth_metal_mirrors_nearly_everything() -> None:
+    # Single scattering loses little on so smooth a metal: a lobe of the wrong height would not come near 1.
+    up, metal = np.array([0.0, 0.0, 1.0]), material(base=1.0, roughness=0.2, metallic=1.0)
+    assert hemispherical_reflectance(metal, up, rings=100_000, sectors=4) == pytest.approx(1, abs=0.003)
+
+
+def test_float32_is_close_to_float64() -> None:
+    generator = torch.Generator().manual_seed(0)
+    surface = draw_material(200, generator)
+    double = Material(*(getattr(surface, name).double() for name in NAMES))
+    lights = torch.from_numpy(hemisphere(100))
+    normals = torch.from_numpy(hemisphere(200, seed=2)) + torch.tensor((0.0, 0.0, 0.2))
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    exact = shade(double, normals @ lights.T, normals[:, 2:], lights[:, 2])
+    coarse = shade(surface, (normals @ lights.T).float(), normals[:, 2:].float(), lights[:, 2].float())
+    assert torch.isfinite(coarse).all()
+    # Half a per cent in a peak of the narrowest lobes, whose height float32 resolves no better.
+    assert ((coarse - exact).abs() / (exact + 0.01)).max() < 5e-3
+
+
+def test_drawn_materials_have_the_stated_classes() -> None:
+    drawn = draw_material(40_000, torch.Generator().manual_seed(0))
+    values = {name: getattr(drawn, name).numpy().ravel() for name in NAMES}
+    metal, blend = values["metallic"] == 1, (values["metallic"] > 0) & (values["metallic"] < 1)
+    # Four standard deviations of a share of 40 000 are 0.01.
+    assert metal.mean() == pytest.approx(0.25, abs=0.01)
+    assert blend.mean() == pytest.approx(0.10, abs=0.01)
+    assert (values["specular"] > 1).mean() == pytest.approx(0.30 / 2, abs=0.01)
+    assert (values["specular"][metal] <= 1).all()
+    assert (values["sheen"] > 0)[~metal].mean() == pytest.approx(0.2, abs=0.01)
+    assert not values["sheen"][metal].any()
+    assert (values["clearcoat"] > 0).mean() == pytest.approx(0.15, abs=0.01)
+    ranges = {
+        "base": (0.05, 1),
+        "specular": (0, 4),
+        "sheen": (0, 1),
+        "clearcoat": (0, 1),
+        "clearcoat_gloss": (0, 1),
+    }
+    for name, (low, high) in ranges.items():
+        assert low <= values[name].min() <= low + 0.01, name
+        assert high - 0.01 <= values[name].max() <= high, name
+    rough = values["roughness"]
+    assert 0.2 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9
+    assert rough[~(metal | blend)].min() == pytest.approx(0.05, abs=0.01)
+    assert rough.max() == pytest.approx(1, abs=0.01)
+
+
+def test_take_keeps_parameters_together() -> None:
+    drawn = draw_material(10, torch.Generator().manual_seed(0))
+    some = drawn.take(torch.tensor([7, 2]))
+    assert torch.equal(some.base, drawn.base[[7, 2]])
+    assert torch.equal(some.clearcoat_gloss, drawn.clearcoat_gloss[[7, 2]])

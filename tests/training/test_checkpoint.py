@@ -1,0 +1,72 @@
+"""Checkpoints: whole, or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from splinecli.errors import ModelError
+from splinecli.networks.weights import save_weights
+from splinecli.training.checkpoint import Clock, load_checkpoint, read_checkpoint_config
+from splinecli.training.config import TrainingConfig
+from splinecli.training.loop import CHECKPOINT, Trainer
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
+    made = Trainer(tiny, tmp_path, CPU)
+    made.step()
+    made.save()
+    return made
+
+
+def test_everything_comes_back(trainer: Trainer, tiny: TrainingConfig, tmp_path: Path) -> None:
+    assert read_checkpoint_config(tmp_path / CHECKPOINT) == tiny
+    other = Trainer(tiny, tmp_path / "other", CPU)
+    clock = load_checkpoint(
+        tmp_path / CHECKPOINT, other.network, other.average, other.optimizer, other.generator
+    )
+    assert clock == trainer.clock == Clock(step=1, pixels=16, seconds=trainer.clock.seconds)
+    assert torch.equal(other.generator.get_state(), trainer.generator.get_state())
+    for name in ("network", "average"):
+        for key, tensor in getattr(trainer, name).state_dict().items():
+            assert torch.equal(getattr(other, name).state_dict()[key], tensor)
+    states, expected = other.optimizer.state_dict()["state"], trainer.optimizer.state_dict()["state"]
+    assert states.keys() == expected.keys()
+    assert len(expected) == len(list(trainer.network.parameters()))
+    for index, state in expected.items():
+        assert state.keys() == {"step", "exp_avg", "exp_avg_sq"}
+        for key, tensor in state.items():
+            assert torch.equal(states[index][key], tensor)
+
+
+def test_a_weight_file_is_no_checkpoint(trainer: Trainer, tmp_path: Path) -> None:
+    save_weights(trainer.network, tmp_path / CHECKPOINT)
+    with pytest.raises(ModelError, match="found splinecli-weights-1, expected splinecli-checkpoint-1"):
+        read_checkpoint_config(tmp_path / CHECKPOINT)
+
+
+def test_no_changed_byte_goes_unnoticed(trainer: Trainer, tmp_path: Path) -> None:
+    path = tmp_path / CHECKPOINT
+    whole = path.read_bytes()
+    for position in (8, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        with pytest.raises(ModelError):
+            read_checkpoint_config(path)
+
+
+def test_settings_of_a_later_splinecli(trainer: Trainer, tmp_path: Path) -> None:
+    path = tmp_path / CHECKPOINT
+    whole = path.read_bytes()
+    # Inside the header, which no checksum covers; same length, so that the header still ends where it says.
+    assert whole.count(b"batch_size") == 1
+    path.write_bytes(whole.replace(b"batch_size", b"batch_sise"))
+    with pytest.raises(ModelError, match="unknown training setting 'batch_sise'"):
+        read_checkpoint_config(path)
+    path.write_bytes(whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0'))
+    with pytest.raises(ModelError, match="the entry 'config' in the file is not JSON"):
+        read_checkpoint_config(path)

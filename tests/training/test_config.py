@@ -1,0 +1,65 @@
+"""Training configurations and presets."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from splinecli.errors import ModelError, UsageError
+from splinecli.networks.config import NetworkConfig
+from splinecli.training.config import PRESETS, TrainingConfig, preset
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_round_trip_through_json(name: str) -> None:
+    config = preset(name, seed=7, minutes=0.5)
+    assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_settings_left_out_have_their_defaults() -> None:
+    assert TrainingConfig.from_dict({}) == TrainingConfig()
+    partial = TrainingConfig.from_dict({"network": {"width": 8}, "steps": 5, "learning_rate": 1})
+    assert partial.network == NetworkConfig(width=8)
+    assert (partial.steps, partial.learning_rate, partial.batch_size) == (5, 1, TrainingConfig().batch_size)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"stepz": 5}, "unknown training setting 'stepz'; known are angle_weight, average_decay, batch_size"),
+        (
+            {"pixels": {"lights": 5}},
+            "unknown training setting 'lights'; known are ambient_share, cast_shadows",
+        ),
+        ({"network": {"lights": 5}}, "unknown network setting 'lights'"),
+        ({"network": 5}, "training setting 'network' is 5; expected a table of settings"),
+        ({"pixels": ["wall_share"]}, "'pixels' is .* expected a table of settings"),
+        ({"steps": 0}, "training setting 'steps' is 0; expected a whole number from 1"),
+        ({"batch_size": 2.5}, "'batch_size' is 2.5; expected a whole number from 1"),
+        ({"steps": True}, "'steps' is True"),
+        ({"warmup_steps": -1}, "'warmup_steps' is -1; expected a whole number from 0"),
+        ({"learning_rate": "fast"}, "'learning_rate' is 'fast'; expected a number from 0"),
+        ({"learning_rate": float("nan")}, "'learning_rate' is nan; expected a number from 0"),
+        ({"schedule": "linear"}, "'schedule' is 'linear'; expected 'cosine' or 'stepped'"),
+        ({"precision": "float16"}, "'precision' is 'float16'; expected 'bfloat16' or 'float32'"),
+        ({"pixels": {"wall_share": 1.5}}, "'wall_share' is 1.5; expected a number from 0 to 1"),
+        ({"pixels": {"cast_shadows": 1}}, "'cast_shadows' is 1; expected true or false"),
+        ({"pixels": {"min_lights": 0}}, "'min_lights' is 0; expected a whole number from 1"),
+    ],
+)
+def test_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        TrainingConfig.from_dict(values)
+
+
+def test_presets_by_name() -> None:
+    assert preset("compact") == TrainingConfig()
+    # The paper's section 4 and the authors' code (field notes, section 5).
+    paper = preset("paper")
+    assert (paper.batch_size, paper.learning_rate, paper.steps) == (128, 1e-4, 200_000)
+    assert (paper.beta1, paper.beta2) == (0.5, 0.999)
+    assert paper.network.size == "paper"
+    with pytest.raises(UsageError, match="no preset named 'tiny'; expected one of compact, paper"):
+        preset("tiny")
