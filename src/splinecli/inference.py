@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.evaluation.metrics import AngularErrors, angular_error_map_deg, summarise_errors
+from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
 
 TILE_PIXELS = 16_384

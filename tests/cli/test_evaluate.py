@@ -28,7 +28,10 @@ def test_files_and_table(dataset, run, golden):
     golden("evaluate_table.md", Path("evaluation/table.md").read_text())
     with Path("evaluation/results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["method"], row["capture"], row["trials"]) for row in rows] == [("ls", "matte", "3"), ("ls", "shaded", "3")]
+    assert [(row["method"], row["capture"], row["trials"]) for row in rows] == [
+        ("ls", "matte", "3"),
+        ("ls", "shaded", "3"),
+    ]
     document = json.loads(Path("evaluation/results.json").read_text())
     matte, shaded = document["results"]
     assert matte["mae_deg"] < 1e-3 < shaded["mae_deg"]
@@ -40,7 +43,19 @@ def test_the_draw_of_infer_is_the_first_of_evaluate(dataset, run):
         run("infer", dataset / "shaded", "--method", "ls", "--n-lights", 5, "--seed", 3, "--json").out
     )
     document = json.loads(
-        run("evaluate", dataset / "shaded", "--method", "ls", "--n-lights", 5, "--seed", 3, "--trials", 1, "--json").out
+        run(
+            "evaluate",
+            dataset / "shaded",
+            "--method",
+            "ls",
+            "--n-lights",
+            5,
+            "--seed",
+            3,
+            "--trials",
+            1,
+            "--json",
+        ).out
     )
     assert document["results"][0]["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
 

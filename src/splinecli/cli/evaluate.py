@@ -81,7 +81,9 @@ def evaluate(
 
     if draws is not None and n_lights:
         raise UsageError("--draws and --n-lights exclude each other", hint="The draws say how many lights")
-    counts = [None] if draws is not None else [_light_count(text) for text in dict.fromkeys(n_lights or ["10"])]
+    counts = (
+        [None] if draws is not None else [_light_count(text) for text in dict.fromkeys(n_lights or ["10"])]
+    )
     protocols = [
         Protocol(count, trials, seed, draws, light_noise_deg=noise, max_pixels=max_pixels)
         for count in counts

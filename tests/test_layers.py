@@ -1,0 +1,56 @@
+"""Imports only point downwards through the rooms of the house (CONTRIBUTING.md)."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import splinecli
+
+# From the top; a room may import from those below it, and its own files from each other.
+ROOMS = [
+    {"__main__"},
+    {"cli"},
+    {"outputs"},
+    {"evaluation", "training"},
+    {"synthesis", "inference"},
+    {"methods", "metrics"},
+    {"networks", "devices"},
+    {"capture", "observation_map"},
+    {"normals", "files"},
+    {"errors", "__init__"},
+]
+HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}
+SOURCE = Path(splinecli.__file__).parent
+
+
+def imported_rooms(tree: ast.AST) -> set[str]:
+    modules = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("splinecli"):
+            modules += (
+                [f"{node.module}.{alias.name}" for alias in node.names]
+                if node.module == "splinecli"
+                else [node.module]
+            )
+        elif isinstance(node, ast.Import):
+            modules += [alias.name for alias in node.names if alias.name.startswith("splinecli")]
+    names = {(module.split(".") + ["__init__"])[1] for module in modules}
+    return {name if name in HEIGHT else "__init__" for name in names}
+
+
+def test_every_room_is_ranked():
+    names = {
+        path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert names == set(HEIGHT)
+
+
+def test_imports_point_downwards():
+    upwards = []
+    for path in SOURCE.rglob("*.py"):
+        room = path.relative_to(SOURCE).parts[0].removesuffix(".py")
+        for target in imported_rooms(ast.parse(path.read_text("utf-8"))):
+            if target != room and HEIGHT[target] >= HEIGHT[room]:
+                upwards.append(f"{path.relative_to(SOURCE)} -> {target}")
+    assert not upwards
