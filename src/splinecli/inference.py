@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
+from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
 TILE_PIXELS = 16_384
 

@@ -47,8 +47,11 @@ def encode_picture(
     """
     signs = np.array([1.0, 1.0 if convention == "opengl" else -1.0, 1.0])
     top = 2**bits - 1
-    picture: NDArray[np.float64] = np.rint((normals * signs + 1) / 2 * top) * mask[..., None]
-    return picture.astype(np.uint8) if bits == 8 else picture.astype(np.uint16)
+    picture = np.empty(normals.shape, np.uint8 if bits == 8 else np.uint16)
+    # Row by row: a picture of many megapixels must not need several copies in float64.
+    for row, row_normals, row_mask in zip(picture, normals, mask, strict=True):
+        row[:] = np.rint((row_normals * signs + 1) / 2 * top) * row_mask[:, None]
+    return picture
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:

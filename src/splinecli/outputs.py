@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import tempfile
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.files import write_bytes, write_text
+from splinecli.files import current_umask
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
@@ -82,42 +81,43 @@ def write_estimate(
     Raises OutputError.
     """
     started = time.perf_counter()
+    stage: Path | None = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror})", path=folder, hint="Choose another place with -o"
-        ) from error
-    try:
         for form in formats:
-            write_bytes(stage / NORMALS[form], encode(estimate, form, convention))
+            write_normals(estimate, form, stage / NORMALS[form], convention)
         if estimate.error_map_deg is not None:
             from splinecli.evaluation.figures import error_map_picture
 
-            write_bytes(stage / ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg)))
+            (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
         files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
         seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
         report = {**report, "seconds": seconds, "files": files}
-        write_text(stage / REPORT, json.dumps(report, indent=2) + "\n")
+        (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
         _publish(stage, folder)
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror or error})", path=folder, hint="Choose another place with -o"
+        ) from error
     finally:
-        shutil.rmtree(stage, ignore_errors=True)
+        # Also on Ctrl-C: nothing half-written stays behind.
+        if stage is not None:
+            shutil.rmtree(stage, ignore_errors=True)
     return report
 
 
-def encode(estimate: NormalEstimate, form: str, convention: Convention) -> bytes:
+def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: Convention) -> None:
     """The normal map as a 16-bit PNG picture, or as float32 NPY or TIFF."""
-    buffer = io.BytesIO()
     if form == "png":
-        return encode_png(encode_picture(estimate.normal_map, estimate.capture.mask, convention=convention))
-    if form == "npy":
-        np.save(buffer, estimate.normal_map, allow_pickle=False)
+        picture = encode_picture(estimate.normal_map, estimate.capture.mask, convention=convention)
+        path.write_bytes(encode_png(picture))
+    elif form == "npy":
+        np.save(path, estimate.normal_map, allow_pickle=False)
     else:
         import tifffile
 
-        tifffile.imwrite(buffer, estimate.normal_map, photometric="rgb")
-    return buffer.getvalue()
+        tifffile.imwrite(path, estimate.normal_map, photometric="rgb")
 
 
 def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:
@@ -143,19 +143,15 @@ def peak_memory_mib() -> int | None:
 
 
 def _publish(stage: Path, folder: Path) -> None:
-    try:
-        if not folder.exists():
-            stage.chmod(0o755)
-            stage.rename(folder)
-            return
-        kept = {path.name for path in stage.iterdir()}
-        for name in OWN_FILES:
-            if name not in kept:
-                (folder / name).unlink(missing_ok=True)
-        # The report goes last: where it stands, the rest is complete.
-        for path in sorted(stage.iterdir(), key=lambda path: path.name == REPORT):
-            path.replace(folder / path.name)
-    except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror})", path=folder, hint="Choose another place with -o"
-        ) from error
+    """Move the finished files to their place; where there is no such folder yet, all at once."""
+    if not folder.exists():
+        stage.chmod(0o777 & ~current_umask())
+        stage.rename(folder)
+        return
+    kept = {path.name for path in stage.iterdir()}
+    for name in OWN_FILES:
+        if name not in kept:
+            (folder / name).unlink(missing_ok=True)
+    # The report goes last: where it stands, the rest is complete.
+    for path in sorted(stage.iterdir(), key=lambda path: path.name == REPORT):
+        path.replace(folder / path.name)

@@ -50,7 +50,7 @@ def multiply_adds(network: SplineNet) -> int:
         elif isinstance(module, nn.ConvTranspose2d):
             count += inputs[0][0].numel() * module.out_channels * math.prod(module.kernel_size)
 
-    hooks = [module.register_forward_hook(add) for module in network.modules()]  # type: ignore[arg-type]
+    hooks = [module.register_forward_hook(add) for module in network.modules()]
     lights = torch.nn.functional.normalize(torch.tensor([[0.3, 0, 1], [-0.3, 0.2, 1], [0, -0.4, 1]]), dim=1)
     with torch.no_grad():
         network.eval()(torch.rand(1, 3), lights)

@@ -1,0 +1,67 @@
+"""The weights that come in the package: their size, their checksum, and a small stored prediction."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splinecli.methods import MethodOptions, make_estimator
+from splinecli.networks.weights import SHIPPED, manifest, resolve_weights
+from splinecli.normals import angle_between_deg, unit
+
+GOLDEN = Path(__file__).resolve().parents[1] / "golden/shipped_predictions.json"
+
+
+def glossy_pixels(n_lights: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals (25, 3), lights (F, 3) on a spiral, and observations (25, F): Lambert's cosine and a Phong lobe."""
+    grid = np.linspace(-0.7, 0.7, 5)
+    x, y = (axis.ravel() for axis in np.meshgrid(grid * 0.9, grid * 0.9))
+    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    step = (np.arange(n_lights) + 0.5) / n_lights
+    azimuth, radius = 2.4 * np.arange(n_lights), 0.8 * np.sqrt(step)
+    lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1)
+    half = unit(lights + (0.0, 0.0, 1.0))
+    shading = np.clip(normals @ lights.T, 0, None)
+    lobe = np.clip(normals @ half.T, 0, None) ** 60 * (shading > 0)
+    return normals, lights, (0.6 * shading + 0.5 * lobe).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", sorted(manifest()))
+def test_file(name):
+    entry = manifest()[name]
+    content = (SHIPPED / entry["file"]).read_bytes()
+    assert len(content) <= 8e6
+    assert hashlib.sha256(content).hexdigest() == entry["sha256"]
+    assert resolve_weights(name).sha256 == entry["sha256"]
+
+
+@pytest.mark.parametrize("n_lights", [3, 4, 8, 10, 16, 32, 64, 96])
+def test_glossy_pixels_under_any_number_of_lights(n_lights):
+    """Far better than least squares where highlights mislead it; three lights only have to give unit normals."""
+    normals, lights, observations = glossy_pixels(n_lights)
+    estimated = make_estimator("spline-net", MethodOptions(precision="float32")).estimate(
+        observations, lights
+    )
+    np.testing.assert_allclose(np.linalg.norm(estimated, axis=1), 1, atol=1e-5)
+    if n_lights >= 8:
+        least_squares = make_estimator("ls").estimate(observations, lights)
+        error = angle_between_deg(estimated, normals).mean()
+        assert error < 3
+        assert error < angle_between_deg(least_squares, normals).mean()
+
+
+def test_stored_prediction(request):
+    """The numbers of this very file; `pytest --update-golden` after new weights."""
+    _, lights, observations = glossy_pixels(10)
+    estimated = make_estimator("spline-net", MethodOptions(precision="float32")).estimate(
+        observations, lights
+    )
+    if request.config.getoption("--update-golden"):
+        GOLDEN.write_text(json.dumps({"spline-net": np.round(estimated, 4).tolist()}) + "\n", "utf-8")
+    stored = np.array(json.loads(GOLDEN.read_text("utf-8"))["spline-net"])
+    # Other processors add up in another order; four decimals are 0.006 degrees.
+    assert angle_between_deg(estimated, unit(stored)).max() < 0.05
