@@ -3,9 +3,9 @@
     python examples/render_capture.py [FOLDER]        # default: examples/medallion
 
 The medallion is a height field z(x, y) over the square -1..1, seen by an orthographic camera from +z (x right, y up):
-a dome with a raised rim, a ring of beads and an ammonite, a logarithmic spiral with ribs. Everything that least
-squares ignores is there on purpose: highlights, attached shadows, cast shadows, and colours that vary over the
-surface. There is no interreflection and no noise, and nothing is random: the same files come out each time.
+a dome with a raised rim, a ring of beads and an ammonite, a logarithmic spiral with ribs. What least squares knows
+nothing of is there on purpose: highlights, attached shadows and cast shadows. There is no interreflection and no
+noise, and nothing is random: the same files come out each time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ REFLECTANCE = 0.05
 SHADOW_EDGE = 0.012
 """Depth below a blocking ridge, in height, at which a shadow is complete: the lamps are not points."""
 
-EXPOSURE = 0.52
+EXPOSURE = 0.75
 """Stored value, as a share of full scale, of a matte white surface that faces a lamp of strength 1."""
 
 
@@ -94,8 +94,8 @@ def height(x: Array, y: Array) -> Array:
     turns = spiral_turns(x, y)
     tube = np.sin(np.pi * turns) ** 2
     ribs = 1 + 0.16 * tube * np.cos(26 * azimuth + 5.0 * np.sin(np.pi * turns) ** 2)
-    shell = 0.30 * r * tube * ribs * r**2 / (r**2 + 0.08**2) * step_down(r, 0.66, 0.03)
-    eye = 0.05 * np.exp(-((r / 0.07) ** 2))
+    shell = 0.30 * r * tube * ribs * r**2 / (r**2 + 0.15**2) * step_down(r, 0.66, 0.03)
+    eye = 0.05 * np.exp(-((r / 0.08) ** 2))
     body = (dome + rim + beads + shell + eye) * step_down(r, RADIUS + 0.02, 0.02)
     return np.asarray(body, np.float64)
 

@@ -35,7 +35,7 @@ def imported_rooms(tree: ast.AST) -> set[str]:
             )
         elif isinstance(node, ast.Import):
             modules += [alias.name for alias in node.names if alias.name.startswith("splinecli")]
-    names = {(module.split(".") + ["__init__"])[1] for module in modules}
+    names = {[*module.split("."), "__init__"][1] for module in modules}
     return {name if name in HEIGHT else "__init__" for name in names}
 
 

@@ -1,0 +1,27 @@
+#!/bin/sh
+# Normals of the medallion with the shipped weights; prints the mean angular error from the report.
+#
+#   examples/infer_medallion.sh [OUT]             # default: out, in the repository
+#
+# SPLINECLI and PYTHON name other programs than `splinecli` and `python3` on the PATH.
+set -eu
+
+out=${1:-}
+case $out in
+  '') out=out ;;
+  /*) ;;
+  *) out=$PWD/$out ;;
+esac
+cd "$(dirname "$0")/.."
+
+# stdout is the report and nothing else; the same text is in $out/medallion/report.json.
+"${SPLINECLI:-splinecli}" infer examples/medallion -o "$out" --overwrite --json > /dev/null
+
+"${PYTHON:-python3}" - "$out/medallion/report.json" <<'END'
+import json, sys
+
+report = json.load(open(sys.argv[1], encoding="utf-8"))
+errors = report["angular_error_deg"]
+print(f"{report['method']}, {report['n_lights']} lights: MAE {errors['mean']:.2f} deg, median {errors['median']:.2f} deg")
+END
+echo "see $out/medallion/normals.png and error_map.png"

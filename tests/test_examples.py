@@ -1,0 +1,200 @@
+"""The example capture is what its script renders, and the example scripts run."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.capture import find_capture_files, read_capture
+from splinecli.inference import estimate_normals
+from splinecli.methods import make_estimator
+from splinecli.networks.weights import shipped_names
+from splinecli.normals import encode_picture
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+MEDALLION = EXAMPLES / "medallion"
+ONE_COUNT = 1  # of 65535: libraries of mathematics differ in the last digit, and rounding then in one count
+
+needs_weights = pytest.mark.skipif("spline-net" not in shipped_names(), reason="the package ships no weights")
+
+
+def read_png(path: Path) -> Any:
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return pixels[..., ::-1] if pixels.ndim == 3 else pixels
+
+
+def counts_apart(a: Any, b: Any) -> int:
+    return int(np.abs(a.astype(np.int64) - b.astype(np.int64)).max())
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("render_capture", EXAMPLES / "render_capture.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def rendering(script):
+    return script.render()
+
+
+def test_the_stored_images_are_what_the_script_renders(rendering):
+    for number, image in enumerate(rendering.images, start=1):
+        stored = read_png(MEDALLION / f"{number:02d}.png")
+        assert stored.dtype == np.uint16
+        assert stored.shape == image.shape
+        assert counts_apart(stored, image) <= ONE_COUNT, f"image {number}"
+
+
+def test_the_stored_mask_and_normals_are_what_the_script_makes(rendering):
+    np.testing.assert_array_equal(read_png(MEDALLION / "mask.png") == 255, rendering.mask)
+    stored = read_png(MEDALLION / "normals_gt.png")
+    assert counts_apart(stored, encode_picture(rendering.normals, rendering.mask)) <= ONE_COUNT
+
+
+def test_the_stored_lights_are_those_of_the_script(rendering):
+    directions = np.loadtxt(MEDALLION / "light_directions.txt")
+    np.testing.assert_allclose(directions, rendering.light_directions, rtol=0, atol=1.1e-6)
+    np.testing.assert_array_equal(
+        np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities
+    )
+
+
+def test_write_makes_the_files_of_the_repository(script, rendering, tmp_path):
+    script.write(rendering, tmp_path / "medallion")
+    assert {p.name for p in (tmp_path / "medallion").iterdir()} == {p.name for p in MEDALLION.iterdir()}
+
+
+def test_the_reader_finds_every_file_by_its_name():
+    files = find_capture_files(MEDALLION)
+    assert len(files.images) == 10
+    assert files.light_intensities is not None
+    assert files.mask is not None
+    assert files.ground_truth is not None
+
+
+def test_nothing_is_saturated_and_nothing_is_warned_about():
+    capture = read_capture(MEDALLION)
+    assert capture.warnings == ()
+    assert max(read_png(path).max() for path in MEDALLION.glob("[0-9]*.png")) < 65535
+
+
+def test_the_ground_truth_is_unit_and_faces_the_camera(rendering):
+    capture = read_capture(MEDALLION)
+    assert capture.ground_truth is not None
+    inside = capture.ground_truth[capture.mask]
+    np.testing.assert_allclose(np.linalg.norm(inside, axis=1), 1, rtol=0, atol=1e-6)
+    assert inside[:, 2].min() > 0.1
+    # 16 bits hold a component to 1.6e-5; the read normals are scaled to unit length besides.
+    np.testing.assert_allclose(inside, rendering.normals[rendering.mask], rtol=0, atol=5e-5)
+
+
+def test_the_normals_belong_to_the_height_field(script):
+    # Independent of normals_of: heights one sample apart, walked over with the normals between them.
+    x, y = script.sample_grid()
+    z, normals = script.height(x, y), script.normals_of(x, y)
+    near = np.hypot(x, y) < script.RADIUS
+    spacing = x[0, 1] - x[0, 0]
+    slope_x, slope_y = -normals[..., 0] / normals[..., 2], -normals[..., 1] / normals[..., 2]
+    walked_right = (slope_x[:, :-1] + slope_x[:, 1:]) / 2 * spacing
+    walked_up = (slope_y[:-1] + slope_y[1:]) / 2 * spacing  # row 0 is the top: up is towards smaller rows
+    # The trapezium rule errs with the third derivative: small where the relief is smooth, which most of it is.
+    right = np.abs(np.diff(z, axis=1) - walked_right)[near[:, 1:]]
+    up = np.abs(-np.diff(z, axis=0) - walked_up)[near[1:]]
+    assert np.median(right) < 1e-5
+    assert np.median(up) < 1e-5
+
+
+def test_light_directions_point_to_the_lit_side(rendering):
+    # The medallion is a dome: under a light from the right its right half is brighter, and so on.
+    x, y = np.meshgrid(np.linspace(-1, 1, 128), np.linspace(1, -1, 128))
+    for image, light in zip(rendering.images, rendering.light_directions, strict=True):
+        gray = image.mean(axis=-1) * rendering.mask
+        assert (gray * (x * light[0] + y * light[1])).sum() > 0
+
+
+def test_shadows_fall_away_from_the_light(script):
+    # A block in the middle of a table, a light from the upper right at 45 degrees.
+    heights = np.zeros((60, 60))
+    heights[28:32, 28:32] = 0.2  # at 45 degrees the shadow is 0.2 long too: 6 samples of 2 / 60
+    light = np.array((0.5, 0.5, np.sqrt(0.5)))
+    seen = script.visibility(heights, light)
+    assert seen[34, 25] == 0  # down and left of it
+    assert seen[25, 34] == 1 and seen[25, 25] == 1 and seen[34, 34] == 1
+    assert seen[29, 30] == 1  # its own top
+    assert seen[42, 17] == 1  # past the shadow's end
+
+
+@pytest.fixture(scope="module")
+def ls_mae_deg() -> float:
+    estimate = estimate_normals(read_capture(MEDALLION), make_estimator("ls"))
+    assert estimate.errors is not None
+    return estimate.errors.mean
+
+
+def test_least_squares_is_off_by_highlights_and_shadows_alone(ls_mae_deg):
+    # 5.98 degrees. Another frame or order of the lights would give tens of degrees, a matte disc next to none.
+    assert 5 < ls_mae_deg < 7
+
+
+def test_dividing_by_the_intensities_matters(ls_mae_deg, tmp_path):
+    equal = tmp_path / "equal.txt"
+    equal.write_text("1 1 1\n" * 10)
+    estimate = estimate_normals(read_capture(MEDALLION, intensities=equal), make_estimator("ls"))
+    assert estimate.errors is not None
+    assert estimate.errors.mean > ls_mae_deg + 1
+
+
+def run(command: list[str], folder: Path, **environment: str) -> str:
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@needs_weights
+def test_python_api_runs_from_any_folder(tmp_path, ls_mae_deg):
+    said = run([sys.executable, str(EXAMPLES / "python_api.py")], tmp_path)
+    assert f"ls: MAE {ls_mae_deg:.2f} deg" in said
+    assert "spline-net: MAE " in said
+    for method in ("ls", "spline-net"):
+        picture = read_png(tmp_path / "out" / "python_api" / f"{method}.png")
+        assert picture.dtype == np.uint16
+        assert picture.shape == (128, 128, 3)
+
+
+@needs_weights
+def test_infer_medallion_runs_from_any_folder(tmp_path):
+    places = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+    command, shell = shutil.which("splinecli", path=places), shutil.which("sh")
+    if command is None or shell is None:
+        pytest.skip("no splinecli console script, or no sh, on the PATH")
+    said = run(
+        [shell, str(EXAMPLES / "infer_medallion.sh"), "here"],
+        tmp_path,
+        SPLINECLI=command,
+        PYTHON=sys.executable,
+    )
+    assert said.startswith("spline-net, 10 lights: MAE ")
+    made = {path.name for path in (tmp_path / "here" / "medallion").iterdir()}
+    assert made == {"normals.png", "normals.npy", "error_map.png", "report.json"}
