@@ -79,3 +79,13 @@ def test_angles_are_never_nan() -> None:
     same, opposite = angle_between_deg(normals, normals), angle_between_deg(normals, -normals)
     assert same.max() < 1e-5
     assert opposite.min() > 180 - 1e-5
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_black_and_mid_gray_are_no_normals(dtype: type[np.unsignedinteger]) -> None:
+    top = np.iinfo(dtype).max
+    half = top // 2
+    picture = np.array([[0, 0, 0], [half] * 3, [half + 1] * 3, [half, half, top]], dtype)
+    decoded = decode_picture(picture)
+    assert not decoded[:3].any()
+    np.testing.assert_allclose(decoded[3], [0, 0, 1], atol=0.01)

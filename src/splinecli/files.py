@@ -30,6 +30,22 @@ def write_bytes(path: Path, content: bytes) -> None:
             temporary.unlink(missing_ok=True)
 
 
+def check_writable(folder: Path) -> None:
+    """Raise OutputError where `folder` is no folder, or could not be made or written into."""
+    place = folder
+    try:
+        while not place.exists():
+            place = place.parent
+    except OSError as error:
+        raise OutputError(f"cannot be a folder ({error.strerror})", path=folder) from error
+    if not place.is_dir():
+        raise OutputError(
+            "is a file; the results need a folder", path=place, hint="Choose another place with -o"
+        )
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OutputError("may not be written into", path=place, hint="Choose another place with -o")
+
+
 def write_text(path: Path, content: str) -> None:
     """write_bytes of UTF-8 text."""
     write_bytes(path, content.encode())

@@ -1,4 +1,7 @@
-"""Capture + Estimator -> NormalEstimate, in tiles: memory beyond the capture is bounded by one tile."""
+"""Capture + Estimator -> NormalEstimate, in tiles: what a method needs to work is bounded by one tile.
+
+The normals themselves, and the errors, grow with the capture.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
+from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
 TILE_PIXELS = 16_384
+_UNIT_TOLERANCE = 1e-2  # float16 and bfloat16 normals pass, zero ones and NaN do not
 
 
 @dataclass(frozen=True)
@@ -47,9 +52,18 @@ def estimate_normals(
         if progress is not None:
             progress(len(tile))
     seconds = time.perf_counter() - started
+    _check_unit(normals, estimator.name)
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
     normal_map[capture.mask] = normals
     if capture.ground_truth is None:
         return NormalEstimate(capture, normal_map, seconds)
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
     return NormalEstimate(capture, normal_map, seconds, error_map, summarise_errors(error_map))
+
+
+def _check_unit(normals: NDArray[np.float32], method: str) -> None:
+    # A zero normal would score 0 degrees, and NaN would drop out of a mean.
+    for start in range(0, len(normals), TILE_PIXELS):
+        length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
+        if not (np.abs(length - 1) <= _UNIT_TOLERANCE).all():
+            raise SplinecliError(f"method {method} gave normals that are not unit vectors")

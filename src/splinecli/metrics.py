@@ -34,7 +34,9 @@ def angular_error_map_deg(
     """
     scored = mask & ground_truth.any(axis=-1)
     errors = np.full(mask.shape, np.nan, np.float32)
-    errors[scored] = angle_between_deg(normals[scored], ground_truth[scored])
+    # Row by row: in float64, all at once, a map of many megapixels would need several gigabytes.
+    for row, row_scored, row_normals, row_truth in zip(errors, scored, normals, ground_truth, strict=True):
+        row[row_scored] = angle_between_deg(row_normals[row_scored], row_truth[row_scored])
     return errors
 
 

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 Convention = Literal["opengl", "directx"]
 
+# A picture's background may be gray, the code of the zero vector: a real normal is never so short.
+_SHORTEST_IN_PICTURE = 0.5
+
 _Float = TypeVar("_Float", bound=np.floating)
 
 
@@ -55,8 +58,9 @@ def encode_picture(
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
-    """Unit normals (H, W, 3) from an 8- or 16-bit RGB picture (y up); black pixels become zero vectors."""
-    top = np.iinfo(picture.dtype).max
-    decoded: NDArray[np.float64] = unit(picture.astype(np.float64) * 2 / top - 1)
-    decoded[~picture.any(axis=-1)] = 0
+    """Unit normals (..., 3) from an 8- or 16-bit RGB picture (y up); black and mid-gray become zero vectors."""
+    vectors = picture.astype(np.float64) * 2 / np.iinfo(picture.dtype).max - 1
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    is_normal = picture.any(axis=-1, keepdims=True) & (length > _SHORTEST_IN_PICTURE)
+    decoded: NDArray[np.float64] = np.divide(vectors, length, out=np.zeros_like(vectors), where=is_normal)
     return decoded

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.files import current_umask
+from splinecli.files import check_writable, current_umask
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
@@ -28,11 +28,8 @@ OWN_FILES = (*NORMALS.values(), ERROR_MAP, REPORT)
 
 
 def check_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError where the folder holds results already and may not be overwritten, or is no folder."""
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(
-            "is a file; the results need a folder", path=folder, hint="Choose another place with -o"
-        )
+    """Raise OutputError where the folder holds results that may not be overwritten, or could not be written."""
+    check_writable(folder)
     if overwrite:
         return
     for name in OWN_FILES:
@@ -143,15 +140,24 @@ def peak_memory_mib() -> int | None:
 
 
 def _publish(stage: Path, folder: Path) -> None:
-    """Move the finished files to their place; where there is no such folder yet, all at once."""
+    """Move the finished files to their place; where that fails, those of an earlier run come back."""
     if not folder.exists():
         stage.chmod(0o777 & ~current_umask())
         stage.rename(folder)
         return
-    kept = {path.name for path in stage.iterdir()}
-    for name in OWN_FILES:
-        if name not in kept:
-            (folder / name).unlink(missing_ok=True)
-    # The report goes last: where it stands, the rest is complete.
-    for path in sorted(stage.iterdir(), key=lambda path: path.name == REPORT):
-        path.replace(folder / path.name)
+    new = [path.name for path in stage.iterdir()]
+    earlier = stage / "earlier"
+    earlier.mkdir()
+    try:
+        for name in OWN_FILES:
+            if (folder / name).exists():
+                (folder / name).replace(earlier / name)
+        for name in new:
+            (stage / name).replace(folder / name)
+    except BaseException:
+        for name in new:
+            if not (stage / name).exists():
+                (folder / name).unlink()
+        for path in earlier.iterdir():
+            path.replace(folder / path.name)
+        raise

@@ -150,3 +150,23 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
 def test_no_normal_inside_the_mask(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found no normal inside the mask, expected at least one"):
         read_normals(write(tmp_path / "a.npy", np.zeros((*SHAPE, 3))), SHAPE, MASK)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_picture_saved_by_numpy(tmp_path: Path, normals: NDArray[np.float64], bits: int) -> None:
+    has_normal = normals.any(axis=2)
+    np.save(tmp_path / "a.npy", encode_picture(normals, has_normal, bits=bits))
+    read = read_normals(tmp_path / "a.npy", SHAPE, MASK)
+    assert not read[~has_normal].any()
+    assert angle_between_deg(read[has_normal], normals[has_normal]).max() < 0.5
+
+
+def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
+    plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
+    scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
+    np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", SHAPE, MASK), plane * MASK[..., None])
+
+
+def test_a_path_that_the_system_refuses(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be read \(File name too long\)\."):
+        read_normals(tmp_path / ("x" * 300 + ".npy"), SHAPE, MASK)

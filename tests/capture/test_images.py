@@ -243,3 +243,29 @@ def test_empty_mask(write_image: WriteImage) -> None:
     assert str(caught.value) == (
         f"{path}: the mask is empty: every pixel is zero. Paint the object white, or give no mask."
     )
+
+
+CUT_OUT = np.array([[0, 0, 255], [0, 200, 255]], np.uint8)
+
+
+@pytest.mark.parametrize("name", ["mask.png", "mask.tif"])
+@pytest.mark.parametrize("scale", [1, 257], ids=["8 bits", "16 bits"])
+@pytest.mark.parametrize("colour", [0, 90, 255])
+def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path: Path, name: str, scale: int, colour: int) -> None:
+    alpha = CUT_OUT * scale if scale == 1 else CUT_OUT.astype(np.uint16) * 257
+    cv2.imwrite(str(tmp_path / name), np.dstack([np.full_like(alpha, colour * scale)] * 3 + [alpha]))
+    np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
+
+
+@pytest.mark.parametrize(
+    "alpha", [np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]]
+)
+def test_alpha_that_cuts_nothing_out_leaves_the_mask_to_the_colours(tmp_path: Path, alpha: object) -> None:
+    cv2.imwrite(str(tmp_path / "mask.png"), np.dstack([CUT_OUT] * 3 + [np.asarray(alpha, np.uint8)]))
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), CUT_OUT > 127)
+
+
+def test_values_beyond_float32_are_refused_without_a_numpy_warning(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", np.array([[1.0, 1e300]]), photometric="minisblack")
+    with pytest.raises(InputError, match="found a value that is not finite"):  # warnings are errors here
+        read_image(tmp_path / "a.tif")

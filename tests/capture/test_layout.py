@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.capture import find_capture_files, find_captures
+from splinecli.capture import capture_name, find_capture_files, find_captures
 from splinecli.errors import InputError
 
 
@@ -202,3 +202,61 @@ def test_psbox(tmp_path: Path) -> None:
     assert files.images == (folder / "Objects/b2.png", folder / "Objects/b10.png")
     assert (files.name, files.light_directions) == ("demo", folder / "light_directions.txt")
     assert (files.mask, files.ground_truth) == (None, None)
+
+
+def test_psbox_without_images(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "demo", "Objects/notes.txt", "light_directions.txt")
+    with pytest.raises(InputError) as caught:
+        find_capture_files(folder)
+    assert str(caught.value) == (
+        f"{folder / 'Objects'}: the folder holds no images. PNG, TIFF and JPEG files count as images."
+    )
+
+
+def test_find_captures_sees_psbox(tmp_path: Path) -> None:
+    fill(
+        tmp_path, "a/Objects/1.png", "a/light_directions.txt", "b/Objects/notes.txt", "b/light_directions.txt"
+    )
+    assert find_captures(tmp_path) == [tmp_path / "a"]
+    assert find_captures(tmp_path / "a") == [tmp_path / "a"]
+
+
+def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "vase", "a.png", "lights.txt")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (folder / "loop.png").symlink_to(folder / "loop.png")
+    long = tmp_path / ("x" * 300)
+    reasons = {long: "File name too long", tmp_path / "loop": "Too many levels of symbolic links"}
+    for path, reason in reasons.items():
+        for call in (
+            lambda path: find_capture_files(path),
+            lambda path: find_captures(path),
+            lambda path: find_capture_files(folder, lights=path),
+            lambda path: find_capture_files(folder, mask=path),
+        ):
+            with pytest.raises(InputError) as caught:
+                call(path)
+            assert str(caught.value) == f"{path}: cannot be read ({reason})."
+    assert [path.name for path in find_capture_files(folder).images] == ["a.png"]
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("Symlink loop"), OSError(40, "Too many levels of symbolic links")]
+)
+def test_a_name_through_a_loop(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def refuse(path: Path) -> None:  # what Path.resolve raises depends on Python's version
+        raise error
+
+    monkeypatch.setattr(Path, "resolve", refuse)
+    with pytest.raises(InputError, match=r"cannot be read \(Too many levels of symbolic links\)\."):
+        capture_name(Path("loop/x/.."))
+
+
+def test_a_folder_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, **_: object) -> None:  # root may read everything
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "stat", refuse)
+    with pytest.raises(InputError) as caught:
+        find_captures(tmp_path / "closed/vase")
+    assert str(caught.value) == f"{tmp_path / 'closed/vase'}: cannot be read (Permission denied)."

@@ -155,7 +155,9 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
     write_image("vase/mask.png", np.array([[1, 0, 1]], np.uint8))
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
-    assert capture.warnings == ()
+    assert capture.warnings == (
+        "50.0 % of the pixels are black under every light; they get the normal (0, 0, 1).",
+    )
     (capture_folder / "mask.png").unlink()
     with pytest.raises(InputError, match=r"8\.tif: found a value that is not finite"):
         read_capture(capture_folder)
@@ -170,6 +172,19 @@ def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
         "5.0 % of the observations are saturated; a shorter exposure gives better normals.",
         "The images have 8 bits; 16-bit linear images give better normals.",
     )
+
+
+@pytest.mark.parametrize(("n_black", "share"), [(1, None), (2, "2.0"), (100, "100.0")])
+def test_pixels_that_no_light_reaches(
+    capture_folder: Path, write_image: WriteImage, n_black: int, share: str | None
+) -> None:
+    for number in range(8, 12):
+        pixels = np.full((10, 10), 1, np.uint16)
+        pixels.flat[:n_black] = 0
+        pixels[9, 9] = number == 8 and n_black < 100  # lit once: not black
+        write_image(f"vase/img{number}.png", pixels)
+    message = f"{share} % of the pixels are black under every light; they get the normal (0, 0, 1)."
+    assert read_capture(capture_folder).warnings == (() if share is None else (message,))
 
 
 @pytest.mark.parametrize(

@@ -100,3 +100,11 @@ def test_refusals(dataset, run, golden):
         messages.append(result.err)
     golden("evaluate_refusals.txt", "".join(messages))
     assert not Path("evaluation").exists()
+
+
+def test_a_wide_table_is_turned_and_never_cut(make_capture, run, golden):
+    for index in range(9):
+        make_capture(f"data/capture_number_{index}[red]")
+    result = run("evaluate", "data", "--method", "ls", "--n-lights", "all")
+    golden("evaluate_wide.txt", result.out)
+    assert "capture_number_8[red]" in result.out

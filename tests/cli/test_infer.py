@@ -164,6 +164,52 @@ def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
     assert "image3.png" in documents[1]["error"]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [("--n-lights", 2), ("--light-indices", "0,0,1"), ("--device", "cuda"), ("--weights", "spline-net")],
+)
+def test_usage_errors_end_a_batch_at_once(arguments, capture, make_capture, run, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    make_capture("second")
+    method = "spline-net" if "--device" in arguments else "ls"
+    result = run("infer", capture, "second", "--method", method, *arguments)
+    assert (result.code, result.out, result.err.count("\n")) == (2, "", 1)
+    assert not Path("out").exists()
+
+
+def test_a_batch_with_an_existing_output_computes_nothing(capture, make_capture, run):
+    make_capture("second")
+    run("infer", "second", "--method", "ls")
+    assert run("infer", capture, "second", "--method", "ls").code == 5
+    assert [path.name for path in Path("out").iterdir()] == ["second"]
+
+
+def test_links_are_called_by_their_own_names(capture, run):
+    for link in ("x/obj", "y/obj", "one", "two"):
+        Path(link).parent.mkdir(exist_ok=True)
+        Path(link).symlink_to(capture.absolute())
+    assert run("infer", "x/obj", "y/obj", "--method", "ls").code == 2
+    assert run("infer", "one", "two", "--method", "ls").code == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == ["one", "two"]
+
+
+def test_interrupted_overwriting_keeps_the_earlier_results(capture, run, monkeypatch):
+    run("infer", capture, "--method", "ls")
+    before = {path.name: path.read_bytes() for path in Path("out/sphere").iterdir()}
+    replace, calls = Path.replace, []
+
+    def interrupt_at_the_sixth(path: Path, target: Path) -> Path:
+        calls.append(path)
+        if len(calls) == 6:  # the four earlier files are aside, the second new one is on its way
+            raise KeyboardInterrupt
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", interrupt_at_the_sixth)
+    assert run("infer", capture, "--method", "ls", "--n-lights", 5, "--overwrite").code == 130
+    assert {path.name: path.read_bytes() for path in Path("out/sphere").iterdir()} == before
+    assert [path.name for path in Path("out").iterdir()] == ["sphere"]
+
+
 def test_output_that_cannot_be_written(capture, run, golden):
     Path("out").write_text("a file where the folder should be")
     result = run("infer", capture, "--method", "ls")
@@ -214,3 +260,20 @@ def test_a_defect_is_called_one(capture, run, monkeypatch):
     assert result.err.endswith(
         "splinecli: this is a defect of splinecli; please report it with the lines above.\n"
     )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX redirections")
+def test_closed_streams_and_ascii_terminals(capture, make_capture):
+    make_capture("naïve ☃")
+
+    def call(name: str, redirection: str) -> int:
+        command = f'"{sys.executable}" -m splinecli infer "{name}" --method ls --overwrite {redirection}'
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+        return subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, env=environment).returncode
+
+    assert call("naïve ☃", "> seen.txt") == 0
+    assert "na\\xefve" in Path("seen.txt").read_text()
+    assert call("sphere", ">&-") == 0
+    assert call("sphere", "2>&-") == 0
+    if Path("/dev/full").exists():
+        assert call("sphere", "> /dev/full") == 5

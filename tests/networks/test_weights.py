@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splinecli.errors import ModelError
 from splinecli.networks import weights
+from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import FORMAT, load_weights, resolve_weights, save_weights, tensors_sha256
 
@@ -149,7 +150,7 @@ def test_files_of_other_kinds(tmp_path: Path, content: bytes) -> None:
 def test_files_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no such file"):
         resolve_weights(str(tmp_path / "weights.safetensors"))
-    with pytest.raises(ModelError, match="no such file"):
+    with pytest.raises(ModelError, match="is a folder"):
         resolve_weights(str(tmp_path))
     with pytest.raises(ModelError, match="no weights named 'spine-net'"):
         resolve_weights("spine-net")
@@ -172,3 +173,12 @@ def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_what_the_package_ships_is_whole() -> None:
     for name in weights.shipped_names():
         assert resolve_weights(name).name == name
+
+
+def test_weights_that_are_not_finite(tmp_path: Path) -> None:
+    network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8))
+    with torch.no_grad():
+        network.ne_net.out.bias[0] = float("nan")  # type: ignore[union-attr, operator, index]
+    save_weights(network, tmp_path / "nan.safetensors")
+    with pytest.raises(ModelError, match="not finite"):
+        load_weights(tmp_path / "nan.safetensors")

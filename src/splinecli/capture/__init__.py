@@ -1,6 +1,6 @@
 """Captures: photographs of one object under known lights, read from folders of files."""
 
-from splinecli.capture.capture_files import CaptureFiles
+from splinecli.capture.capture_files import CaptureFiles, capture_name
 from splinecli.capture.ground_truth import read_normals
 from splinecli.capture.images import read_image, read_mask
 from splinecli.capture.layout import find_capture_files, find_captures
@@ -12,6 +12,7 @@ __all__ = [
     "Capture",
     "CaptureFiles",
     "CaptureSource",
+    "capture_name",
     "find_capture_files",
     "find_captures",
     "open_capture",

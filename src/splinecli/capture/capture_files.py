@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from splinecli.capture.image_lists import IMAGE_SUFFIXES, list_folder
+from splinecli.capture.paths import find_mode, is_file, resolve
 from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
@@ -60,25 +62,30 @@ class Overrides:
     ground_truth: Path | None = None
 
     def named(self) -> tuple[Path, ...]:
-        """Those that are there. Raises InputError for one that is no file."""
+        """Those that are given. Raises InputError for one that is no file."""
         files = tuple(
             f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None
         )
         for file in files:
-            if not file.exists():
+            mode = find_mode(file)
+            if mode is None:
                 raise InputError("the file does not exist", path=file)
-            if not file.is_file():
+            if not stat.S_ISREG(mode):
                 raise InputError("found a folder, expected a file", path=file)
         return files
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """The first of the names that the folder holds, letter case aside; None for none."""
-    files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.is_file()}
+    files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}
     return next((files[name] for name in names if name in files), None)
 
 
 def capture_name(folder: Path) -> str:
-    """The folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name."""
+    """The folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
+
+    Raises:
+        InputError: the system does not tell what lies at a path with "..".
+    """
     path = folder.absolute()
-    return (path.resolve() if ".." in path.parts else path).name or "capture"
+    return (resolve(path) if ".." in path.parts else path).name or "capture"

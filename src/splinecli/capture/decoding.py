@@ -47,6 +47,11 @@ def decode_image(path: Path) -> NDArray[Any]:
     Raises:
         InputError: the file is missing, of another format, truncated or damaged.
     """
+    return decode_with_alpha(path)[0]
+
+
+def decode_with_alpha(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """The pixels as decode_image gives them, and the alpha channel (H, W), None where there is none."""
     data = _read_bytes(path)
     if data.startswith(_TIFF):
         pixels = decode_tiff(path, lambda: _decode_with_opencv(data, path))
@@ -60,9 +65,7 @@ def decode_image(path: Path) -> NDArray[Any]:
         raise InputError("the file is empty" if not data else "found neither PNG, TIFF nor JPEG", path=path)
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
-    if pixels.shape[2] in (2, 4):
-        pixels = pixels[:, :, :-1]
-    if pixels.shape[2] not in (1, 3):
+    if pixels.shape[2] not in (1, 2, 3, 4):
         raise InputError(f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path=path)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
@@ -72,7 +75,9 @@ def decode_image(path: Path) -> NDArray[Any]:
             path=path,
             hint="Save the image with 16 bits",
         )
-    return pixels
+    if pixels.shape[2] in (2, 4):
+        return pixels[:, :, :-1], pixels[:, :, -1]
+    return pixels, None
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -87,7 +92,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, C), colour in RGB order without alpha."""
+    """(H, W) or (H, W, C), colour in RGB or RGBA order."""
     import cv2
 
     with _native_stderr() as said:
@@ -98,8 +103,11 @@ def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
             pixels = None
     if pixels is None or _DAMAGE.search("".join(said)):
         raise InputError("the image is damaged and cannot be read", path=path, hint="Copy or export it again")
-    # BGR or BGRA becomes RGB: a view, since a copy of a large image is felt.
-    return pixels[:, :, 2::-1] if pixels.ndim == 3 and pixels.shape[2] in (3, 4) else pixels
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        return pixels[:, :, ::-1]  # BGR becomes RGB: a view, since a copy of a large image is felt
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        return pixels[:, :, [2, 1, 0, 3]]
+    return pixels
 
 
 def _check_png(data: bytes, path: Path) -> None:

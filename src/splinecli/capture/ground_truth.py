@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.decoding import decode_image
+from splinecli.capture.paths import find_mode
 from splinecli.capture.text_files import read_number_rows
 from splinecli.errors import InputError
+from splinecli.normals import decode_picture
 
 StrPath = str | os.PathLike[str]
 
 _MAT_KEY = "Normal_gt"
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
-# A picture's background may be gray, the code of the zero vector: a real normal is never so short.
-_SHORTEST_IN_PICTURE = 0.5
+# Not .mat: MATLAB stores whole numbers, such as those of a plane's normals, as bytes whatever their type.
+_MAY_HOLD_PICTURE = (*_PICTURE_SUFFIXES, ".npy")
 # Pixels normalised at a time: in float64, but not all of a large picture at once.
 _BLOCK = 1 << 20
 
@@ -29,9 +32,9 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
     Frame: x right, y up, z to the camera. The file is one of
 
     - MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array;
-    - .npy;
+    - .npy; unsigned integers are a picture;
     - .txt: H*W rows of x y z in row-major order;
-    - .png or .tif: n = 2 v / full range - 1, black for no ground truth; floating-point TIFF as it is.
+    - .png or .tif: n = 2 v / full range - 1, black or mid-gray for no ground truth; floating-point TIFF as it is.
 
     Vectors are normalised; zero and non-finite ones are no ground truth.
 
@@ -44,7 +47,8 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
         InputError: the file cannot be read, has another size, or has no normal inside the mask.
     """
     path = Path(path)
-    if not path.is_file():
+    mode = find_mode(path)
+    if mode is None or not stat.S_ISREG(mode):
         raise InputError("the ground truth does not exist or is no file", path=path)
     suffix = path.suffix.lower()
     if suffix == ".mat":
@@ -64,32 +68,27 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
             f"found ground truth of {_times(stored.shape)}, expected {_times((*shape, 3))} like the images",
             path=path,
         )
-    is_picture = suffix in _PICTURE_SUFFIXES and stored.dtype.kind == "u"
+    is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
     if stored.dtype.kind not in "fiu":
         raise InputError(f"found ground truth of type {stored.dtype}, expected real numbers", path=path)
     normals = np.zeros((*shape, 3), np.float32)
     rows, columns = np.nonzero(mask)
     for start in range(0, len(rows), _BLOCK):
         place = rows[start : start + _BLOCK], columns[start : start + _BLOCK]
-        vectors = stored[place].astype(np.float64)
-        normals[place] = _from_picture(vectors, stored.dtype) if is_picture else _unit_or_zero(vectors, 0.0)
+        normals[place] = decode_picture(stored[place]) if is_picture else _unit_or_zero(stored[place])
     if not normals.any():
         raise InputError("found no normal inside the mask, expected at least one", path=path)
     return normals
 
 
-def _from_picture(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.float64]:
-    coloured = values.any(axis=1, keepdims=True)
-    return _unit_or_zero(values * 2 / np.iinfo(dtype).max - 1, _SHORTEST_IN_PICTURE) * coloured
-
-
-def _unit_or_zero(vectors: NDArray[np.float64], shortest: float) -> NDArray[np.float64]:
-    """Vectors (P, 3) at unit length; zero where they are not finite or not longer than the shortest."""
+def _unit_or_zero(stored: NDArray[Any]) -> NDArray[np.float64]:
+    """Vectors (P, 3) at unit length; zero where they are zero or not finite."""
+    vectors = stored.astype(np.float64)
     # Not NaN, not infinite, and nothing (of a damaged file) whose square would be.
     usable = (np.abs(vectors) < 1e100).all(axis=1, keepdims=True)
     length = np.linalg.norm(np.where(usable, vectors, 0), axis=1, keepdims=True)
     scaled: NDArray[np.float64] = np.divide(
-        vectors, length, out=np.zeros_like(vectors), where=usable & (length > shortest)
+        vectors, length, out=np.zeros_like(vectors), where=usable & (length > 0)
     )
     return scaled
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+import stat
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from splinecli.capture.paths import find_mode, is_file, resolve
 from splinecli.capture.text_files import read_lines
 from splinecli.errors import InputError
 
@@ -29,9 +31,10 @@ def list_folder(folder: Path) -> list[Path]:
     Raises:
         InputError: the folder is missing, is a file, or cannot be read.
     """
-    if not folder.exists():
+    mode = find_mode(folder)
+    if mode is None:
         raise InputError("the folder does not exist", path=folder)
-    if not folder.is_dir():
+    if not stat.S_ISDIR(mode):
         raise InputError("found a file, expected a folder of images", path=folder)
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
@@ -49,15 +52,23 @@ def list_images(
         leave_out_stems: lower-case names without suffix that mean something else, such as "mask".
         leave_out: files that mean something else.
     """
-    others = {path.resolve() for path in leave_out}
+    others = {resolve(path) for path in leave_out}
     return tuple(
         entry
         for entry in list_folder(folder)
         if entry.suffix.lower() in IMAGE_SUFFIXES
         and entry.stem.lower() not in leave_out_stems
-        and entry.is_file()
-        and entry.resolve() not in others
+        and is_file(entry)
+        and resolve(entry) not in others
     )
+
+
+def check_not_empty(images: Sequence[Path], folder: Path) -> None:
+    """Raise InputError where there are no images in the folder."""
+    if not images:
+        raise InputError(
+            "the folder holds no images", path=folder, hint="PNG, TIFF and JPEG files count as images"
+        )
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
@@ -72,7 +83,7 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         if not name:
             continue
         image = path.parent / name
-        if not _is_file(image):
+        if not is_file(image):
             raise InputError(
                 f'the image "{name}" does not exist',
                 path=path,
@@ -85,10 +96,3 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
     if not images:
         raise InputError("the list names no images", path=path)
     return tuple(images)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a line too long for a name
-        return False

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.decoding import decode_image
+from splinecli.capture.decoding import decode_image, decode_with_alpha
 from splinecli.errors import InputError
 
 StrPath = str | os.PathLike[str]
@@ -30,7 +30,8 @@ def read_image(path: StrPath) -> NDArray[np.float32]:
 
 def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     """Stored values of any shape as float32 on the scale of read_image, which see."""
-    values = stored.astype(np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+        values = stored.astype(np.float32)
     if stored.dtype.kind == "u":
         values /= np.float32(np.iinfo(stored.dtype).max)
         return values
@@ -52,13 +53,18 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
 def read_mask(path: StrPath) -> NDArray[np.bool_]:
     """A mask (H, W) bool: true where any channel is above half of the image's largest value.
 
-    So 0 and 1 serve as well as 0 and 255.
+    So 0 and 1 serve as well as 0 and 255. Where an alpha channel cuts something out (is above half of its
+    largest value at some pixels and not at others), it alone is the mask: colours then mean nothing.
 
     Raises:
         InputError: the image cannot be read, or no pixel is above zero.
     """
     path = Path(path)
-    stored = decode_image(path)
+    stored, alpha = decode_with_alpha(path)
+    if alpha is not None:
+        opaque: NDArray[np.bool_] = alpha > alpha.max() / 2
+        if opaque.any() and not opaque.all():
+            return opaque
     largest = to_linear(stored.max(keepdims=True), path).item()
     if largest <= 0:
         raise InputError(

@@ -15,6 +15,7 @@ from splinecli.capture.capture_files import (
     find_named,
 )
 from splinecli.capture.image_lists import list_folder, list_images
+from splinecli.capture.paths import is_folder
 from splinecli.errors import InputError
 
 StrPath = str | os.PathLike[str]
@@ -51,7 +52,8 @@ def find_capture_files(
 def find_captures(folder: StrPath) -> list[Path]:
     """The captures of a dataset's folder in natural order, or the folder alone where it is a capture itself.
 
-    A capture is a folder with a light file beside its images; whether it can be read shows when it is read.
+    A capture is a folder with a light file beside its images, or beside the folder Objects that holds them
+    (PSBox); whether it can be read shows when it is read.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no capture.
@@ -72,7 +74,7 @@ def find_captures(folder: StrPath) -> list[Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    return [entry for entry in list_folder(folder) if entry.is_dir()]
+    return [entry for entry in list_folder(folder) if is_folder(entry)]
 
 
 def _looks_like_capture(folder: Path) -> bool:
@@ -80,4 +82,7 @@ def _looks_like_capture(folder: Path) -> bool:
         return False
     if find_named(folder, [FILENAMES]) is not None:
         return True
+    objects = psbox.list_objects(folder)
+    if objects is not None:
+        return bool(objects)
     return bool(list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=()))

@@ -16,7 +16,7 @@ from splinecli.capture.capture_files import (
     capture_name,
     find_named,
 )
-from splinecli.capture.image_lists import list_images, read_image_list
+from splinecli.capture.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
 
 
@@ -31,10 +31,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
         images = read_image_list(filenames)
     else:
         images = list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
-    if not images:
-        raise InputError(
-            "the folder holds no images", path=folder, hint="PNG, TIFF and JPEG files count as images"
-        )
+    check_not_empty(images, folder)
     lights = overrides.lights or find_named(folder, LIGHT_DIRECTIONS)
     if lights is None:
         raise InputError(

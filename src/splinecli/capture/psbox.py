@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 from splinecli.capture.capture_files import (
@@ -13,21 +14,34 @@ from splinecli.capture.capture_files import (
     capture_name,
     find_named,
 )
-from splinecli.capture.image_lists import list_images
+from splinecli.capture.image_lists import check_not_empty, list_images
+from splinecli.capture.paths import is_folder
+
+_LIGHT_DIRECTIONS = ("light_directions.txt",)
+_OBJECTS = "Objects"
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """The capture's files, or None for another layout."""
-    lights = find_named(folder, ["light_directions.txt"])
-    objects = folder / "Objects"
-    if lights is None or not objects.is_dir():
+    """The capture's files, or None for another layout; InputError where Objects/ holds no images."""
+    lights = find_named(folder, _LIGHT_DIRECTIONS)
+    images = list_objects(folder, leave_out=overrides.named())
+    if lights is None or images is None:
         return None
+    check_not_empty(images, folder / _OBJECTS)
     return CaptureFiles(
         name=capture_name(folder),
         folder=folder,
-        images=list_images(objects, leave_out_stems=(), leave_out=overrides.named()),
+        images=images,
         light_directions=overrides.lights or lights,
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
         mask=overrides.mask or find_named(folder, MASK),
         ground_truth=overrides.ground_truth or find_named(folder, GROUND_TRUTH),
     )
+
+
+def list_objects(folder: Path, *, leave_out: Collection[Path] = ()) -> tuple[Path, ...] | None:
+    """The images of Objects/, without files that mean something else; None for another layout."""
+    objects = folder / _OBJECTS
+    if find_named(folder, _LIGHT_DIRECTIONS) is None or not is_folder(objects):
+        return None
+    return list_images(objects, leave_out_stems=(), leave_out=leave_out)

@@ -22,6 +22,9 @@ from splinecli.errors import InputError
 SATURATED_SHARE = 0.01
 """The share of saturated observations above which the capture carries a warning."""
 
+BLACK_SHARE = 0.01
+"""The share of pixels without light above which the capture carries a warning."""
+
 
 @dataclass(frozen=True, eq=False)
 class CaptureSource:
@@ -89,6 +92,7 @@ class CaptureSource:
             stored = None  # let go before the next is decoded: one full image at a time
             if progress is not None:
                 progress()
+        n_black = len(observations) - np.count_nonzero(observations.any(axis=1))
         return Capture(
             name=self.files.name,
             observations=observations,
@@ -96,7 +100,7 @@ class CaptureSource:
             light_indices=indices,
             mask=mask,
             ground_truth=ground_truth,
-            warnings=_warnings(n_saturated / observations.size, n_8_bit),
+            warnings=_warnings(n_saturated / observations.size, n_black / len(observations), n_8_bit),
         )
 
     def _read_mask(self, shape: tuple[int, ...], image: Path) -> NDArray[np.bool_]:
@@ -169,12 +173,17 @@ def _observe(
     return to_linear(pixels, path) @ weights.astype(np.float32), n_saturated
 
 
-def _warnings(saturated_share: float, n_8_bit: int) -> tuple[str, ...]:
+def _warnings(saturated_share: float, black_share: float, n_8_bit: int) -> tuple[str, ...]:
     warnings = []
     if saturated_share > SATURATED_SHARE:
         warnings.append(
             f"{100 * saturated_share:.1f} % of the observations are saturated;"
             " a shorter exposure gives better normals."
+        )
+    if black_share > BLACK_SHARE:
+        warnings.append(
+            f"{100 * black_share:.1f} % of the pixels are black under every light;"
+            " they get the normal (0, 0, 1)."
         )
     if n_8_bit:
         warnings.append("The images have 8 bits; 16-bit linear images give better normals.")

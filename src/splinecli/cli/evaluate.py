@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,12 +77,12 @@ def evaluate(
     from splinecli.evaluation.protocol import evaluate as score
     from splinecli.evaluation.records import Protocol
     from splinecli.evaluation.tables import markdown, results_csv, results_document
-    from splinecli.files import write_text
+    from splinecli.files import check_writable, write_text
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, make_estimator
 
     if draws is not None and n_lights:
         raise UsageError("--draws and --n-lights exclude each other", hint="The draws say how many lights")
-    counts = (
+    counts: list[int | None] = (
         [None] if draws is not None else [_light_count(text) for text in dict.fromkeys(n_lights or ["10"])]
     )
     protocols = [
@@ -93,6 +94,8 @@ def evaluate(
     for name in methods:
         check_method(name)
     captures = [capture for dataset in datasets for capture in find_captures(dataset)]
+    check_writable(output)
+    _check_counts(captures, counts)
     options = MethodOptions(weights, rotations, batch_size, device.value, precision.value)
     estimators = [make_estimator(name, options) for name in methods]
     talk = Talk(quiet=quiet)
@@ -141,21 +144,42 @@ def _follow(advance: Callable[[float], None], methods: list[str]) -> Callable[[P
     return follow
 
 
+def _check_counts(captures: list[Path], counts: list[int | None]) -> None:
+    """Raise UsageError for more lights than any capture has, before anything is scored."""
+    from splinecli.capture import open_capture
+
+    most = 0
+    for capture in captures:
+        with suppress(InputError):  # scoring passes it over and says why
+            most = max(most, open_capture(capture).n_lights)
+    for count in counts:
+        if most and count is not None and count > most:
+            raise UsageError(f"{count} lights wanted, the captures have at most {most}")
+
+
 def _print_table(evaluation: Evaluation, *, with_title: bool) -> None:
+    """Methods by captures; captures by methods where that is too wide for the terminal."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from splinecli.evaluation.tables import best_cells, heading, table_rows
 
     rows = table_rows(evaluation)
     best = best_cells(rows)
+    cells = [
+        [Text(cell, "bold" if (r, c) in best else "") for c, cell in enumerate(row)]
+        for r, row in enumerate(rows)
+    ]
+    console = Console(highlight=False)
+    if sum(max(len(row[column]) for row in rows) + 3 for column in range(len(rows[0]))) > console.width:
+        cells = [list(column) for column in zip(*cells, strict=True)]
     title = f"MAE in degrees, {heading(evaluation.protocol)}" if with_title else None
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
-    for column, name in enumerate(rows[0]):
+    for column, name in enumerate(cells[0]):
         table.add_column(name, justify="right" if column else "left", no_wrap=True)
-    for number, row in enumerate(rows[1:], start=1):
-        table.add_row(
-            *(f"[bold]{cell}[/]" if (number, column) in best else cell for column, cell in enumerate(row))
-        )
-    Console(highlight=False).print(table)
+    for row in cells[1:]:
+        table.add_row(*row)
+    # A table is for reading, also in a pipe: rather too wide than cut.
+    console.print(table, width=max(console.width, console.measure(table).maximum), crop=False)

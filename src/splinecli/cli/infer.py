@@ -95,21 +95,31 @@ def infer(
     by --lights). Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there is ground
     truth. A bad capture among several is named and passed over; the exit code is then 3.
     """
+    from splinecli.capture import capture_name
+    from splinecli.capture.record import check_light_indices
+    from splinecli.evaluation.draws import check_draw_settings
     from splinecli.methods import MethodOptions, check_method
+    from splinecli.outputs import check_free
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
     check_method(method)
+    indices = None if light_indices is None else parse_indices(light_indices, "--light-indices")
+    if n_lights is not None:
+        check_draw_settings(n_lights, 1, seed)
+    if indices is not None:
+        check_light_indices(indices, max(indices) + 1)
     _refuse_same_names(captures)
+    for folder in captures:
+        check_free(output / capture_name(folder), overwrite=overwrite)
     job = _Job(
         files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
         output=output,
         formats=split_commas(formats, "--format", ["png", "npy", "tiff"]),
         convention=convention.value,
-        overwrite=overwrite,
         n_lights=n_lights,
         seed=seed,
-        light_indices=None if light_indices is None else parse_indices(light_indices, "--light-indices"),
+        light_indices=indices,
         method=method,
         options=MethodOptions(weights, rotations, batch_size, device.value, precision.value),
         talk=Talk(quiet=quiet),
@@ -118,9 +128,10 @@ def infer(
     for folder in captures:
         try:
             report = job.run(folder)
-        except (InputError, UsageError) as error:
+        except BadCaptureError as bad:
+            error = bad.reason
             if len(captures) == 1:
-                raise
+                raise error from None
             exit_code = InputError.exit_code
             print(f"splinecli: {error}", file=sys.stderr)
             report = {"capture": capture_name(folder), "error": str(error)}
@@ -133,6 +144,14 @@ def infer(
     return exit_code
 
 
+class BadCaptureError(Exception):
+    """A capture that a batch passes over, with the reason."""
+
+    def __init__(self, reason: InputError | UsageError) -> None:
+        super().__init__(str(reason))
+        self.reason = reason
+
+
 @dataclass
 class _Job:
     """What the command line asked for, the same for every capture."""
@@ -141,7 +160,6 @@ class _Job:
     output: Path
     formats: list[str]
     convention: Any
-    overwrite: bool
     n_lights: int | None
     seed: int
     light_indices: list[int] | None
@@ -154,24 +172,29 @@ class _Job:
         """Made when the first capture has turned out to be one: loading a network takes a second."""
         from splinecli.methods import make_estimator
 
-        return make_estimator(self.method, self.options)
+        estimator = make_estimator(self.method, self.options)
+        if self.options.weights is not None and estimator.weights is None:
+            raise UsageError(f"method {self.method} uses no weights", hint="Leave --weights out")
+        return estimator
 
     def run(self, folder: Path) -> dict[str, Any]:
-        """Read, estimate and write one capture; returns its report."""
-        from splinecli.capture import open_capture
+        """Read, estimate and write one capture; returns its report. Raises BadCaptureError for its own faults."""
         from splinecli.inference import estimate_normals
-        from splinecli.outputs import check_free, report_of, write_estimate
+        from splinecli.outputs import report_of, write_estimate
 
         started = time.perf_counter()
-        source = open_capture(folder, **self.files)
-        target = self.output / source.files.name
-        check_free(target, overwrite=self.overwrite)
-        chosen = self._choose_lights(source)
-        count = source.n_lights if chosen is None else len(chosen)
-        with self.talk.progress(f"{source.files.name}: reading", count) as advance:
-            capture = source.read(chosen, progress=lambda: advance(1))
-        read_seconds = time.perf_counter() - started
+        try:
+            source, chosen = self._open(folder)
+        except (InputError, UsageError) as error:
+            raise BadCaptureError(error) from error
         estimator = self.estimator
+        count = source.n_lights if chosen is None else len(chosen)
+        try:
+            with self.talk.progress(f"{source.files.name}: reading", count) as advance:
+                capture = source.read(chosen, progress=lambda: advance(1))
+        except (InputError, UsageError) as error:
+            raise BadCaptureError(error) from error
+        read_seconds = time.perf_counter() - started
         with self.talk.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
             estimate = estimate_normals(capture, estimator, progress=advance)
         warnings = [*capture.warnings]
@@ -180,7 +203,14 @@ class _Job:
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
         report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
+        target = self.output / capture.name
         return write_estimate(estimate, report, target, formats=self.formats, convention=self.convention)
+
+    def _open(self, folder: Path) -> tuple[CaptureSource, Sequence[int] | None]:
+        from splinecli.capture import open_capture
+
+        source = open_capture(folder, **self.files)
+        return source, self._choose_lights(source)
 
     def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
         if self.n_lights is None:
@@ -190,12 +220,9 @@ class _Job:
         return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
 
 
-def capture_name(folder: Path) -> str:
-    """What a capture's results are called: its folder's name, also for `.` and `obj/..`."""
-    return folder.resolve().name
-
-
 def _refuse_same_names(captures: list[Path]) -> None:
+    from splinecli.capture import capture_name
+
     seen: dict[str, Path] = {}
     for folder in captures:
         other = seen.setdefault(capture_name(folder), folder)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
 import typer
 
 from splinecli.cli.app import app
-from splinecli.errors import SplinecliError
+from splinecli.errors import OutputError, SplinecliError
 
 INTERRUPTED = 130
 DEFECT = 1
@@ -20,6 +23,7 @@ _ClickUsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (the contract is in docs/conventions.md)."""
+    _mend_streams()
     command = typer.main.get_command(app)
     try:
         result = command.main(
@@ -39,6 +43,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     except (KeyboardInterrupt, typer.Abort):
         return fail("interrupted.", INTERRUPTED)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        return fail(f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code)
     except Exception:
         traceback.print_exc()
         return fail("this is a defect of splinecli; please report it with the lines above.", DEFECT)
@@ -53,6 +60,17 @@ def fail(message: str, exit_code: int) -> int:
     return exit_code
 
 
+def _mend_streams() -> None:
+    """Make streams usable that are closed (`>&-`) or cannot hold every character (an ASCII locale)."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - for the process
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def run() -> None:
-    """The console script."""
+    """The console script. SIGTERM, which job schedulers send, ends as cleanly as Ctrl-C."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())

@@ -51,7 +51,9 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing bu
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")
 ]
-SeedOption = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the random draws.")]
+SeedOption = Annotated[
+    int, typer.Option("--seed", metavar="S", min=0, max=2**32 - 1, help="Seed of the random draws.")
+]
 
 
 def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:

@@ -27,7 +27,7 @@ def train(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
     seed: Annotated[
-        int | None, typer.Option(metavar="S", min=0, help="Seed of the run. [default: 0]")
+        int | None, typer.Option(metavar="S", min=0, max=2**32 - 1, help="Seed of the run. [default: 0]")
     ] = None,
     device: DeviceOption = Device.auto,
     quiet: QuietOption = False,
@@ -59,11 +59,10 @@ def train(
             advance(progress - shown)
             shown = progress
             # On a terminal the bar moves instead; a log wants a line each time something was saved.
-            if metrics.validation_deg is not None and not sys.stderr.isatty():
+            if metrics.validation_deg is not None and (progress >= 1 or not sys.stderr.isatty()):
                 talk.say(_line(metrics))
 
-        last = trainer.run(report)
-    talk.say(_line(last))
+        trainer.run(report)
     if not quiet:
         print(output / WEIGHTS)
 

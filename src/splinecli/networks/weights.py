@@ -62,9 +62,11 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
     Raises ModelError where the file is missing, is no such file, or is damaged; `hint` says where a right one
     is had.
     """
-    if not path.is_file():
-        raise ModelError("no such file", path=path, hint=hint)
     try:
+        if path.is_dir():
+            raise ModelError("is a folder", path=path, hint=hint)
+        if not path.is_file():
+            raise ModelError("no such file", path=path, hint=hint)
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             found = metadata.get("format", "no format entry")
@@ -106,6 +108,9 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     tensors, metadata = read_tensors(path, FORMAT, hint)
     network = SplineNet(NetworkConfig.from_dict(read_json_entry(metadata, "config", path)))
     load_strictly(network, tensors, path)
+    for key, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            raise ModelError(f"tensor {key!r} holds values that are not finite", path=path)
     network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return LoadedNetwork(network, name or path.stem, hashlib.sha256(path.read_bytes()).hexdigest())
 
@@ -121,12 +126,19 @@ def manifest() -> dict[str, dict[str, str]]:
     return entries
 
 
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name too long for a file
+        return False
+
+
 def resolve_weights(name_or_file: str) -> LoadedNetwork:
     """Load shipped weights by name, or a file by path. Raises ModelError."""
     entry = manifest().get(name_or_file)
     if entry is None:
         path = Path(name_or_file)
-        if path.suffix != ".safetensors" and not path.exists():
+        if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
             names = ", ".join(shipped_names())
             raise ModelError(
                 f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file"

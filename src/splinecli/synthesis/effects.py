@@ -118,7 +118,7 @@ def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tenso
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Directions as calibrated (P, F, 3): Gaussian error, sigma U(0, 2) degrees, for a `share` of pixels."""
+    """Directions as calibrated (P, F, 3): Gaussian errors, sigma U(0, 2) degrees on either axis, for a `share`."""
     pixels = len(directions)
     sigma = _uniform(generator, pixels, 1, 1, high=math.radians(2.0)) * (
         _uniform(generator, pixels, 1, 1) < share

@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from splinecli.errors import ModelError
 from splinecli.files import write_bytes
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, tensors_sha256
@@ -82,8 +83,17 @@ def load_checkpoint(
         index, _, key = name.partition(".")
         states.setdefault(int(index), {})[key] = tensor
     optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
-    generator.set_state(tensors["generator"])
-    return Clock(**read_json_entry(metadata, "clock", path))
+    try:
+        generator.set_state(tensors["generator"])
+        return Clock(**read_json_entry(metadata, "clock", path))
+    except (KeyError, TypeError) as error:
+        raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
+    except RuntimeError as error:
+        raise ModelError(
+            "the checkpoint's random generator is of another kind of device",
+            path=path,
+            hint=f"Go on where the run began, this is {generator.device.type}",
+        ) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

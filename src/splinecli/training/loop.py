@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
-from splinecli.files import write_text
+from splinecli.files import check_writable, write_text
 from splinecli.networks.spline_net import SplineNet, to_pixel_frame
 from splinecli.networks.weights import save_weights
 from splinecli.observation_map import MAP_SIZE
@@ -65,6 +65,7 @@ class Trainer:
         self, config: TrainingConfig, folder: Path, device: torch.device, *, resume: bool = False
     ) -> None:
         """Start a run, or take one up. Raises ModelError, OutputError."""
+        check_writable(folder)
         self.config = config
         self.folder = folder
         self.device = device
@@ -115,8 +116,8 @@ class Trainer:
         started = saved - self.clock.seconds
         while True:
             finished = self.progress >= 1
-            if (count == REPORT_STEPS or finished) and count:
-                due = finished or time.monotonic() - saved > CHECKPOINT_SECONDS
+            due = finished or time.monotonic() - saved > CHECKPOINT_SECONDS
+            if (count == REPORT_STEPS or due) and count:
                 checked_deg = (
                     validation_deg(self.average, validation, bfloat16=self.bfloat16) if due else None
                 )
@@ -132,7 +133,9 @@ class Trainer:
                     return metrics
             elif finished:
                 raise ModelError(
-                    "the run is at its end already", path=self.folder, hint="Give it more --steps"
+                    "the run is at its end already",
+                    path=self.folder,
+                    hint="Give it more --steps or --minutes",
                 )
             sums += self.step()
             count += 1
