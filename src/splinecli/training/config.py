@@ -41,7 +41,7 @@ class TrainingConfig:
     beta2: float = 0.99
     weight_decay: float = 1e-3
     gradient_limit: float = 1.0
-    average_decay: float = 0.999
+    average_decay: float = 0.9995
     turn_jitter_deg: float = 15.0
     map_weight: float = 1.0
     masked_weight: float = 1.0
