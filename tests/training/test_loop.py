@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 from dataclasses import fields, replace
@@ -212,7 +213,10 @@ def test_metrics_of_a_run_without_checkpoint_are_not_mixed_in(tiny: TrainingConf
     assert [row["step"] for row in read_metrics(tmp_path)] == ["6"]
 
 
-def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A clock that moves by 0.05 s each time it is read: the machine's own speed is not what is tested.
+    readings = itertools.count()
+    monkeypatch.setattr("splinecli.training.loop.time.monotonic", lambda: next(readings) * 0.05)
     trainer = Trainer(replace(tiny, steps=1, minutes=0.01), tmp_path, CPU)
     trainer.clock.seconds = 0.3
     assert trainer.progress == pytest.approx(0.5)
