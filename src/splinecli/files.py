@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from splinecli.errors import OutputError
@@ -12,22 +14,30 @@ from splinecli.errors import OutputError
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file by renaming a finished temporary one beside it. Raises OutputError."""
     temporary: Path | None = None
+    with refusals_as_output_errors(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+            temporary = Path(name)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+            temporary.chmod(0o666 & ~current_umask())
+            temporary.replace(path)
+        finally:
+            # Also on Ctrl-C: nothing half-written stays behind.
+            if temporary is not None:
+                temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def refusals_as_output_errors(path: Path) -> Iterator[None]:
+    """Raise OutputError, naming the path, where the system refuses what is done inside."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        temporary = Path(name)
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        temporary.chmod(0o666 & ~current_umask())
-        temporary.replace(path)
+        yield
     except OSError as error:
         raise OutputError(
             f"cannot be written ({error.strerror or error})", path=path, hint="Choose another place with -o"
         ) from error
-    finally:
-        # Also on Ctrl-C: nothing half-written stays behind.
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
 
 
 def check_writable(folder: Path) -> None:

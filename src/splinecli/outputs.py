@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.files import check_writable, current_umask
+from splinecli.files import check_writable, current_umask, refusals_as_output_errors
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
@@ -78,28 +79,23 @@ def write_estimate(
     Raises OutputError.
     """
     started = time.perf_counter()
-    stage: Path | None = None
-    try:
+    with refusals_as_output_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        for form in formats:
-            write_normals(estimate, form, stage / NORMALS[form], convention)
-        if estimate.error_map_deg is not None:
-            from splinecli.evaluation.figures import error_map_picture
+        try:
+            for form in formats:
+                write_normals(estimate, form, stage / NORMALS[form], convention)
+            if estimate.error_map_deg is not None:
+                from splinecli.evaluation.figures import error_map_picture
 
-            (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
-        files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
-        seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
-        report = {**report, "seconds": seconds, "files": files}
-        (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
-        _publish(stage, folder)
-    except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror or error})", path=folder, hint="Choose another place with -o"
-        ) from error
-    finally:
-        # Also on Ctrl-C: nothing half-written stays behind.
-        if stage is not None:
+                (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
+            files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
+            seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
+            report = {**report, "seconds": seconds, "files": files}
+            (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+            _publish(stage, folder)
+        finally:
+            # Also on Ctrl-C: nothing half-written stays behind.
             shutil.rmtree(stage, ignore_errors=True)
     return report
 
@@ -133,8 +129,6 @@ def peak_memory_mib() -> int | None:
         import resource
     except ImportError:  # Windows
         return None
-    import sys
-
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
 

@@ -40,5 +40,4 @@ def _splinecli(
 
 app.command()(infer)
 app.command()(evaluate)
-
 app.command()(train)

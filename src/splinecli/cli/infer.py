@@ -32,7 +32,7 @@ from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource
+    from splinecli.capture import Capture, CaptureSource
     from splinecli.methods import Estimator, MethodOptions
 
 FEWEST_TRAINED_LIGHTS = 4
@@ -127,29 +127,21 @@ def infer(
     reports, exit_code = [], 0
     for folder in captures:
         try:
-            report = job.run(folder)
-        except BadCaptureError as bad:
-            error = bad.reason
+            capture, read_seconds = job.read(folder)
+        except (InputError, UsageError) as error:
             if len(captures) == 1:
-                raise error from None
+                raise
             exit_code = InputError.exit_code
             print(f"splinecli: {error}", file=sys.stderr)
             report = {"capture": capture_name(folder), "error": str(error)}
         else:
+            report = job.estimate(capture, read_seconds)
             if not (quiet or as_json):
                 print(_summary(report, output))
         reports.append(report)
     if as_json:
         print(json.dumps(reports[0] if len(captures) == 1 else reports, indent=2))
     return exit_code
-
-
-class BadCaptureError(Exception):
-    """A capture that a batch passes over, with the reason."""
-
-    def __init__(self, reason: InputError | UsageError) -> None:
-        super().__init__(str(reason))
-        self.reason = reason
 
 
 @dataclass
@@ -177,24 +169,24 @@ class _Job:
             raise UsageError(f"method {self.method} uses no weights", hint="Leave --weights out")
         return estimator
 
-    def run(self, folder: Path) -> dict[str, Any]:
-        """Read, estimate and write one capture; returns its report. Raises BadCaptureError for its own faults."""
+    def read(self, folder: Path) -> tuple[Capture, float]:
+        """The capture under the lights asked for, and the seconds that it took."""
+        from splinecli.capture import open_capture
+
+        started = time.perf_counter()
+        source = open_capture(folder, **self.files)
+        chosen = self._choose_lights(source)
+        count = source.n_lights if chosen is None else len(chosen)
+        with self.talk.progress(f"{source.files.name}: reading", count) as advance:
+            capture = source.read(chosen, progress=lambda: advance(1))
+        return capture, time.perf_counter() - started
+
+    def estimate(self, capture: Capture, read_seconds: float) -> dict[str, Any]:
+        """Estimate and write the normals; returns the report."""
         from splinecli.inference import estimate_normals
         from splinecli.outputs import report_of, write_estimate
 
-        started = time.perf_counter()
-        try:
-            source, chosen = self._open(folder)
-        except (InputError, UsageError) as error:
-            raise BadCaptureError(error) from error
         estimator = self.estimator
-        count = source.n_lights if chosen is None else len(chosen)
-        try:
-            with self.talk.progress(f"{source.files.name}: reading", count) as advance:
-                capture = source.read(chosen, progress=lambda: advance(1))
-        except (InputError, UsageError) as error:
-            raise BadCaptureError(error) from error
-        read_seconds = time.perf_counter() - started
         with self.talk.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
             estimate = estimate_normals(capture, estimator, progress=advance)
         warnings = [*capture.warnings]
@@ -205,12 +197,6 @@ class _Job:
         report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
         target = self.output / capture.name
         return write_estimate(estimate, report, target, formats=self.formats, convention=self.convention)
-
-    def _open(self, folder: Path) -> tuple[CaptureSource, Sequence[int] | None]:
-        from splinecli.capture import open_capture
-
-        source = open_capture(folder, **self.files)
-        return source, self._choose_lights(source)
 
     def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
         if self.n_lights is None:
