@@ -7,15 +7,17 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from splinecli.synthesis.principled import Material, draw_material, shade
+from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 
 Vectors = NDArray[np.float64]
 NAMES = ("base", "metallic", "specular", "roughness", "sheen", "clearcoat", "clearcoat_gloss")
 
 
-def material(**values: float) -> Material:
+def material(**values: float) -> PrincipledMaterial:
     plain = dict.fromkeys(NAMES, 0.0) | {"base": 0.5, "roughness": 0.5} | values
-    return Material(**{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()})
+    return PrincipledMaterial(
+        **{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()}
+    )
 
 
 def hemisphere(count: int, seed: int = 0) -> Vectors:
@@ -24,12 +26,12 @@ def hemisphere(count: int, seed: int = 0) -> Vectors:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def radiance(surface: Material, normal: Vectors, lights: Vectors) -> Vectors:
+def radiance(surface: PrincipledMaterial, normal: Vectors, lights: Vectors) -> Vectors:
     n_dot_l = torch.from_numpy(lights @ normal)[None]
-    return shade(surface, n_dot_l, torch.tensor([[normal[2]]]), torch.from_numpy(lights[:, 2])).numpy()[0]
+    return surface.shade(n_dot_l, torch.tensor([[normal[2]]]), torch.from_numpy(lights[:, 2])).numpy()[0]
 
 
-def burley(surface: Material, n: Vectors, lights: Vectors) -> Vectors:
+def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
     """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012 remapping."""
     base, metallic, specular, roughness, sheen, clearcoat, gloss = (
         float(getattr(surface, name)) for name in NAMES
@@ -81,7 +83,7 @@ def burley(surface: Material, n: Vectors, lights: Vectors) -> Vectors:
         material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
     ],
 )
-def test_agrees_with_the_published_equations(surface: Material) -> None:
+def test_agrees_with_the_published_equations(surface: PrincipledMaterial) -> None:
     lights = hemisphere(300)
     for normal in hemisphere(4, seed=1):
         expected = burley(surface, normal, lights)
@@ -115,7 +117,7 @@ def test_mirror_images_in_the_plane_of_normal_and_view_look_the_same() -> None:
 
 
 def hemispherical_reflectance(
-    surface: Material, normal: Vectors, *, rings: int = 400, sectors: int = 800
+    surface: PrincipledMaterial, normal: Vectors, *, rings: int = 400, sectors: int = 800
 ) -> float:
     """The integral of f cos over all lights above the surface, by the midpoint rule in azimuth and sin^2."""
     sine_squared = (np.arange(rings) + 0.5) / rings
@@ -125,7 +127,7 @@ def hemispherical_reflectance(
     # Cells of equal projected area about the normal, turned into the camera's frame (about the y axis).
     x, y = s * np.cos(a), s * np.sin(a)
     lights = np.stack((normal[2] * x + normal[0] * c, y, normal[2] * c - normal[0] * x), axis=1)
-    # Lights under the camera's horizon are none of ours (z < 0); shade is defined for the upper half alone.
+    # Lights under the camera's horizon are none of ours (z < 0); shade() is defined for the upper half alone.
     lights = lights[lights[:, 2] > 0]
     # d(projected area) = cos dw, and radiance = pi f cos, so the integral is the mean of radiance / cos.
     return float((radiance(surface, normal, lights) / (lights @ normal)).sum() / len(s))
@@ -143,7 +145,9 @@ def hemispherical_reflectance(
         (material(base=0.0, roughness=0.3, specular=1.0), 0.3),
     ],
 )
-def test_no_more_light_comes_out_than_goes_in(surface: Material, limit: float, tilt_deg: float) -> None:
+def test_no_more_light_comes_out_than_goes_in(
+    surface: PrincipledMaterial, limit: float, tilt_deg: float
+) -> None:
     normal = np.array([np.sin(np.radians(tilt_deg)), 0.0, np.cos(np.radians(tilt_deg))])
     reflectance = hemispherical_reflectance(surface, normal)
     assert 0 < reflectance <= limit
@@ -158,12 +162,12 @@ def test_a_smooth_metal_mirrors_nearly_everything() -> None:
 def test_float32_is_close_to_float64() -> None:
     generator = torch.Generator().manual_seed(0)
     surface = draw_material(200, generator)
-    double = Material(*(getattr(surface, name).double() for name in NAMES))
+    double = PrincipledMaterial(*(getattr(surface, name).double() for name in NAMES))
     lights = torch.from_numpy(hemisphere(100))
     normals = torch.from_numpy(hemisphere(200, seed=2)) + torch.tensor((0.0, 0.0, 0.2))
     normals = torch.nn.functional.normalize(normals, dim=1)
-    exact = shade(double, normals @ lights.T, normals[:, 2:], lights[:, 2])
-    coarse = shade(surface, (normals @ lights.T).float(), normals[:, 2:].float(), lights[:, 2].float())
+    exact = double.shade(normals @ lights.T, normals[:, 2:], lights[:, 2])
+    coarse = surface.shade((normals @ lights.T).float(), normals[:, 2:].float(), lights[:, 2].float())
     assert torch.isfinite(coarse).all()
     # Half a per cent in a peak of the narrowest lobes, whose height float32 resolves no better.
     assert ((coarse - exact).abs() / (exact + 0.01)).max() < 5e-3

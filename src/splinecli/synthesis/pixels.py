@@ -26,7 +26,8 @@ from splinecli.synthesis.effects import (
     quantise,
 )
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
-from splinecli.synthesis.principled import Material, draw_material, shade
+from splinecli.synthesis.material import Material
+from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 
 
 @dataclass(frozen=True)
@@ -68,11 +69,8 @@ class PixelScene:
             visible = visible * wall.visibility(directions)
             returned = returned + wall.reflected(directions)
         normal_z = self.normals[:, 2:]
-        direct = shade(self.material, dot(self.normals, directions), normal_z, directions[..., 2])
-        material = self.material
-        # Light from a wide angle meets the diffuse albedo and, averaged over its lobe, the mirror.
-        albedo = material.base + 0.08 * material.specular * (1 - material.metallic)
-        total = direct * visible + albedo * returned
+        direct = self.material.shade(dot(self.normals, directions), normal_z, directions[..., 2])
+        total = direct * visible + self.material.albedo() * returned
         if self.mixed is not None and self.mixed_weight is not None:
             count = len(self.mixed_weight)
             of_mixed = directions if directions.ndim == 2 else directions[:count]
@@ -151,7 +149,7 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
     other = draw_material(count, generator)
     own = material.take(slice(count))
-    second = Material(
+    second = PrincipledMaterial(
         *(torch.where(edge, a, b) for a, b in zip(vars(own).values(), vars(other).values(), strict=True))
     )
     second_normals = torch.where(edge, draw_neighbour_normals(normals[:count], generator), normals[:count])

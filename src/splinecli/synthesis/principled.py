@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Material:
+class PrincipledMaterial:
     """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (specular to 4, as in CyclesPS)."""
 
     base: Tensor
@@ -28,12 +28,49 @@ class Material:
     clearcoat: Tensor
     clearcoat_gloss: Tensor
 
-    def take(self, pixels: slice | Tensor) -> Material:
+    def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
         """The materials of some of the pixels."""
-        return Material(*(getattr(self, field.name)[pixels] for field in fields(self)))
+        return PrincipledMaterial(*(getattr(self, field.name)[pixels] for field in fields(self)))
+
+    def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
+        """pi times the reflected radiance (P, D); arguments as in Material.shade."""
+        lit = n_dot_l.clamp(min=0)
+        l_dot_h = ((1 + l_dot_v) / 2).sqrt()
+        n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
+        n_dot_h_squared = n_dot_h * n_dot_h
+        fresnel = schlick_weight(l_dot_h)
+
+        grazing_90 = 2 * self.roughness * l_dot_h * l_dot_h - 0.5
+        diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
+        diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
+
+        alpha_squared = (self.roughness**4).clamp(min=1e-4)
+        f0 = (0.08 * self.specular * (1 - self.metallic) + self.base * self.metallic).clamp(max=1)
+        spread = n_dot_h_squared * (alpha_squared - 1) + 1
+        specular = (
+            alpha_squared
+            * smith_ggx(n_dot_v, alpha_squared)
+            * smith_ggx(lit, alpha_squared)
+            / (spread * spread)
+        )
+        radiance = diffuse + specular * (f0 + (1 - f0) * fresnel)
+
+        if bool((self.clearcoat > 0).any()):
+            coat_alpha_squared = (0.1 + (0.001 - 0.1) * self.clearcoat_gloss) ** 2
+            coat = (coat_alpha_squared - 1) / (
+                coat_alpha_squared.log() * (1 + (coat_alpha_squared - 1) * n_dot_h_squared)
+            )
+            quarter = torch.full_like(n_dot_v, 0.25**2)
+            coat = coat * smith_ggx(n_dot_v, quarter) * smith_ggx(lit, quarter) * (0.04 + 0.96 * fresnel)
+            radiance = radiance + 0.25 * self.clearcoat * coat
+        return radiance * lit
+
+    def albedo(self) -> Tensor:
+        """The diffuse albedo and, averaged over its lobe, the mirror (P, 1)."""
+        return self.base + 0.08 * self.specular * (1 - self.metallic)
 
 
-def draw_material(pixels: int, generator: torch.Generator) -> Material:
+def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial:
     """Random materials. Classes: 35 % matte, 30 % specular, 25 % metallic, 10 % half metallic.
 
     base U(0.05, 1); roughness U(0.05, 1), of metals U(0.2, 0.9); specular U(0, 1), of the specular class U(0,
@@ -50,7 +87,7 @@ def draw_material(pixels: int, generator: torch.Generator) -> Material:
     blend = kind >= 0.9
     shiny = (kind >= 0.35) & ~metal & ~blend
     zero, one = torch.zeros_like(kind), torch.ones_like(kind)
-    return Material(
+    return PrincipledMaterial(
         base=uniform(0.05, 1.0),
         metallic=torch.where(metal, one, torch.where(blend, uniform(), zero)),
         specular=torch.where(shiny & (split < 0.5), uniform(1.0, 4.0), uniform()),
@@ -71,40 +108,3 @@ def schlick_weight(cosine: Tensor) -> Tensor:
 def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
     """Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 - a^2)(n.x)^2))."""
     return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())
-
-
-def shade(material: Material, n_dot_l: Tensor, n_dot_v: Tensor, light_z: Tensor) -> Tensor:
-    """pi times the reflected radiance, BRDF times max(n.l, 0), under unit light (P, D).
-
-    Args:
-        n_dot_l: (P, D) cosines of normal and light, may be negative (attached shadow: zero radiance).
-        n_dot_v: (P, 1) cosines of normal and viewing direction (0, 0, 1), positive.
-        light_z: (D) or (P, D), the lights' z.
-    """
-    lit = n_dot_l.clamp(min=0)
-    l_dot_h = ((1 + light_z) / 2).sqrt()
-    n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
-    n_dot_h_squared = n_dot_h * n_dot_h
-    fresnel = schlick_weight(l_dot_h)
-
-    grazing_90 = 2 * material.roughness * l_dot_h * l_dot_h - 0.5
-    diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
-    diffuse = (1 - material.metallic) * (material.base * diffuse + math.pi * material.sheen * fresnel)
-
-    alpha_squared = (material.roughness**4).clamp(min=1e-4)
-    f0 = (0.08 * material.specular * (1 - material.metallic) + material.base * material.metallic).clamp(max=1)
-    spread = n_dot_h_squared * (alpha_squared - 1) + 1
-    specular = (
-        alpha_squared * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared) / (spread * spread)
-    )
-    radiance = diffuse + specular * (f0 + (1 - f0) * fresnel)
-
-    if bool((material.clearcoat > 0).any()):
-        coat_alpha_squared = (0.1 + (0.001 - 0.1) * material.clearcoat_gloss) ** 2
-        coat = (coat_alpha_squared - 1) / (
-            coat_alpha_squared.log() * (1 + (coat_alpha_squared - 1) * n_dot_h_squared)
-        )
-        quarter = torch.full_like(n_dot_v, 0.25**2)
-        coat = coat * smith_ggx(n_dot_v, quarter) * smith_ggx(lit, quarter) * (0.04 + 0.96 * fresnel)
-        radiance = radiance + 0.25 * material.clearcoat * coat
-    return radiance * lit
