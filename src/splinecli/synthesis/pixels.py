@@ -13,41 +13,36 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splinecli.errors import ModelError
 from splinecli.observation_map import MAP_SIZE, cell_directions, rotate_about_view_axis
+from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
 from splinecli.synthesis.effects import (
     Wall,
-    add_sensor_noise,
-    disturb_light_directions,
-    disturb_light_strengths,
     dot,
     draw_ambient,
-    draw_exposure,
     draw_wall,
-    quantise,
 )
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
 from splinecli.synthesis.material import Material
-from splinecli.synthesis.principled import PrincipledMaterial, draw_material
+from splinecli.synthesis.measured import MeasuredLibrary
+from splinecli.synthesis.measured_files import read_measured
+from splinecli.synthesis.mixed_material import MixedMaterial, choose
+from splinecli.synthesis.principled import draw_material
 
 
 @dataclass(frozen=True)
-class PixelGeneratorConfig:
-    """Switches and shares of the pixel generator (a share of 0 switches an effect off)."""
+class PixelGeneratorConfig(CaptureConfig):
+    """Switches and shares of the pixel generator (a share of 0 switches an effect off), beside its captures'."""
 
-    min_lights: int = 4
-    max_lights: int = 96
-    usual_lights: int = 10
     cast_shadows: bool = True
     interreflections: bool = True
     wall_share: float = 0.45
     second_wall_share: float = 0.2
     ambient_share: float = 0.5
     mixed_share: float = 0.2
-    light_direction_error_share: float = 0.5
-    light_strength_error_share: float = 0.5
-    saturated_share: float = 0.08
-    sensor_noise: bool = True
-    eight_bit_share: float = 0.15
+    # Share of the materials that come from a file of measured ones (docs/conventions.md), and its path.
+    measured_share: float = 0.0
+    measured_materials: str = ""
 
 
 @dataclass(frozen=True)
@@ -101,19 +96,11 @@ class PixelScene:
         dense[:, 0, inside] = self.radiance(directions[inside])
         return dense
 
-
-@dataclass(frozen=True)
-class PixelBatch:
-    """What a capture holds of P pixels: observations, valid (bool) (P, F) and light_directions (P, F, 3).
-
-    `scene` is the truth behind them and `exposure` (P, 1) the factor from its radiance to the observations.
-    """
-
-    observations: Tensor
-    light_directions: Tensor
-    valid: Tensor
-    scene: PixelScene
-    exposure: Tensor
+    def dense_truth(self, size: int) -> DenseMap:
+        """The complete map, known in the whole disc."""
+        _, inside = cell_directions(size)
+        known = inside.to(self.normals).expand(len(self.normals), 1, size, size)
+        return DenseMap(self.dense_map(size), known, known)
 
 
 def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
@@ -130,10 +117,47 @@ def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tenso
     return torch.nn.functional.normalize(moved, dim=1)
 
 
-def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
-    """Random pixels. Of the mixed ones half lie on an edge (a second normal), half blend two materials."""
-    normals = draw_visible_normals(pixels, generator)
+def read_library(config: PixelGeneratorConfig, device: torch.device) -> MeasuredLibrary | None:
+    """The measured materials that a configuration asks for; none where their share is 0.
+
+    Raises ModelError where it names no file, InputError where the file cannot be used.
+    """
+    if not config.measured_share:
+        return None
+    if not config.measured_materials:
+        raise ModelError(
+            f"training setting 'measured_share' is {config.measured_share}, but 'measured_materials' names no file",
+            hint="Name a file of measured materials there, or set the share to 0",
+        )
+    return read_measured(config.measured_materials, device)
+
+
+def draw_reflectance(
+    pixels: int, share: float, library: MeasuredLibrary | None, generator: torch.Generator
+) -> Material:
+    """Random materials, each with probability `share` from the library, else from the principled model."""
     material = draw_material(pixels, generator)
+    if library is None or not share:
+        return material
+    measured = library.draw(pixels, generator)
+    kind = (torch.rand(pixels, generator=generator, device=generator.device) < share).long()
+    return MixedMaterial((material, measured), kind, torch.arange(pixels, device=kind.device))
+
+
+def draw_scene(
+    pixels: int,
+    config: PixelGeneratorConfig,
+    generator: torch.Generator,
+    library: MeasuredLibrary | None = None,
+) -> PixelScene:
+    """Random pixels. Of the mixed ones half lie on an edge (a second normal), half blend two materials.
+
+    `library` saves reading the file of measured materials anew. Where their share is 0, no random number is
+    drawn for them. Raises ModelError, InputError as read_library.
+    """
+    library = library or read_library(config, generator.device)
+    normals = draw_visible_normals(pixels, generator)
+    material = draw_reflectance(pixels, config.measured_share, library, generator)
     walls = tuple(
         draw_wall(
             normals, share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
@@ -147,11 +171,8 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
         return PixelScene(normals, material, walls, ambient)
     # Every second mixed pixel is an edge, with one material on two normals; the others are two materials.
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
-    other = draw_material(count, generator)
-    own = material.take(slice(count))
-    second = PrincipledMaterial(
-        *(torch.where(edge, a, b) for a, b in zip(vars(own).values(), vars(other).values(), strict=True))
-    )
+    other = draw_reflectance(count, config.measured_share, library, generator)
+    second = choose(edge, material.take(slice(count)), other)
     second_normals = torch.where(edge, draw_neighbour_normals(normals[:count], generator), normals[:count])
     mixed = PixelScene(second_normals, second, (), ambient[:count])
     weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(edge, 0.4, 0.7)
@@ -162,24 +183,18 @@ class PixelGenerator:
     """Draws batches of pixels; reproducible from the seed of `generator`, on whose device all is made."""
 
     def __init__(self, config: PixelGeneratorConfig, generator: torch.Generator) -> None:
+        """Read the measured materials, if any. Raises ModelError, InputError."""
         self.config = config
         self.generator = generator
+        self.library = read_library(config, generator.device)
 
     def draw(self, pixels: int) -> PixelBatch:
         """A batch of P pixels, each with lights of its own number and spread; F is the largest number."""
         config, generator = self.config, self.generator
-        scene = draw_scene(pixels, config, generator)
+        scene = draw_scene(pixels, config, generator, self.library)
         counts = draw_light_counts(
             pixels, config.min_lights, config.max_lights, config.usual_lights, generator
         )
         true_directions = draw_light_directions(pixels, int(counts.max()), generator)
         valid = torch.arange(true_directions.shape[1], device=counts.device) < counts[:, None]
-        radiance = scene.radiance(true_directions) * valid
-        exposure = draw_exposure(radiance, config.saturated_share, generator)
-        observed = disturb_light_strengths(radiance * exposure, config.light_strength_error_share, generator)
-        observed = observed.clamp(max=1)
-        if config.sensor_noise:
-            observed = add_sensor_noise(observed, generator)
-            observed = quantise(observed, config.eight_bit_share, generator)
-        calibrated = disturb_light_directions(true_directions, config.light_direction_error_share, generator)
-        return PixelBatch(observed * valid, calibrated, valid, scene, exposure)
+        return photograph(scene, scene.radiance(true_directions), true_directions, valid, config, generator)
