@@ -23,10 +23,10 @@ class Talk:
         self.say(f"splinecli: warning: {message}")
 
     @contextmanager
-    def progress(self, label: str, total: float) -> Iterator[Callable[[float], None]]:
-        """A progress bar; the function it yields advances it."""
+    def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Callable[..., None]]:
+        """A progress bar with the time left; `advance(amount, note="")`, which it yields, moves it."""
         if self.quiet or not sys.stderr.isatty():
-            yield lambda _: None
+            yield lambda amount, note="": None
             return
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -35,7 +35,16 @@ class Talk:
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             TextColumn("{task.percentage:3.0f}%"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
         )
-        with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task(label, total=total)
-            yield lambda amount: bar.advance(task, amount)
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(label, total=total, note="")
+            bar.update(task, completed=start)
+
+            def advance(amount: float, note: str = "") -> None:
+                bar.update(task, advance=amount)
+                if note:
+                    bar.update(task, note=note)
+
+            yield advance

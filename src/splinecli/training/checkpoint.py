@@ -1,4 +1,7 @@
-"""Checkpoints: one safetensors file that rebuilds a run exactly where it stood."""
+"""Checkpoints: one safetensors file that rebuilds a run exactly where it stood.
+
+There is no state of a random generator in it: what a step draws follows from the seed and the step's number.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, tensors_sha256
 from splinecli.training.config import TrainingConfig
 
-FORMAT = "splinecli-checkpoint-1"
+FORMAT = "splinecli-checkpoint-2"
 
 
 @dataclass
@@ -34,11 +37,10 @@ def save_checkpoint(
     network: SplineNet,
     average: SplineNet,
     optimizer: torch.optim.Optimizer,
-    generator: torch.Generator,
     clock: Clock,
 ) -> None:
     """Write the whole state of a run. Raises OutputError."""
-    tensors: dict[str, Tensor] = {"generator": generator.get_state()}
+    tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", network), ("average", average)):
         tensors |= {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
@@ -67,7 +69,6 @@ def load_checkpoint(
     network: SplineNet,
     average: SplineNet,
     optimizer: torch.optim.Optimizer,
-    generator: torch.Generator,
 ) -> Clock:
     """Put a run's state back. Raises ModelError where the file does not fit the run."""
     tensors, metadata = _read(path)
@@ -84,16 +85,9 @@ def load_checkpoint(
         states.setdefault(int(index), {})[key] = tensor
     optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
     try:
-        generator.set_state(tensors["generator"])
         return Clock(**read_json_entry(metadata, "clock", path))
-    except (KeyError, TypeError) as error:
+    except TypeError as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
-    except RuntimeError as error:
-        raise ModelError(
-            "the checkpoint's random generator is of another kind of device",
-            path=path,
-            hint=f"Go on where the run began, this is {generator.device.type}",
-        ) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -9,29 +9,48 @@ from typing import Any, Literal
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
+from splinecli.training.losses import Norm
+
+GENERATOR = "generator"
+"""The name among the sources of the online pixel generator; every other is the path of a pixel set."""
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """A training run on the online pixel generator.
+    """Everything that decides a training run.
 
     Attributes:
+        sources: where pixels come from, with weights: the share of each in the batches.
+        held_share: share of the scenes of a pixel set that are held back for validation.
         batch_size: pixels a step.
+        shards: parts of a batch, drawn each from a random stream of its own; so many processes can share the
+            drawing, and any number that divides `shards` sees the same batches.
+        updates: "joint", both networks at each step, or "alternating", the paper's way: `ne_net_updates` steps
+            for NE-Net, then one for LI-Net, while the other is fixed.
         learning_rate: the schedule's top; it rises over `warmup_steps` and then falls, by a cosine to a
             hundredth, or ("stepped", the authors' way) to a tenth over the last tenth.
         steps, minutes: the run's length; minutes wins where it is above 0.
-        beta1, beta2, weight_decay: of AdamW.
+        beta1, beta2, weight_decay: of AdamW, which is Adam where weight_decay is 0.
         gradient_limit: largest norm of the gradient.
         average_decay: decay of the running average of the weights, which is what gets saved.
         turn_jitter_deg: canonical networks see each pixel turned further by up to this, either way, and half
             of the batches mirrored, so that estimates from several views can be averaged.
-        map_weight, masked_weight, angle_weight: of |D - D_gt|, |M_s o (D - D_gt)| and arccos(n . n_gt).
+        angle_weight, map_weight, masked_weight: of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
+        symmetric_weight, asymmetric_weight: lambda_s and lambda_a, of Ls and La.
+        eta, lambda_c: of La.
+        li_net_norm, ne_net_norm: whether a map's cells are averaged or summed, in all of LI-Net's terms and
+            in NE-Net's Ls and La; eta is in summed cells in either case.
         precision: "bfloat16" runs the convolutions so where the device has it, "float32" never.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     pixels: PixelGeneratorConfig = field(default_factory=PixelGeneratorConfig)
+    sources: dict[str, float] = field(default_factory=lambda: {GENERATOR: 1.0})
+    held_share: float = 0.1
     batch_size: int = 256
+    shards: int = 4
+    updates: Literal["joint", "alternating"] = "joint"
+    ne_net_updates: int = 5
     learning_rate: float = 1.5e-3
     schedule: Literal["cosine", "stepped"] = "cosine"
     warmup_steps: int = 300
@@ -43,11 +62,31 @@ class TrainingConfig:
     gradient_limit: float = 1.0
     average_decay: float = 0.9995
     turn_jitter_deg: float = 15.0
+    angle_weight: float = 1.0
     map_weight: float = 1.0
     masked_weight: float = 1.0
-    angle_weight: float = 1.0
+    symmetric_weight: float = 0.0
+    asymmetric_weight: float = 0.0
+    eta: float = 1.0
+    lambda_c: float = 50.0
+    li_net_norm: Norm = "mean"
+    ne_net_norm: Norm = "sum"
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raise ModelError for settings that do not fit together."""
+        if self.batch_size % self.shards:
+            raise ModelError(
+                f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards = {self.shards}"
+            )
+        if self.pixels.min_lights > self.pixels.max_lights:
+            raise ModelError(
+                f"training setting 'min_lights' is {self.pixels.min_lights};"
+                f" expected at most max_lights = {self.pixels.max_lights}"
+            )
+        if not sum(self.sources.values()) > 0:
+            raise ModelError("training setting 'sources' gives no source a weight above 0")
 
     def to_dict(self) -> dict[str, Any]:
         """Nested plain values, as stored in checkpoints and config.json."""
@@ -58,54 +97,84 @@ class TrainingConfig:
         """Rebuild a configuration. Raises ModelError for an unknown key or a value that cannot be."""
         values = dict(values)
         network, pixels = values.pop("network", {}), values.pop("pixels", {})
-        for name, table in (("network", network), ("pixels", pixels)):
+        sources = values.pop("sources", {GENERATOR: 1.0})
+        for name, table in (("network", network), ("pixels", pixels), ("sources", sources)):
             if not isinstance(table, dict):
                 raise ModelError(f"training setting {name!r} is {table!r}; expected a table of settings")
         _check_settings(values, cls())
         _check_settings(pixels, PixelGeneratorConfig())
-        return cls(network=NetworkConfig.from_dict(network), pixels=PixelGeneratorConfig(**pixels), **values)
+        for name, weight in sources.items():
+            if not _is_number(weight) or not 0 <= weight < math.inf:
+                raise ModelError(f"the weight of source {name!r} is {weight!r}; expected a number from 0")
+        return cls(
+            network=NetworkConfig.from_dict(network),
+            pixels=PixelGeneratorConfig(**pixels),
+            sources=sources,
+            **values,
+        )
 
 
-_CHOICES = {"schedule": ("cosine", "stepped"), "precision": ("bfloat16", "float32")}
-_AT_LEAST_ONE = ("batch_size", "steps", "min_lights", "max_lights", "usual_lights")
+_CHOICES = {
+    "updates": ("joint", "alternating"),
+    "schedule": ("cosine", "stepped"),
+    "precision": ("bfloat16", "float32"),
+    "li_net_norm": ("mean", "sum"),
+    "ne_net_norm": ("mean", "sum"),
+}
+_LOWEST = {
+    "batch_size": 1, "shards": 1, "steps": 1, "ne_net_updates": 1,
+    "min_lights": 3, "max_lights": 3, "usual_lights": 3,
+}  # fmt: skip
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGeneratorConfig) -> None:
     """Raise ModelError for a setting that `defaults` does not have, or of another kind than there."""
     known = vars(defaults)
     for name, value in values.items():
-        if name not in known or name in ("network", "pixels"):
+        if name not in known or name in ("network", "pixels", "sources"):
             raise ModelError(f"unknown training setting {name!r}; known are {', '.join(sorted(known))}")
         default = known[name]
         if name in _CHOICES:
             expected, fits = " or ".join(map(repr, _CHOICES[name])), value in _CHOICES[name]
         elif isinstance(default, bool):
             expected, fits = "true or false", isinstance(value, bool)
+        elif isinstance(default, str):
+            expected, fits = "a text", isinstance(value, str)
         elif isinstance(default, int):
-            lowest = int(name in _AT_LEAST_ONE)
+            lowest = _LOWEST.get(name, 0)
             expected = f"a whole number from {lowest}"
             fits = isinstance(value, int) and not isinstance(value, bool) and value >= lowest
         else:
             highest = 1.0 if name.endswith("_share") else math.inf
             expected = "a number from 0 to 1" if highest == 1 else "a number from 0"
-            fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= highest
+            fits = _is_number(value) and 0 <= value <= highest
         if not fits:
             raise ModelError(f"training setting {name!r} is {value!r}; expected {expected}")
 
 
+# The paper's text (section 4) where it speaks, the authors' code where it does not: docs/training.md.
 PRESETS = {
     "compact": TrainingConfig(),
     "paper": TrainingConfig(
         network=NetworkConfig(size="paper"),
+        pixels=PixelGeneratorConfig(min_lights=10, max_lights=10, usual_lights=10),
         batch_size=128,
+        updates="alternating",
         learning_rate=1e-4,
         schedule="stepped",
         warmup_steps=0,
         steps=200_000,
-        beta1=0.5,
+        beta1=0.9,
         beta2=0.999,
         weight_decay=0.0,
         turn_jitter_deg=0.0,
+        symmetric_weight=2e-2,
+        asymmetric_weight=2e-5,
+        li_net_norm="sum",
     ),
 }
 

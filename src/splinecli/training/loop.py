@@ -1,53 +1,40 @@
-"""The training loop: LI-Net and NE-Net together, on pixels that the generator makes as they are needed.
-
-The alternating updates and the special losses of the paper join here.
-"""
+"""The training loop: batches in, updates of LI-Net and NE-Net together or in alternation, files out."""
 
 from __future__ import annotations
 
 import copy
-import csv
 import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
 from splinecli.files import check_writable, write_text
-from splinecli.networks.spline_net import SplineNet, to_pixel_frame
+from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import save_weights
-from splinecli.observation_map import MAP_SIZE
-from splinecli.synthesis.pixels import PixelBatch, PixelGenerator
+from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.training.checkpoint import Clock, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
-from splinecli.training.losses import angular_loss, map_loss, masked_map_loss
+from splinecli.training.distributed import Workers
+from splinecli.training.objective import Losses, compute_losses, part_of_step
+from splinecli.training.records import Metrics, Records, none_for_nan
+from splinecli.training.sources import open_sources
+from splinecli.training.validation import sample_maps, validation_deg
 
 CHECKPOINT = "checkpoint.safetensors"
 WEIGHTS = "weights.safetensors"
-METRICS = "metrics.csv"
 VALIDATION_PIXELS = 2048
-CHECKPOINT_SECONDS = 120.0
+CHECKPOINT_SECONDS = 45.0
 REPORT_STEPS = 50
 
-
-@dataclass(frozen=True)
-class Metrics:
-    """One line of metrics.csv: means over the steps since the last line; angles in degrees."""
-
-    step: int
-    pixels: int
-    minutes: float
-    learning_rate: float
-    loss: float
-    angle_deg: float
-    map_error: float
-    validation_deg: float | None = None
+# Random streams of a step, beside those of its shards, which are numbered from 0.
+_BATCH_STREAM, _DROPOUT_STREAM, _VALIDATION_STREAM = 2**31, 2**31 + 1, 2**31 + 2
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
@@ -58,17 +45,47 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
     return config.learning_rate * rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
 
 
+def stream_seed(seed: int, step: int, stream: int) -> int:
+    """The seed of one of a step's random streams.
+
+    What a step draws follows from these three numbers alone: not from what was drawn before, nor by whom. A
+    run that is taken up, or cut among processes in another way, sees the same batches.
+    """
+    return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
+
+
 class Trainer:
-    """A run in a folder: `checkpoint.safetensors`, `weights.safetensors`, `config.json` and `metrics.csv`."""
+    """A run in a folder: checkpoint, weights, config.json and the records.
+
+    Of several processes the leader alone writes.
+    """
 
     def __init__(
-        self, config: TrainingConfig, folder: Path, device: torch.device, *, resume: bool = False
+        self,
+        config: TrainingConfig,
+        folder: Path,
+        device: torch.device,
+        *,
+        resume: bool = False,
+        workers: Workers | None = None,
+        tensorboard: bool = False,
     ) -> None:
-        """Start a run, or take one up. Raises ModelError, OutputError."""
+        """Start a run, or take one up. Raises ModelError, OutputError, InputError, UsageError."""
         check_writable(folder)
         self.config = config
         self.folder = folder
         self.device = device
+        self.workers = workers or Workers()
+        self.shards = self.workers.shards(config.shards)
+        self.generator = torch.Generator(device)
+        validation_generator = torch.Generator(device)
+        validation_generator.manual_seed(stream_seed(config.seed, 0, _VALIDATION_STREAM))
+        if not resume and (folder / CHECKPOINT).exists():
+            raise OutputError(
+                "holds a run already", path=folder, hint="Go on with --resume, or choose another -o"
+            )
+        sources = open_sources(config, self.generator, validation_generator)
+        self.source = sources.training
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -79,24 +96,15 @@ class Trainer:
             betas=(config.beta1, config.beta2),
             weight_decay=config.weight_decay,
         )
-        self.generator = torch.Generator(device).manual_seed(config.seed)
         # Where it is emulated, bfloat16 is slower than float32 and gains nothing.
         self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
         self.clock = Clock()
         if resume:
-            self.clock = load_checkpoint(
-                folder / CHECKPOINT, self.network, self.average, self.optimizer, self.generator
-            )
-            _drop_metrics_after(self.clock.step, folder / METRICS)
-        elif (folder / CHECKPOINT).exists():
-            raise OutputError(
-                "holds a run already", path=folder, hint="Go on with --resume, or choose another -o"
-            )
-        else:
-            # Of a run that ended before its first checkpoint.
-            (folder / METRICS).unlink(missing_ok=True)
-        write_text(folder / "config.json", json.dumps(config.to_dict(), indent=2) + "\n")
-        self.pixels = PixelGenerator(config.pixels, self.generator)
+            self.clock = load_checkpoint(folder / CHECKPOINT, self.network, self.average, self.optimizer)
+        if self.workers.leads:
+            self.records = Records(folder, self.clock.step, tensorboard=tensorboard)
+            self.validation = sources.validation.draw(VALIDATION_PIXELS)
+            write_text(folder / "config.json", json.dumps(config.to_dict(), indent=2) + "\n")
 
     @property
     def progress(self) -> float:
@@ -105,99 +113,99 @@ class Trainer:
             return min(1.0, self.clock.seconds / (60 * self.config.minutes))
         return min(1.0, self.clock.step / self.config.steps)
 
-    def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics:
-        """Train to the end; `report` is called with progress and metrics now and then. Saves as it goes.
+    def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
+        """Train to the end and save on the way; `report` is called with progress and metrics now and then.
 
-        Raises ModelError when the loss is no longer finite.
+        Returns the last metrics, on the leader.
+
+        Raises:
+            ModelError: the loss or its gradient is no longer finite, or the run is at its end already; the
+                last checkpoint stays.
+            OutputError: a file cannot be written.
         """
-        validation = validation_set(self.config, self.device)
-        sums, count = torch.zeros(3), 0
+        if self.progress >= 1:
+            raise ModelError(
+                "the run is at its end already", path=self.folder, hint="Give it more --steps or --minutes"
+            )
+        metrics = None
+        losses: list[Tensor] = []
         saved = time.monotonic()
         started = saved - self.clock.seconds
-        while True:
-            finished = self.progress >= 1
-            due = finished or time.monotonic() - saved > CHECKPOINT_SECONDS
-            if (count == REPORT_STEPS or due) and count:
-                checked_deg = (
-                    validation_deg(self.average, validation, bfloat16=self.bfloat16) if due else None
-                )
-                metrics = self._metrics(sums / count, checked_deg)
-                self._append(metrics)
+        while self.progress < 1:
+            losses.append(self.step())
+            self.clock.seconds = self.workers.agree(time.monotonic() - started, self.device)
+            due = self.progress >= 1 or time.monotonic() - saved > CHECKPOINT_SECONDS
+            if self.workers.leads and (due or len(losses) == REPORT_STEPS):
+                metrics = self._metrics(torch.stack(losses).mean(dim=0), check=due)
+                self.records.append(metrics)
                 if due:
                     self.save()
                     saved = time.monotonic()
                 if report:
                     report(self.progress, metrics)
-                sums, count = torch.zeros(3), 0
-                if finished:
-                    return metrics
-            elif finished:
-                raise ModelError(
-                    "the run is at its end already",
-                    path=self.folder,
-                    hint="Give it more --steps or --minutes",
-                )
-            sums += self.step()
-            count += 1
-            self.clock.seconds = time.monotonic() - started
+                losses = []
+            elif not self.workers.leads:
+                losses = []
+        return metrics
+
+    def draw(self) -> tuple[PixelBatch, Tensor, bool]:
+        """This process's part of the step's batch, the pixels' further turns in degrees, whether mirrored."""
+        canonical = self.network.config.is_canonical
+        self.generator.manual_seed(stream_seed(self.config.seed, self.clock.step, _BATCH_STREAM))
+        mirrored = canonical and bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
+        pixels = self.config.batch_size // self.config.shards
+        batches, turns = [], []
+        for shard in self.shards:
+            self.generator.manual_seed(stream_seed(self.config.seed, self.clock.step, shard))
+            batches.append(self.source.draw(pixels))
+            turns.append(2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1)
+        jitter_deg = self.config.turn_jitter_deg if canonical else 0.0
+        return join_batches(batches), torch.cat(turns) * jitter_deg, mirrored
 
     def step(self) -> Tensor:
-        """One update of both networks on a fresh batch; returns loss, angle in degrees and map error."""
+        """One update on a fresh batch; returns the losses (6,), as in Losses, averaged over all processes."""
         config = self.config
-        # Dropout draws from the global generator; seeded by the step, it is the same in a resumed run.
-        torch.manual_seed((config.seed * 1_000_003 + self.clock.step) % 2**63)
-        rate = learning_rate(config, self.clock.step, self.progress)
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = learning_rate(config, self.clock.step, self.progress)
+        batch, turn_deg, mirrored = self.draw()
+        # Dropout draws from the global generator; seeded by the step, it is the same in a resumed run.
+        torch.manual_seed(stream_seed(config.seed, self.clock.step, _DROPOUT_STREAM + self.workers.rank))
         self.network.train()
-        batch = self.pixels.draw(config.batch_size)
-        turn, mirror = self._jitter(len(batch.observations))
-        views = self.network.look(
-            batch.observations, batch.light_directions, batch.valid, turn_deg=turn, mirror=mirror
-        )
-        size = config.network.map_size
-        dense_truth, normal_truth = truth_in_frame(
-            batch, views.cosine, views.sine, views.scale, mirror, size=size
-        )
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bfloat16):
-            dense = self.network.interpolate(views)
-            normals = self.network.estimate(views, dense)
-        angle = angular_loss(normals, normal_truth)
-        on_map = map_loss(dense.float(), dense_truth, self.network.inside)
-        masked = masked_map_loss(dense.float(), dense_truth, views.holds)
-        loss = config.angle_weight * angle + config.map_weight * on_map + config.masked_weight * masked
-        if not torch.isfinite(loss):
-            raise ModelError(
-                f"the loss is {loss.item()} at step {self.clock.step}", hint="Lower the learning rate"
-            )
         self.optimizer.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
+        losses = compute_losses(
+            self.network,
+            batch,
+            config,
+            part=part_of_step(config, self.clock.step),
+            turn_deg=turn_deg,
+            mirrored=mirrored,
+            bfloat16=self.bfloat16,
+        )
+        torch.autograd.backward(losses.total)
+        numbers = self.workers.average(
+            self.network.parameters(), torch.stack([loss.detach().double() for loss in losses])
+        ).cpu()
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
+        for name, value in (("loss", numbers[0]), ("gradient", norm)):
+            if not torch.isfinite(value):
+                raise ModelError(
+                    f"the {name} is {value.item()} at step {self.clock.step}",
+                    path=self.folder,
+                    hint="The last checkpoint is kept; go on from it, or begin anew, with a lower learning rate",
+                )
         self.optimizer.step()
         self._follow()
         self.clock.step += 1
         self.clock.pixels += config.batch_size
-        return torch.stack((loss.detach(), torch.rad2deg(angle.detach()), on_map.detach())).cpu()
+        return numbers
 
     def save(self) -> None:
-        """Write the checkpoint and the averaged weights. Raises OutputError."""
+        """Write checkpoint, averaged weights and pictures. Raises OutputError."""
         save_checkpoint(
-            self.folder / CHECKPOINT,
-            self.config,
-            self.network,
-            self.average,
-            self.optimizer,
-            self.generator,
-            self.clock,
+            self.folder / CHECKPOINT, self.config, self.network, self.average, self.optimizer, self.clock
         )
         save_weights(self.average, self.folder / WEIGHTS)
-
-    def _jitter(self, pixels: int) -> tuple[Tensor | float, bool]:
-        if not self.network.config.is_canonical:
-            return 0.0, False
-        turn = 2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1
-        mirror = bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
-        return turn * self.config.turn_jitter_deg, mirror
+        self.records.draw(sample_maps(self.average, self.validation))
 
     def _follow(self) -> None:
         # A young average would remember the start for too long: its decay grows with the steps.
@@ -207,70 +215,19 @@ class Trainer:
             for averaged, current in pairs:
                 averaged.lerp_(current, 1 - decay)
 
-    def _metrics(self, means: Tensor, checked_deg: float | None) -> Metrics:
-        loss, angle_deg, map_error = means.tolist()
+    def _metrics(self, means: Tensor, *, check: bool) -> Metrics:
+        losses = Losses(*means.tolist())
+        checked_deg = validation_deg(self.average, self.validation, bfloat16=self.bfloat16) if check else None
         return Metrics(
             step=self.clock.step,
             pixels=self.clock.pixels,
             minutes=round(self.clock.seconds / 60, 3),
             learning_rate=self.optimizer.param_groups[0]["lr"],
-            loss=loss,
-            angle_deg=angle_deg,
-            map_error=map_error,
+            loss=float(losses.total),
+            angle_deg=math.degrees(losses.angle),
+            map_error=float(losses.on_map),
+            masked_map_error=float(losses.masked),
+            symmetric=none_for_nan(float(losses.symmetric)),
+            asymmetric=none_for_nan(float(losses.asymmetric)),
             validation_deg=checked_deg,
         )
-
-    def _append(self, metrics: Metrics) -> None:
-        path = self.folder / METRICS
-        row = vars(metrics)
-        try:
-            fresh = not path.exists()
-            with path.open("a", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, row.keys())
-                if fresh:
-                    writer.writeheader()
-                writer.writerow({key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()})
-        except OSError as error:
-            raise OutputError(f"cannot be written ({error.strerror})", path=path) from error
-
-
-def _drop_metrics_after(step: int, path: Path) -> None:
-    # Lines come oftener than checkpoints: those after the last one are about to be written again.
-    if path.exists():
-        header, *lines = path.read_text("utf-8").splitlines() or [""]
-        kept = [
-            line for line in lines if line.partition(",")[0].isdigit() and int(line.partition(",")[0]) <= step
-        ]
-        write_text(path, "\n".join([header, *kept]) + "\n")
-
-
-def truth_in_frame(
-    batch: PixelBatch, cosine: Tensor, sine: Tensor, scale: Tensor, mirror: bool, *, size: int = MAP_SIZE
-) -> tuple[Tensor, Tensor]:
-    """In the pixels' frames: D_gt (P, 1, w, w), at the sparse map's scale, cut at 1; normals (P, 3)."""
-    scene = batch.scene.rotate(cosine, sine)
-    dense = (scene.dense_map(size) * (batch.exposure / scale)[..., None, None]).clamp(max=1)
-    normals = scene.normals
-    if mirror:
-        # The cells' centres lie symmetrically, so mirroring y is turning the rows over.
-        dense, normals = dense.flip(2), normals * normals.new_tensor((1.0, -1.0, 1.0))
-    return dense, normals
-
-
-def validation_set(config: TrainingConfig, device: torch.device) -> PixelBatch:
-    """Pixels under `usual_lights` lights from a generator of their own: checking never disturbs training."""
-    count = config.pixels.usual_lights
-    fixed = replace(config.pixels, min_lights=count, max_lights=count)
-    return PixelGenerator(fixed, torch.Generator(device).manual_seed(2**31 + config.seed)).draw(
-        VALIDATION_PIXELS
-    )
-
-
-@torch.no_grad()
-def validation_deg(network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False) -> float:
-    """Mean angular error in degrees."""
-    network.eval()
-    views = network.look(batch.observations, batch.light_directions, batch.valid)
-    with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-        normals = network.estimate(views, network.interpolate(views))
-    return math.degrees(angular_loss(normals, to_pixel_frame(batch.scene.normals, views)).item())

@@ -1,6 +1,6 @@
 """Pixels a second of the shipped network and of the paper's, on the CPU, same run; and the whole `infer` command.
 
-python benchmarks/speed.py [CAPTURE]
+python benchmarks/inference_speed.py [CAPTURE]
 
 The networks get ten lights of one random rig. Medians over the repeats, after one warm-up. With a CAPTURE (such as
 DiLiGenT's catPNG) the whole command is timed on it too, from ten lights, in processes of its own.

@@ -1,0 +1,126 @@
+"""`splinecli prepare`: captures with ground truth, CyclesPS trees and rendered scenes -> a pixel set."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from splinecli.cli.options import JsonOption, QuietOption, SeedOption
+from splinecli.cli.talk import Talk
+from splinecli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splinecli.training.pixel_sets import PixelSet
+    from splinecli.training.preparation import ScenePlan
+
+CONTACT_SHEET = "contact_sheet.png"
+
+
+def prepare(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="SET", help="Folder of the pixel set.")],
+    sources: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[SOURCE]...", help="Captures with ground truth, folders of them, CyclesPS trees."
+        ),
+    ] = None,
+    scenes: Annotated[int, typer.Option(metavar="N", min=0, help="Render N scenes.")] = 0,
+    mesh: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...); repeatable."),
+    ] = None,
+    size: Annotated[
+        int | None, typer.Option(metavar="PIXELS", min=8, help="Side of the rendered images. [default: 128]")
+    ] = None,
+    lights: Annotated[
+        int | None, typer.Option(metavar="F", min=16, help="Lights of a rendered scene. [default: 500]")
+    ] = None,
+    measured: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Measured materials (.npz) to use in the scenes too.")
+    ] = None,
+    measured_share: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Share of the materials that are measured.")
+    ] = 0.5,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Make a pixel set, the training data of `splinecli train SET`.
+
+    Every pixel comes with its true normal and what it shows under all lights. Rendering needs the extra
+    packages of 'splinecli[render]'. Writes SET/manifest.json, a folder for each entry, and
+    SET/contact_sheet.png to look at. An interrupted command, given again, goes on.
+    """
+    from splinecli.files import check_writable, write_bytes
+    from splinecli.outputs import encode_png
+    from splinecli.training.contact_sheet import contact_sheet
+    from splinecli.training.pixel_sets import PixelSetWriter
+    from splinecli.training.preparation import add_capture, add_scene, list_captures
+
+    if not sources and not scenes and not mesh:
+        raise UsageError("nothing to prepare", hint="Name a SOURCE, or ask for --scenes N or --mesh FILE")
+    check_writable(output)
+    captures = list_captures(sources or [])
+    plan = None
+    if scenes or mesh:
+        settings = {
+            "size": size,
+            "lights": lights,
+            "measured_materials": measured and str(measured.absolute()),
+        }
+        plan = _plan(
+            scenes, mesh or [], seed, {k: v for k, v in settings.items() if v is not None}, measured_share
+        )
+    writer = PixelSetWriter(output, plan.recipe if plan else {})
+    talk = Talk(quiet=quiet)
+    with talk.progress("preparing", len(captures) + (len(plan) if plan else 0)) as advance:
+        for name, folder in captures.items():
+            add_capture(writer, name, folder)
+            talk.say(writer.describe(name))
+            advance(1)
+        for index in range(len(plan) if plan else 0):
+            assert plan is not None
+            for name in add_scene(writer, plan, index):
+                talk.say(writer.describe(name))
+            advance(1)
+    pixel_set = writer.finish()
+    write_bytes(output / CONTACT_SHEET, encode_png(contact_sheet(pixel_set)))
+    summary = _summary(pixel_set)
+    if as_json:
+        print(json.dumps(summary, indent=2))
+    elif not quiet:
+        print(
+            f"{output}: {summary['entries']} entries of {summary['scenes']} scenes, {summary['n_pixels']} pixels,"
+            f" {summary['bytes'] / 1e6:.0f} MB; look at {output / CONTACT_SHEET}"
+        )
+
+
+def _plan(
+    scenes: int, meshes: list[Path], seed: int, settings: dict[str, Any], measured_share: float
+) -> ScenePlan:
+    from splinecli.synthesis.meshes import read_mesh
+    from splinecli.synthesis.scenes import SceneConfig
+    from splinecli.training.preparation import ScenePlan
+
+    for path in meshes:
+        read_mesh(path)  # a bad one is refused before anything is rendered
+    if "measured_materials" in settings:
+        settings["measured_share"] = measured_share
+    return ScenePlan(SceneConfig(**settings), seed, tuple(meshes), len(meshes) + scenes)
+
+
+def _summary(pixel_set: PixelSet) -> dict[str, Any]:
+    from splinecli.training.pixel_sets import MANIFEST
+
+    return {
+        "set": str(pixel_set.folder),
+        "entries": len(pixel_set.entries),
+        "scenes": len({entry.scene for entry in pixel_set.entries}),
+        "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
+        "bytes": sum(path.stat().st_size for path in pixel_set.folder.rglob("*.npy")),
+        "manifest": str(pixel_set.folder / MANIFEST),
+        "contact_sheet": str(pixel_set.folder / CONTACT_SHEET),
+    }

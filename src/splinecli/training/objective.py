@@ -1,0 +1,143 @@
+"""What is minimised: the losses of a batch, for both networks or for one while the other is fixed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from splinecli.networks.spline_net import SplineNet, Views
+from splinecli.observation_map import cell_directions
+from splinecli.synthesis.batches import DenseMap, PixelBatch
+from splinecli.training.config import TrainingConfig
+from splinecli.training.losses import (
+    angular_loss,
+    asymmetric_loss,
+    asymmetries,
+    map_loss,
+    masked_map_loss,
+    symmetric_loss,
+)
+
+Part = Literal["both", "ne_net", "li_net"]
+
+
+class Losses(NamedTuple):
+    """The whole loss and its terms, unweighted, each a scalar; NaN for a term that was not computed.
+
+    angle in radians; on_map, masked: means over cells; symmetric, asymmetric: of LI-Net's and NE-Net's terms
+    together, each in its norm.
+    """
+
+    total: Tensor
+    angle: Tensor
+    on_map: Tensor
+    masked: Tensor
+    symmetric: Tensor
+    asymmetric: Tensor
+
+
+def part_of_step(config: TrainingConfig, step: int) -> Part:
+    """Which networks a step updates."""
+    if config.updates == "joint":
+        return "both"
+    return "li_net" if step % (config.ne_net_updates + 1) == config.ne_net_updates else "ne_net"
+
+
+def compute_losses(
+    network: SplineNet,
+    batch: PixelBatch,
+    config: TrainingConfig,
+    *,
+    part: Part = "both",
+    turn_deg: Tensor | float = 0.0,
+    mirrored: bool = False,
+    bfloat16: bool = False,
+) -> Losses:
+    """The losses of the paper, eqs. 5 and 8 as field by field in docs/training.md.
+
+    LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
+    NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). Where both are updated, the sum,
+    with the angle once.
+    """
+    views = network.look(
+        batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg, mirror=mirrored
+    )
+    dense_truth, normal_truth = truth_in_frame(batch, views, size=network.config.map_size)
+    autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+    with _fixed(network, part), autocast:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
+            dense = network.interpolate(views)
+        normals = network.estimate(views, dense)
+    dense = dense.float()
+    angle = angular_loss(normals, normal_truth)
+    on_map = map_loss(dense, dense_truth.values, dense_truth.known)
+    masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, views.holds)
+    symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
+    total = config.angle_weight * angle
+    if part != "ne_net":
+        against = (dense, dense_truth.values, dense_truth.known)
+        total = total + config.map_weight * map_loss(*against, config.li_net_norm)
+        total = total + config.masked_weight * masked_map_loss(*against, views.holds, config.li_net_norm)
+    if config.symmetric_weight:
+        total = total + config.symmetric_weight * symmetric
+    if config.asymmetric_weight:
+        total = total + config.asymmetric_weight * asymmetric
+    return Losses(total, angle, on_map, masked, symmetric, asymmetric)
+
+
+def _special(
+    dense: Tensor,
+    normals: Tensor,
+    dense_truth: DenseMap,
+    normal_truth: Tensor,
+    config: TrainingConfig,
+    part: Part,
+) -> tuple[Tensor, Tensor]:
+    if not (config.symmetric_weight or config.asymmetric_weight):
+        return dense.new_full((), torch.nan), dense.new_full((), torch.nan)
+    cells = cell_directions(dense.shape[-1])[1].sum()
+    terms = []
+    if part != "ne_net":
+        terms.append((dense, normal_truth, config.li_net_norm))
+    if part != "li_net":
+        terms.append((dense_truth.values, normals, config.ne_net_norm))
+    symmetric = asymmetric = dense.new_zeros(())
+    for maps, axes, norm in terms:
+        fine, coarse = asymmetries(maps, axes, dense_truth.filled)
+        share = 1 / cells if norm == "mean" else 1
+        symmetric = symmetric + share * symmetric_loss(fine)
+        asymmetric = asymmetric + share * asymmetric_loss(
+            fine, coarse, eta=config.eta, lambda_c=config.lambda_c
+        )
+    return symmetric, asymmetric
+
+
+def truth_in_frame(batch: PixelBatch, views: Views, *, size: int) -> tuple[DenseMap, Tensor]:
+    """In the pixels' frames: D_gt at the sparse map's scale, cut at 1; normals (P, 3)."""
+    scene = batch.scene.rotate(views.cosine, views.sine)
+    dense, normals = scene.dense_truth(size), scene.normals
+    values = (dense.values * (batch.exposure / views.scale)[..., None, None]).clamp(max=1)
+    dense = DenseMap(values, dense.known, dense.filled)
+    if views.mirrored:
+        dense, normals = dense.flip_y(), normals * normals.new_tensor((1.0, -1.0, 1.0))
+    return dense, normals
+
+
+@contextmanager
+def _fixed(network: SplineNet, part: Part) -> Iterator[None]:
+    """The network that `part` leaves out takes no gradients inside; gradients still pass through it."""
+    fixed: nn.Module | None = {"both": None, "ne_net": network.li_net, "li_net": network.ne_net}[part]
+    if fixed is None:
+        yield
+        return
+    states = [(parameter, parameter.requires_grad) for parameter in fixed.parameters()]
+    fixed.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter, state in states:
+            parameter.requires_grad_(state)

@@ -1,0 +1,222 @@
+"""Pixel sets: pixels with known normals under many lights, on disk as memory-mapped arrays with a manifest.
+
+    SET/manifest.json                       format, version, recipe, entries with counts and checksums
+    SET/<entry>/observations.npy            (P, F), linear, float16 where rendered and float32 where read
+    SET/<entry>/normals.npy                 (P, 3) float32, unit
+    SET/<entry>/light_directions.npy        (F, 3) float32, unit
+    SET/<entry>/mask.npy                    (H, W) bool with P true pixels, in whose row-major order P runs
+
+An entry appears whole, and the manifest names it only then: what an interruption leaves is a set that `prepare`
+can go on with. Training refuses a set that is not finished.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli import __version__
+from splinecli.errors import InputError, OutputError
+from splinecli.files import check_writable, current_umask, refusals_as_output_errors, write_text
+
+FORMAT = "splinecli-pixel-set-1"
+MANIFEST = "manifest.json"
+ARRAYS = ("observations", "normals", "light_directions", "mask")
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """The content of one entry; shapes and types as in the files above."""
+
+    observations: NDArray[np.floating]
+    normals: NDArray[np.float32]
+    light_directions: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the manifest says of an entry. Entries of one `scene` share their shape, so they are held together."""
+
+    name: str
+    scene: str
+    source: str
+    n_pixels: int
+    n_lights: int
+    sha256: dict[str, str]
+
+
+@dataclass(frozen=True)
+class PixelSet:
+    """A finished, verified set."""
+
+    folder: Path
+    entries: tuple[Entry, ...]
+
+    def load(self, entry: Entry) -> Pixels:
+        """The entry's arrays, mapped and not read. Raises InputError."""
+        return _load(self.folder / entry.name)
+
+
+class PixelSetWriter:
+    """Writes a set entry by entry; a set that was begun with the same recipe is gone on with."""
+
+    def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
+        """Begin or go on.
+
+        Args:
+            recipe: plain values that decide the whole content.
+
+        Raises:
+            OutputError: the folder cannot be written, or holds something else.
+        """
+        check_writable(folder)
+        self.folder = folder
+        self.recipe: dict[str, Any] = json.loads(json.dumps(recipe))
+        self._entries: dict[str, Entry] = {}
+        if (folder / MANIFEST).exists():
+            manifest = _read_manifest(folder)
+            if manifest["recipe"] != self.recipe:
+                raise OutputError(
+                    "holds a pixel set made in another way", path=folder, hint="Choose another -o"
+                )
+            self._entries = {entry.name: entry for entry in _entries(manifest, folder)}
+        elif folder.is_dir() and any(folder.iterdir()):
+            raise OutputError("is not empty and holds no pixel set", path=folder, hint="Choose another -o")
+        self._write_manifest(complete=False)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._entries
+
+    def describe(self, name: str) -> str:
+        """A line on an entry that is there."""
+        entry = self._entries[name]
+        return f"{name}: {entry.n_pixels} pixels, {entry.n_lights} lights, {entry.source}"
+
+    def add(self, name: str, scene: str, source: str, pixels: Pixels) -> None:
+        """Write an entry. Raises OutputError, and then leaves nothing of it."""
+        folder = self.folder / name
+        with refusals_as_output_errors(folder), tempfile.TemporaryDirectory(dir=self.folder) as temporary:
+            work = Path(temporary) / "entry"
+            work.mkdir()
+            for array in ARRAYS:
+                np.save(work / f"{array}.npy", getattr(pixels, array), allow_pickle=False)
+            checksums = {array: _sha256(work / f"{array}.npy") for array in ARRAYS}
+            work.chmod(0o777 & ~current_umask())
+            if folder.exists():  # of a run that was killed between this rename and its manifest
+                shutil.rmtree(folder)
+            work.rename(folder)
+        n_pixels, n_lights = pixels.observations.shape
+        self._entries[name] = Entry(name, scene, source, n_pixels, n_lights, checksums)
+        self._write_manifest(complete=False)
+
+    def finish(self) -> PixelSet:
+        """Mark the set as finished. Raises OutputError."""
+        self._write_manifest(complete=True)
+        return PixelSet(self.folder, tuple(self._entries.values()))
+
+    def _write_manifest(self, *, complete: bool) -> None:
+        manifest = {
+            "format": FORMAT,
+            "version": __version__,
+            "complete": complete,
+            "n_pixels": sum(entry.n_pixels for entry in self._entries.values()),
+            "recipe": self.recipe,
+            "entries": [asdict(entry) for entry in self._entries.values()],
+        }
+        write_text(self.folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+
+
+def open_pixel_set(folder: Path) -> PixelSet:
+    """A set that is finished and whose files are what the manifest says, every byte.
+
+    Raises:
+        InputError: it is not; the message names the file.
+    """
+    manifest = _read_manifest(folder)
+    if manifest.get("complete") is not True:
+        raise InputError(
+            "the pixel set is not finished", path=folder, hint="Run its 'splinecli prepare' again: it goes on"
+        )
+    pixel_set = PixelSet(folder, tuple(_entries(manifest, folder)))
+    if not pixel_set.entries:
+        raise InputError("the pixel set has no entries", path=folder / MANIFEST)
+    for entry in pixel_set.entries:
+        for array, expected in entry.sha256.items():
+            path = folder / entry.name / f"{array}.npy"
+            found = _sha256(path) if path.is_file() else "no such file"
+            if found != expected:
+                raise InputError(
+                    f"does not match the manifest: found {found[:16]}, expected SHA-256 {expected[:16]}...",
+                    path=path,
+                    hint="Make the set anew with 'splinecli prepare'",
+                )
+        _check_shapes(entry, pixel_set.load(entry), folder)
+    return pixel_set
+
+
+def _check_shapes(entry: Entry, pixels: Pixels, folder: Path) -> None:
+    shapes = {
+        "observations": (entry.n_pixels, entry.n_lights),
+        "normals": (entry.n_pixels, 3),
+        "light_directions": (entry.n_lights, 3),
+    }
+    for array, expected in shapes.items():
+        found = getattr(pixels, array).shape
+        if found != expected:
+            raise InputError(
+                f"does not match the manifest: found an array of shape {found}, expected {expected}",
+                path=folder / entry.name / f"{array}.npy",
+            )
+
+
+def _load(folder: Path) -> Pixels:
+    arrays = []
+    for array in ARRAYS:
+        path = folder / f"{array}.npy"
+        try:
+            arrays.append(np.load(path, mmap_mode="r", allow_pickle=False))
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be read as an array ({error})", path=path) from error
+    return Pixels(*arrays)
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        manifest: Any = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"no pixel set: its {MANIFEST} cannot be read ({error.strerror})",
+            path=folder,
+            hint="Make one with 'splinecli prepare SOURCE -o SET' or 'splinecli prepare --scenes N -o SET'",
+        ) from error
+    except ValueError as error:
+        raise InputError(f"is not JSON ({error})", path=path) from error
+    found = manifest.get("format") if isinstance(manifest, dict) else None
+    if found != FORMAT:
+        raise InputError(
+            f"is no manifest of a pixel set: found format {found!r}, expected {FORMAT!r}", path=path
+        )
+    valid: dict[str, Any] = manifest
+    return valid
+
+
+def _entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
+    try:
+        return [Entry(**values) for values in manifest["entries"]]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"an entry is incomplete ({error})", path=folder / MANIFEST) from error
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

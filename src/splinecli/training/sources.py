@@ -1,0 +1,225 @@
+"""Where training pixels come from: the online generator, pixel sets, and mixtures of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splinecli.observation_map import cell_directions, rotate_about_view_axis, sparse_map
+from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, join_batches, photograph
+from splinecli.synthesis.lights import draw_light_counts
+from splinecli.synthesis.pixels import PixelGenerator
+from splinecli.training.config import GENERATOR, TrainingConfig
+from splinecli.training.pixel_sets import Entry, Pixels, PixelSet, open_pixel_set
+
+FILL_STEPS = 3
+"""Gaps of a dense map are interpolated up to this many cells from a light."""
+
+_PAGES_BYTES = 256 << 20  # mapped pages are let go when about so many bytes of them were touched
+_PAGE = 4096
+
+
+class PixelSource(Protocol):
+    """Draws batches of pixels, reproducible from the seed of its generator."""
+
+    def draw(self, pixels: int) -> PixelBatch:
+        """A batch of P pixels."""
+        ...
+
+
+@dataclass(frozen=True)
+class SampledScene:
+    """P pixels known under F lights each: radiance, known (bool) (P, F), light_directions (P, F, 3)."""
+
+    normals: Tensor
+    radiance: Tensor
+    light_directions: Tensor
+    known: Tensor
+
+    def rotate(self, cosine: Tensor, sine: Tensor) -> SampledScene:
+        """The pixels turned about the view axis."""
+        lights = rotate_about_view_axis(self.light_directions, cosine[:, None], sine[:, None])
+        return SampledScene(
+            rotate_about_view_axis(self.normals, cosine, sine), self.radiance, lights, self.known
+        )
+
+    def dense_truth(self, size: int) -> DenseMap:
+        """The map of all lights, with gaps interpolated."""
+        sampled = sparse_map(self.radiance, self.light_directions, self.known, size=size)
+        inside = cell_directions(size)[1].to(sampled.holds)
+        return fill_gaps(sampled.values, sampled.holds * inside, inside)
+
+
+def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
+    """Interpolate cells without a value from their neighbours, by normalised 3 x 3 convolutions.
+
+    Args:
+        values, known: (P, 1, w, w); a value counts where known is 1.
+        inside: (w, w), 1 in the unit disc; nothing is filled outside.
+    """
+    kernel = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None]
+    filled, weight = values * known, known
+    for _ in range(FILL_STEPS):
+        near = torch.nn.functional.conv2d(weight, kernel, padding=1)
+        mean = torch.nn.functional.conv2d(filled * weight, kernel, padding=1) / near.clamp(min=1)
+        gap = (weight == 0) & (near > 0) & (inside > 0)
+        filled, weight = torch.where(gap, mean, filled), torch.where(gap, torch.ones_like(weight), weight)
+    return DenseMap(filled, known, weight)
+
+
+class PixelSetSource:
+    """Pixels of some entries of a set, all pixels alike likely, under lights drawn anew each time.
+
+    The lights of a pixel are drawn, as in CNN-PS (Ikehata, ECCV 2018), from those within a random largest
+    angle, U(20, 90) degrees, from the view axis; where those are too few, the closest others join them. The
+    capture's faults are those of `config`.
+    """
+
+    def __init__(
+        self,
+        pixel_set: PixelSet,
+        entries: Sequence[Entry],
+        config: CaptureConfig,
+        generator: torch.Generator,
+    ) -> None:
+        self.pixel_set = pixel_set
+        self.entries = tuple(entries)
+        self.config = config
+        self.generator = generator
+        self._ends = torch.tensor([entry.n_pixels for entry in entries]).cumsum(0)
+        self._arrays: dict[int, Pixels] = {}
+        self._touched = 0
+
+    def draw(self, pixels: int) -> PixelBatch:
+        """A batch of P pixels."""
+        scene = self._read(pixels)
+        counts = draw_light_counts(
+            pixels, self.config.min_lights, self.config.max_lights, self.config.usual_lights, self.generator
+        )
+        order, valid = self._choose_lights(scene, counts)
+        directions = scene.light_directions.gather(1, order[..., None].expand(*order.shape, 3))
+        return photograph(
+            scene, scene.radiance.gather(1, order), directions, valid, self.config, self.generator
+        )
+
+    def _choose_lights(self, scene: SampledScene, counts: Tensor) -> tuple[Tensor, Tensor]:
+        uniform = torch.rand(scene.known.shape, generator=self.generator, device=self.generator.device)
+        largest = torch.rand(len(counts), 1, generator=self.generator, device=self.generator.device)
+        zenith_deg = torch.rad2deg(scene.light_directions[..., 2].clamp(-1, 1).acos())
+        beyond = (zenith_deg - (20 + 70 * largest)).clamp(min=0)
+        rank = torch.where(beyond > 0, 1 + beyond, uniform).masked_fill(~scene.known, torch.inf)
+        order = rank.argsort(dim=1)[:, : int(counts.max())]
+        chosen = torch.arange(order.shape[1], device=counts.device) < counts[:, None]
+        return order, chosen & scene.known.gather(1, order)
+
+    def _read(self, pixels: int) -> SampledScene:
+        device = self.generator.device
+        flat = torch.randint(int(self._ends[-1]), (pixels,), generator=self.generator, device=device).cpu()
+        flat = flat.sort().values
+        which = torch.searchsorted(self._ends, flat, right=True)
+        present = which.bincount().nonzero().flatten().tolist()
+        lights = max(self.entries[index].n_lights for index in present)
+        radiance = np.zeros((pixels, lights), np.float32)
+        directions = np.zeros((pixels, lights, 3), np.float32)
+        directions[..., 2] = 1
+        known = np.zeros((pixels, lights), np.bool_)
+        normals = np.empty((pixels, 3), np.float32)
+        for index in present:
+            entry, arrays = self.entries[index], self._mapped(index)
+            here = (which == index).numpy()
+            rows = (flat[which == index] - (self._ends[index] - entry.n_pixels)).numpy()
+            radiance[here, : entry.n_lights] = arrays.observations[rows]
+            directions[here, : entry.n_lights] = arrays.light_directions
+            known[here, : entry.n_lights] = True
+            normals[here] = arrays.normals[rows]
+            self._touched += len(rows) * (2 * _PAGE + arrays.observations[0].nbytes)
+        if self._touched > _PAGES_BYTES:
+            self._arrays, self._touched = {}, 0
+        return SampledScene(
+            *(torch.from_numpy(array).to(device) for array in (normals, radiance, directions, known))
+        )
+
+    def _mapped(self, index: int) -> Pixels:
+        if index not in self._arrays:
+            self._arrays[index] = self.pixel_set.load(self.entries[index])
+        return self._arrays[index]
+
+
+class MixedSource:
+    """Each pixel from a source drawn by weight."""
+
+    def __init__(
+        self, sources: Sequence[PixelSource], weights: Sequence[float], generator: torch.Generator
+    ) -> None:
+        self.sources = tuple(sources)
+        self.weights = torch.tensor(weights, dtype=torch.float64)
+        self.generator = generator
+
+    def draw(self, pixels: int) -> PixelBatch:
+        """A batch of P pixels, those of one source together."""
+        device = self.generator.device
+        chosen = torch.multinomial(
+            self.weights.to(device), pixels, replacement=True, generator=self.generator
+        )
+        counts = chosen.bincount(minlength=len(self.sources)).tolist()
+        return join_batches(
+            [source.draw(count) for source, count in zip(self.sources, counts, strict=True) if count]
+        )
+
+
+def hold_back(pixel_set: PixelSet, share: float) -> tuple[list[Entry], list[Entry]]:
+    """Entries to train on and entries held for validation: the last scenes, at least one of two or more."""
+    scenes = list(dict.fromkeys(entry.scene for entry in pixel_set.entries))
+    count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
+    held = set(scenes[len(scenes) - min(count, len(scenes) - 1) :]) if count else set()
+    return (
+        [entry for entry in pixel_set.entries if entry.scene not in held],
+        [entry for entry in pixel_set.entries if entry.scene in held],
+    )
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What a run trains on, and what it is validated on, each with a generator of its own."""
+
+    training: PixelSource
+    validation: PixelSource
+
+
+def open_sources(
+    config: TrainingConfig, generator: torch.Generator, validation_generator: torch.Generator
+) -> Sources:
+    """The sources of a configuration; validation uses held scenes, under `usual_lights` lights.
+
+    A set of a single scene has none to hold back and is validated on itself.
+
+    Raises:
+        InputError: a pixel set is missing, unfinished or does not match its manifest.
+    """
+    count = config.pixels.usual_lights
+    checked = replace(config.pixels, min_lights=count, max_lights=count)
+    training: list[PixelSource] = []
+    validation: list[PixelSource] = []
+    weights = [weight for weight in config.sources.values() if weight > 0]
+    for name, weight in config.sources.items():
+        if weight == 0:
+            continue
+        if name == GENERATOR:
+            training.append(PixelGenerator(config.pixels, generator))
+            validation.append(PixelGenerator(checked, validation_generator))
+            continue
+        pixel_set = open_pixel_set(Path(name))
+        used, held = hold_back(pixel_set, config.held_share)
+        training.append(PixelSetSource(pixel_set, used, config.pixels, generator))
+        validation.append(PixelSetSource(pixel_set, held or used, checked, validation_generator))
+    if len(weights) == 1:
+        return Sources(training[0], validation[0])
+    return Sources(
+        MixedSource(training, weights, generator), MixedSource(validation, weights, validation_generator)
+    )
