@@ -16,6 +16,7 @@ from splinecli.observation_map import (
     map_scale,
     rotate_about_view_axis,
     sparse_map,
+    unit_disc,
 )
 
 SEEDS = st.integers(0, 2**31)
@@ -52,6 +53,40 @@ def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
 def test_cell_of_a_known_direction(x: float, y: float, row: int, column: int) -> None:
     z = math.sqrt(max(0.0, 1 - x * x - y * y))
     assert light_cells(torch.tensor((x, y, z), dtype=torch.float64)).item() == row * 32 + column
+
+
+# floor((n + 1) 31 / 2) from the lower left, which is row 31 and column 0; its last cell is a single point.
+@pytest.mark.parametrize(
+    ("x", "y", "row", "column"),
+    [
+        (0.01, 0.01, 16, 15),
+        (-0.1, -0.1, 18, 13),
+        (0.0, 1.0, 0, 15),
+        (0.0, 0.99, 1, 15),
+        (0.0, -1.0, 31, 15),
+        (1.0, 0.0, 16, 31),
+        (0.99, 0.0, 16, 30),
+        (-1.0, 0.0, 16, 0),
+        # (0.6 + 1) * 15.5 = 24.8 and (0.3 + 1) * 15.5 = 20.15
+        (0.6, 0.3, 11, 24),
+    ],
+)
+def test_cell_of_a_known_direction_on_the_grid_of_cnn_ps(x: float, y: float, row: int, column: int) -> None:
+    direction = torch.tensor((x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64)
+    assert light_cells(direction, grid="cnn-ps").item() == row * 32 + column
+    holds = sparse_map(torch.ones(1, 1), direction[None], grid="cnn-ps").holds
+    assert holds.flatten().nonzero().item() == row * 32 + column
+
+
+def test_the_disc_of_both_grids() -> None:
+    # By counting the odd a, b within 31 and 32 of the origin.
+    assert unit_disc(32).sum() == 812
+    assert torch.equal(unit_disc(32), cell_directions(32)[1])
+    theirs = unit_disc(32, "cnn-ps")
+    assert theirs.sum() == 740
+    assert torch.equal(theirs, theirs.T)
+    assert torch.equal(theirs, theirs.flip(0))
+    assert not (theirs & ~unit_disc(32)).any()
 
 
 @pytest.mark.parametrize("size", [8, 31, 32, 64])

@@ -5,18 +5,22 @@ projection, [-1, 1] x [-1, 1]. Column 0 is x = -1; row 0 is y = +1, so that a ma
 sky as the object sees it, y up. All cells are equally wide (2 / size) and the view axis runs through the
 corner shared by the four middle cells: rotations by 90 degrees and mirror images are exact permutations of
 cells. CNN-PS (Ikehata, ECCV 2018) and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2),
-whose last cell is a single point.
+whose last cell is a single point. On average that is half a cell, nearly two degrees, off ours, so networks
+trained on such maps need them: the "cnn-ps" grid.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 MAP_SIZE = 32
+
+Grid = Literal["even", "cnn-ps"]
+"""How lights fall on cells: ours, or as the authors of CNN-PS and SPLINE-Net have it. Row 0 is y = +1 in both."""
 
 
 class SparseMap(NamedTuple):
@@ -26,8 +30,14 @@ class SparseMap(NamedTuple):
     holds: Tensor
 
 
-def light_cells(light_directions: Tensor, size: int = MAP_SIZE) -> Tensor:
+def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
     """Flat cell index row * size + column (...) of unit light directions (..., 3), int64."""
+    if grid == "cnn-ps":
+        column, rising = (
+            ((light_directions[..., axis] + 1) * ((size - 1) / 2)).long().clamp(0, size - 1)
+            for axis in (0, 1)
+        )
+        return (size - 1 - rising) * size + column
     column = ((light_directions[..., 0] + 1) * (size / 2)).long().clamp(0, size - 1)
     row = ((1 - light_directions[..., 1]) * (size / 2)).long().clamp(0, size - 1)
     return row * size + column
@@ -47,8 +57,25 @@ def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
     return directions.float(), inside
 
 
+def unit_disc(size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
+    """Which cells (size, size) belong to the unit disc, bool: those whose centres do.
+
+    The authors' networks count a cell where its index, scaled to [-1, 1], lies in the disc: a slightly smaller
+    one, made of 740 cells in place of 812 at size 32.
+    """
+    if grid == "even":
+        return cell_directions(size)[1]
+    doubled = 2 * torch.arange(size) - (size - 1)
+    return doubled[:, None] ** 2 + doubled**2 < (size - 1) ** 2
+
+
 def sparse_map(
-    values: Tensor, light_directions: Tensor, valid: Tensor | None = None, *, size: int = MAP_SIZE
+    values: Tensor,
+    light_directions: Tensor,
+    valid: Tensor | None = None,
+    *,
+    size: int = MAP_SIZE,
+    grid: Grid = "even",
 ) -> SparseMap:
     """Scatter values (P, F) or (P, F, C) onto their lights' cells; lights that share a cell are averaged.
 
@@ -59,7 +86,7 @@ def sparse_map(
     if values.ndim == 2:
         values = values[..., None]
     pixels, lights, channels = values.shape
-    cells = light_cells(light_directions, size).expand(pixels, lights)
+    cells = light_cells(light_directions, size, grid).expand(pixels, lights)
     weight = torch.ones_like(values[..., 0]) if valid is None else valid.to(values.dtype)
     stacked = torch.cat((values * weight[..., None], weight[..., None]), dim=-1).transpose(1, 2)
     sums = values.new_zeros(pixels, channels + 1, size * size)

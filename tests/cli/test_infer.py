@@ -193,6 +193,26 @@ def test_links_are_called_by_their_own_names(capture, run):
     assert sorted(path.name for path in Path("out").iterdir()) == ["one", "two"]
 
 
+def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
+    holder = capture.parent / "Ball"
+    for kind in ("specular", "metallic"):
+        (holder / f"images_{kind}").mkdir(parents=True)
+        for index in range(8):
+            picture = cv2.imread(str(capture / f"image{index + 1}.png"), cv2.IMREAD_UNCHANGED)
+            tifffile.imwrite(holder / f"images_{kind}/{index:05}.tif", np.dstack([picture] * 3))
+    (holder / "light.txt").write_bytes((capture / "light_directions.txt").read_bytes())
+    for name in ("inboundary.png", "onboundary.png"):
+        (holder / name).write_bytes((capture / "mask.png").read_bytes())
+    result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
+    assert (result.code, result.err) == (0, "")
+    assert {path.name for path in Path("out").iterdir()} == {"Ball_specular", "Ball_metallic"}
+    assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
+    # An object with several kinds is passed over among others, under its own name.
+    result = run("infer", holder, capture, "--method", "ls", "--overwrite")
+    assert result.code == 3
+    assert "Ball: found 2 folders of images (images_metallic, images_specular)" in result.err
+
+
 def test_interrupted_overwriting_keeps_the_earlier_results(capture, run, monkeypatch):
     run("infer", capture, "--method", "ls")
     before = {path.name: path.read_bytes() for path in Path("out/sphere").iterdir()}

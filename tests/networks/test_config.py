@@ -11,7 +11,7 @@ from splinecli.networks.config import NetworkConfig
 
 
 def test_round_trip() -> None:
-    config = NetworkConfig(size="paper", map_size=16, width=5)
+    config = NetworkConfig(size="paper", map_size=16, width=5, grid="cnn-ps")
     assert NetworkConfig.from_dict(config.to_dict()) == config
     assert NetworkConfig.from_dict({}) == NetworkConfig()
 
@@ -20,6 +20,8 @@ def test_round_trip() -> None:
     ("values", "message"),
     [
         ({"depth": 3}, "unknown network setting 'depth'; known are size, map_size, width"),
+        ({"grid": "odd"}, "network grid is 'odd'; expected 'even' or 'cnn-ps'"),
+        ({"grid": "cnn-ps"}, "network grid is 'cnn-ps'; only the size 'paper' has it"),
         ({"size": "huge"}, "network size is 'huge'; expected 'paper' or 'compact'"),
         ({"width": 0}, "network setting 'width' is 0; expected a whole number from 1 to 4096"),
         ({"width": 1}, "network setting 'width' is 1; expected at least 2"),

@@ -21,10 +21,12 @@ def parameters(network: nn.Module) -> int:
 
 
 def test_paper_li_net_has_the_published_number_of_parameters() -> None:
-    # Weights and biases: 1*64*7*7 + 64, 64*128*4*4 + 128, 128*256*4*4 + 256; 12 times 256*256*3*3 + 256;
-    # 256*128*4*4 + 128, 128*64*4*4 + 64; 64*1*7*7 + 1.
-    expected = 3_200 + 131_200 + 524_544 + 12 * 590_080 + 524_416 + 131_136 + 3_137
-    assert parameters(PaperLINet()) == expected == 8_398_593
+    # Weights: 1*64*7*7, 64*128*4*4, 128*256*4*4; 12 times 256*256*3*3; 256*128*4*4, 128*64*4*4, 64*1*7*7.
+    weights = 3_136 + 131_072 + 524_288 + 12 * 589_824 + 524_288 + 131_072 + 3_136
+    # A scale and an offset for each normalised channel.
+    norms = 2 * (64 + 128 + 256 + 12 * 256 + 128 + 64)
+    expected = weights + norms
+    assert parameters(PaperLINet()) == expected == 8_402_304
     assert expected / 1e6 == pytest.approx(8.40, abs=0.01)
 
 

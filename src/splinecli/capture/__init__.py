@@ -1,9 +1,9 @@
 """Captures: photographs of one object under known lights, read from folders of files."""
 
-from splinecli.capture.capture_files import CaptureFiles, capture_name
+from splinecli.capture.capture_files import CaptureFiles
 from splinecli.capture.ground_truth import read_normals
 from splinecli.capture.images import read_image, read_mask
-from splinecli.capture.layout import find_capture_files, find_captures
+from splinecli.capture.layout import capture_name, find_capture_files, find_captures
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.reader import CaptureSource, open_capture, read_capture
 from splinecli.capture.record import Capture

@@ -34,12 +34,13 @@ class CaptureFiles:
     """The files of one capture; the images in the order of the lights.
 
     Args:
-        name: the folder's name.
-        folder: the folder.
+        name: what the capture is called, in most layouts like its folder.
+        folder: the folder that holds the files beside the images.
         images: one file a light.
         light_directions: F x 3 text.
         light_intensities: F x 3 text, or None where all lights are equally strong.
         mask: an image, or None where every pixel counts.
+        boundaries: instead of a the mask: images whose pixels above zero together are the object.
         ground_truth: a normal map, or None.
     """
 
@@ -50,6 +51,7 @@ class CaptureFiles:
     light_intensities: Path | None = None
     mask: Path | None = None
     ground_truth: Path | None = None
+    boundaries: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     return next((files[name] for name in names if name in files), None)
 
 
-def capture_name(folder: Path) -> str:
+def folder_name(folder: Path) -> str:
     """The folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
 
     Raises:

@@ -11,8 +11,8 @@ from splinecli.capture.capture_files import (
     MASK,
     CaptureFiles,
     Overrides,
-    capture_name,
     find_named,
+    folder_name,
 )
 from splinecli.capture.image_lists import read_image_list
 
@@ -27,7 +27,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     if filenames is None or lights is None:
         return None
     return CaptureFiles(
-        name=capture_name(folder),
+        name=folder_name(folder),
         folder=folder,
         images=read_image_list(filenames),
         light_directions=overrides.lights or lights,

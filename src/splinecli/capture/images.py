@@ -50,6 +50,16 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     return values
 
 
+def read_boundary(path: StrPath) -> NDArray[np.bool_]:
+    """A mask of CyclesPS (H, W) bool: true where any channel is above zero; it may be empty.
+
+    Raises:
+        InputError: the image cannot be read.
+    """
+    above: NDArray[np.bool_] = decode_image(Path(path)).max(axis=2) > 0
+    return above
+
+
 def read_mask(path: StrPath) -> NDArray[np.bool_]:
     """A mask (H, W) bool: true where any channel is above half of the image's largest value.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from splinecli.capture import diligent, plain_folder, psbox
+from splinecli.capture import cyclesps, diligent, plain_folder, psbox
 from splinecli.capture.capture_files import (
     FILENAMES,
     LIGHT_DIRECTIONS,
@@ -13,6 +13,7 @@ from splinecli.capture.capture_files import (
     CaptureFiles,
     Overrides,
     find_named,
+    folder_name,
 )
 from splinecli.capture.image_lists import list_folder, list_images
 from splinecli.capture.paths import is_folder
@@ -21,7 +22,7 @@ from splinecli.errors import InputError
 StrPath = str | os.PathLike[str]
 
 # Special before general: a plain folder takes whatever holds images.
-_LAYOUTS = (diligent.find, psbox.find, plain_folder.find)
+_LAYOUTS = (diligent.find, psbox.find, cyclesps.find, plain_folder.find)
 
 
 def find_capture_files(
@@ -49,23 +50,31 @@ def find_capture_files(
     raise AssertionError("the plain folder takes every folder or raises")  # pragma: no cover
 
 
+def capture_name(folder: StrPath) -> str:
+    """What the capture in the folder is called: like the folder, but in CyclesPS <object>_<kind>.
+
+    Raises:
+        InputError: the system does not tell what lies there.
+    """
+    return cyclesps.capture_name(Path(folder)) or folder_name(Path(folder))
+
+
 def find_captures(folder: StrPath) -> list[Path]:
     """The captures of a dataset's folder in natural order, or the folder alone where it is a capture itself.
 
     A capture is a folder with a light file beside its images, or beside the folder Objects that holds them
-    (PSBox); whether it can be read shows when it is read.
+    (PSBox), or one of the folders of images that a CyclesPS object holds; of CyclesPS, an object and the
+    published tree are datasets too. Whether a capture can be read shows when it is read.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)
-    if _looks_like_capture(folder):
-        return [folder]
-    captures = [path for path in inside if _looks_like_capture(path)]
+    captures = _captures_in(folder) or [capture for path in inside for capture in _captures_below(path)]
     if captures:
         return captures
-    deeper = [path for path in inside if any(_looks_like_capture(sub) for sub in _subfolders(path))]
+    deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
     raise InputError(
         f"found no capture, expected folders of images with a light file ({' or '.join(LIGHT_DIRECTIONS)})",
         path=folder,
@@ -75,6 +84,18 @@ def find_captures(folder: StrPath) -> list[Path]:
 
 def _subfolders(folder: Path) -> list[Path]:
     return [entry for entry in list_folder(folder) if is_folder(entry)]
+
+
+def _captures_in(folder: Path) -> list[Path]:
+    """The folder, where it is a capture, or the captures of the object that it is."""
+    return [folder] if _looks_like_capture(folder) else cyclesps.list_captures(folder)
+
+
+def _captures_below(folder: Path) -> list[Path]:
+    """Those in the folder, and in its subfolders where it is a part of CyclesPS's tree."""
+    if folder.name in cyclesps.TREES:
+        return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
+    return _captures_in(folder)
 
 
 def _looks_like_capture(folder: Path) -> bool:

@@ -13,8 +13,8 @@ from splinecli.capture.capture_files import (
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
-    capture_name,
     find_named,
+    folder_name,
 )
 from splinecli.capture.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
@@ -40,7 +40,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
             hint="Pass --lights FILE, with one line x y z for each image",
         )
     return CaptureFiles(
-        name=capture_name(folder),
+        name=folder_name(folder),
         folder=folder,
         images=images,
         light_directions=lights,

@@ -11,8 +11,8 @@ from splinecli.capture.capture_files import (
     MASK,
     CaptureFiles,
     Overrides,
-    capture_name,
     find_named,
+    folder_name,
 )
 from splinecli.capture.image_lists import check_not_empty, list_images
 from splinecli.capture.paths import is_folder
@@ -29,7 +29,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
         return None
     check_not_empty(images, folder / _OBJECTS)
     return CaptureFiles(
-        name=capture_name(folder),
+        name=folder_name(folder),
         folder=folder,
         images=images,
         light_directions=overrides.lights or lights,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splinecli.capture.capture_files import CaptureFiles
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.ground_truth import read_normals
-from splinecli.capture.images import read_mask, to_linear
+from splinecli.capture.images import read_boundary, read_mask, to_linear
 from splinecli.capture.layout import StrPath, find_capture_files
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.record import Capture, check_light_indices
@@ -104,15 +104,26 @@ class CaptureSource:
         )
 
     def _read_mask(self, shape: tuple[int, ...], image: Path) -> NDArray[np.bool_]:
+        if self.files.boundaries:
+            return self._read_boundaries(shape, image)
         if self.files.mask is None:
             return np.ones(shape, np.bool_)
         mask = read_mask(self.files.mask)
-        if mask.shape != shape:
-            raise InputError(
-                f"found a mask of {_size(mask.shape)} pixels, expected {_size(shape)} as in {image.name}",
-                path=self.files.mask,
-            )
+        _check_mask_size(mask, shape, self.files.mask, image)
         return mask
+
+    def _read_boundaries(self, shape: tuple[int, ...], image: Path) -> NDArray[np.bool_]:
+        union = np.zeros(shape, np.bool_)
+        for path in self.files.boundaries:
+            boundary = read_boundary(path)
+            _check_mask_size(boundary, shape, path, image)
+            union |= boundary
+        if not union.any():
+            names = " and ".join(path.name for path in self.files.boundaries)
+            raise InputError(
+                f"the mask is empty: every pixel of {names} is zero", path=self.files.boundaries[0].parent
+            )
+        return union
 
 
 def open_capture(
@@ -188,6 +199,14 @@ def _warnings(saturated_share: float, black_share: float, n_8_bit: int) -> tuple
     if n_8_bit:
         warnings.append("The images have 8 bits; 16-bit linear images give better normals.")
     return tuple(warnings)
+
+
+def _check_mask_size(mask: NDArray[np.bool_], shape: tuple[int, ...], path: Path, image: Path) -> None:
+    if mask.shape != shape:
+        raise InputError(
+            f"found a mask of {_size(mask.shape)} pixels, expected {_size(shape)} as in {image.name}",
+            path=path,
+        )
 
 
 def _size(shape: tuple[int, ...]) -> str:

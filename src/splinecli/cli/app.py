@@ -8,7 +8,9 @@ import typer
 
 from splinecli import __version__
 from splinecli.cli.evaluate import evaluate
+from splinecli.cli.import_weights import import_weights
 from splinecli.cli.infer import infer
+from splinecli.cli.prepare import prepare
 from splinecli.cli.train import train
 
 app = typer.Typer(
@@ -40,4 +42,6 @@ def _splinecli(
 
 app.command()(infer)
 app.command()(evaluate)
+app.command()(prepare)
 app.command()(train)
+app.command()(import_weights)

@@ -52,6 +52,10 @@ EXAMPLES = (
         "splinecli train -o runs/mine --minutes 90",
         "New weights; then --weights runs/mine/weights.safetensors.",
     ),
+    (
+        "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o official.safetensors",
+        "The authors' own weights; then --weights official.safetensors.",
+    ),
 )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import Capture, CaptureSource, open_capture
+from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.draws import NOISE_STREAM, Draw, DrawsFile, draw_lights, read_draws
 from splinecli.evaluation.light_noise import tilt_lights
@@ -32,9 +32,9 @@ def evaluate(
 ) -> Evaluation:
     """Score every estimator on every capture.
 
-    Captures are called by their folders' names, with so many parent folders as tell them apart; one given
-    twice counts once. One that cannot be read, or has no ground truth or too few lights, is skipped with its
-    reason.
+    Captures are called by their names (capture_name), or where two are equal by their folders' paths, with so
+    many parent folders as tell them apart; one given twice counts once. One that cannot be read, or has no
+    ground truth or too few lights, is skipped with its reason.
 
     Args:
         captures: folders.
@@ -177,7 +177,10 @@ def _read_lights(source: CaptureSource, lights: Sequence[int], report: _Report) 
 
 
 def _distinct_names(folders: Sequence[Path]) -> list[str]:
-    """The last parts of the folders' paths, as many for all as tell them apart."""
+    """The captures' names, or the last parts of the folders' paths, as many for all as tell them apart."""
+    names = [capture_name(folder) for folder in folders]
+    if len(set(names)) == len(names):
+        return names
     # As capture_name has it: a link keeps its name.
     parts = [(f.resolve() if ".." in f.parts else f.absolute()).parts for f in folders]
     depth = 1

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from splinecli.errors import ModelError
-from splinecli.observation_map import MAP_SIZE
+from splinecli.observation_map import MAP_SIZE, Grid
+
+_CHOICES = {"size": ("paper", "compact"), "grid": get_args(Grid)}
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,7 @@ class NetworkConfig:
     Attributes:
         size: "paper", the layers of the authors' networks; "compact", made for laptop cores.
         map_size: cells along a side of the observation map.
+        grid: how lights fall on its cells; "cnn-ps" for the authors' own weights, of the paper size alone.
         width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's
             hidden features of the compact size; the paper size has fixed layers and ignores them.
     """
@@ -26,6 +29,7 @@ class NetworkConfig:
     li_blocks: int = 2
     ne_blocks: int = 3
     head_width: int = 256
+    grid: Grid = "even"
 
     @property
     def is_canonical(self) -> bool:
@@ -44,9 +48,10 @@ class NetworkConfig:
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
         for name, value in values.items():
-            if name == "size":
-                if value not in ("paper", "compact"):
-                    raise ModelError(f"network size is {value!r}; expected 'paper' or 'compact'")
+            if name in _CHOICES:
+                if value not in _CHOICES[name]:
+                    expected = " or ".join(map(repr, _CHOICES[name]))
+                    raise ModelError(f"network {name} is {value!r}; expected {expected}")
             elif not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 4096:
                 raise ModelError(
                     f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096"
@@ -57,4 +62,6 @@ class NetworkConfig:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
         if config.width < 2:
             raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
+        if config.grid != "even" and config.size != "paper":
+            raise ModelError(f"network grid is {config.grid!r}; only the size 'paper' has it")
         return config

@@ -12,23 +12,25 @@ class PaperLINet(nn.Module):
     """The authors' generator (Zheng et al., ICCV 2019): (P, 1, w, w) -> the same, in 0..1; 8.40 M parameters.
 
     7x7 conv to 64; two stride-2 4x4 convs to 128 and 256; six residual blocks; two transposed convs back; 7x7
-    conv; sigmoid; instance norm between.
+    conv; sigmoid. No conv has a bias; an instance norm with a scale and an offset for each channel follows all
+    but the last. It normalises by each map's own statistics, in training and after it: the authors track
+    running ones but never use them.
     """
 
     def __init__(self) -> None:
         super().__init__()
 
         def normed(conv: nn.Module, width: int) -> list[nn.Module]:
-            return [conv, nn.InstanceNorm2d(width), nn.ReLU(inplace=True)]
+            return [conv, nn.InstanceNorm2d(width, affine=True), nn.ReLU(inplace=True)]
 
         self.layers = nn.Sequential(
-            *normed(nn.Conv2d(1, 64, 7, padding=3), 64),
-            *normed(nn.Conv2d(64, 128, 4, stride=2, padding=1), 128),
-            *normed(nn.Conv2d(128, 256, 4, stride=2, padding=1), 256),
+            *normed(nn.Conv2d(1, 64, 7, padding=3, bias=False), 64),
+            *normed(nn.Conv2d(64, 128, 4, stride=2, padding=1, bias=False), 128),
+            *normed(nn.Conv2d(128, 256, 4, stride=2, padding=1, bias=False), 256),
             *(_PaperResidualBlock(256) for _ in range(6)),
-            *normed(nn.ConvTranspose2d(256, 128, 4, stride=2, padding=1), 128),
-            *normed(nn.ConvTranspose2d(128, 64, 4, stride=2, padding=1), 64),
-            nn.Conv2d(64, 1, 7, padding=3),
+            *normed(nn.ConvTranspose2d(256, 128, 4, stride=2, padding=1, bias=False), 128),
+            *normed(nn.ConvTranspose2d(128, 64, 4, stride=2, padding=1, bias=False), 64),
+            nn.Conv2d(64, 1, 7, padding=3, bias=False),
         )
 
     def forward(self, sparse: Tensor) -> Tensor:
@@ -39,11 +41,11 @@ class _PaperResidualBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.InstanceNorm2d(width),
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            nn.InstanceNorm2d(width, affine=True),
             nn.ReLU(inplace=True),
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.InstanceNorm2d(width),
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            nn.InstanceNorm2d(width, affine=True),
         )
 
     def forward(self, x: Tensor) -> Tensor:

@@ -24,7 +24,13 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.lambertian import fit_lambertian
 from splinecli.networks.li_net import CompactLINet, PaperLINet
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
-from splinecli.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map
+from splinecli.observation_map import (
+    cell_directions,
+    map_scale,
+    rotate_about_view_axis,
+    sparse_map,
+    unit_disc,
+)
 
 RESIDUAL_LIMIT = 3.0
 
@@ -65,7 +71,8 @@ class SplineNet(nn.Module):
         else:
             self.li_net = CompactLINet(4, config.width, config.li_blocks, config.map_size)
             self.ne_net = CompactNENet(5, config.width, config.ne_blocks, config.head_width, config.map_size)
-        cells, inside = cell_directions(config.map_size)
+        cells, _ = cell_directions(config.map_size)
+        inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)
         self.register_buffer("inside", inside.float()[None, None], persistent=False)
 
@@ -106,8 +113,9 @@ class SplineNet(nn.Module):
         albedo = scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-3)
         predicted = (lights @ scaled_normals[..., None])[..., 0]
         residual = ((observed - predicted) / albedo).clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)
-        maps = sparse_map(torch.stack((observed, residual), dim=-1), lights, valid, size=self.config.map_size)
-        side = self.config.map_size
+        side, grid = self.config.map_size, self.config.grid
+        stacked = torch.stack((observed, residual), dim=-1)
+        maps = sparse_map(stacked, lights, valid, size=side, grid=grid)
         lambertian_map = (scaled_normals @ self.cells.T).clamp(0, 1).view(-1, 1, side, side)
         return Views(
             maps.values[:, :1],

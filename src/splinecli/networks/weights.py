@@ -104,7 +104,8 @@ def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) ->
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     """Rebuild the network of a weight file. Raises ModelError."""
     names = ", ".join(shipped_names())
-    hint = f"--weights takes a file written by 'splinecli train' or one of the names {names}"
+    writers = "'splinecli train' or 'splinecli import-weights'"
+    hint = f"--weights takes a file written by {writers}, or one of the names {names}"
     tensors, metadata = read_tensors(path, FORMAT, hint)
     network = SplineNet(NetworkConfig.from_dict(read_json_entry(metadata, "config", path)))
     load_strictly(network, tensors, path)

@@ -85,6 +85,10 @@ class TrainingConfig:
                 f"training setting 'min_lights' is {self.pixels.min_lights};"
                 f" expected at most max_lights = {self.pixels.max_lights}"
             )
+        if self.network.grid != "even":
+            raise ModelError(
+                f"network setting 'grid' is {self.network.grid!r}; training knows true maps on the grid 'even' alone"
+            )
         if not sum(self.sources.values()) > 0:
             raise ModelError("training setting 'sources' gives no source a weight above 0")
 
