@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,14 +67,7 @@ def prepare(
     captures = list_captures(sources or [])
     plan = None
     if scenes or mesh:
-        settings = {
-            "size": size,
-            "lights": lights,
-            "measured_materials": measured and str(measured.absolute()),
-        }
-        plan = _plan(
-            scenes, mesh or [], seed, {k: v for k, v in settings.items() if v is not None}, measured_share
-        )
+        plan = _plan(scenes, mesh or [], seed, size, lights, measured, measured_share)
     writer = PixelSetWriter(output, plan.recipe if plan else {})
     talk = Talk(quiet=quiet)
     with talk.progress("preparing", len(captures) + (len(plan) if plan else 0)) as advance:
@@ -99,7 +93,13 @@ def prepare(
 
 
 def _plan(
-    scenes: int, meshes: list[Path], seed: int, settings: dict[str, Any], measured_share: float
+    scenes: int,
+    meshes: list[Path],
+    seed: int,
+    size: int | None,
+    lights: int | None,
+    measured: Path | None,
+    measured_share: float,
 ) -> ScenePlan:
     from splinecli.synthesis.meshes import read_mesh
     from splinecli.synthesis.scenes import SceneConfig
@@ -107,9 +107,16 @@ def _plan(
 
     for path in meshes:
         read_mesh(path)  # a bad one is refused before anything is rendered
-    if "measured_materials" in settings:
-        settings["measured_share"] = measured_share
-    return ScenePlan(SceneConfig(**settings), seed, tuple(meshes), len(meshes) + scenes)
+    config = SceneConfig()
+    config = replace(
+        config,
+        size=size or config.size,
+        lights=lights or config.lights,
+        measured_share=measured_share if measured else 0.0,
+    )
+    plan = ScenePlan(config, seed, len(meshes) + scenes, tuple(meshes), measured)
+    _ = plan.library  # the same of a bad file
+    return plan
 
 
 def _summary(pixel_set: PixelSet) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 def check_same_run(begun: TrainingConfig, asked: TrainingConfig, path: Path) -> None:
     """Raise ModelError where a run begun with one configuration is to go on with another, length aside."""
     old, new = _flat(begun.to_dict()), _flat(asked.to_dict())
-    for name in sorted(old.keys() | new.keys()):
+    for name in old | new:
         if name not in ("steps", "minutes") and old.get(name) != new.get(name):
             raise ModelError(
                 f"the run was begun with {name} = {old.get(name)!r}, this asks for {new.get(name)!r}",

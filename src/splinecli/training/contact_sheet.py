@@ -9,6 +9,7 @@ from splinecli.normals import encode_picture
 from splinecli.training.pixel_sets import Entry, Pixels, PixelSet
 
 TILE = 96  # pixels: shapes and materials can be told, and sixty scenes fit on a screen or two
+LARGE_TILE, FEW_SCENES = 160, 12
 MOST_SCENES = 120
 _WIDTH = 1900
 _GAMMA = 2.2
@@ -23,7 +24,8 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
     for entry in pixel_set.entries:
         scenes.setdefault(entry.scene, []).append(entry)
     every = -(-len(scenes) // MOST_SCENES)
-    strips = [_strip(pixel_set, entries) for entries in list(scenes.values())[::every]]
+    tile = LARGE_TILE if len(scenes) <= FEW_SCENES else TILE
+    strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
     width = max(strip.shape[1] for strip in strips)
     across = max(1, _WIDTH // width)
     padded = [np.pad(strip, ((2, 2), (2, width - strip.shape[1] + 6), (0, 0))) for strip in strips]
@@ -32,12 +34,12 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
     return np.vstack(rows)
 
 
-def _strip(pixel_set: PixelSet, entries: list[Entry]) -> Picture:
+def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
     first = pixel_set.load(entries[0])
-    tiles = [_fit(encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8))]
+    tiles = [_fit(encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8), tile)]
     for entry in entries:
         pixels = pixel_set.load(entry)
-        tiles += [_fit(_shown(pixels, light)) for light in _LIGHTS]
+        tiles += [_fit(_shown(pixels, light), tile) for light in _LIGHTS]
     return np.hstack(tiles)
 
 
@@ -55,14 +57,14 @@ def _on_mask(values: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[n
     return picture
 
 
-def _fit(picture: NDArray[np.unsignedinteger]) -> Picture:
+def _fit(picture: NDArray[np.unsignedinteger], tile: int) -> Picture:
     import cv2
 
     height, width = picture.shape[:2]
-    scale = TILE / max(height, width)
+    scale = tile / max(height, width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    missing = (TILE - size[1], TILE - size[0])
+    missing = (tile - size[1], tile - size[0])
     return np.pad(
         small, ((missing[0] // 2, -(-missing[0] // 2)), (missing[1] // 2, -(-missing[1] // 2)), (0, 0))
     )

@@ -84,7 +84,7 @@ class PixelSetWriter:
         self._entries: dict[str, Entry] = {}
         if (folder / MANIFEST).exists():
             manifest = _read_manifest(folder)
-            if manifest["recipe"] != self.recipe:
+            if manifest.get("recipe") != self.recipe:
                 raise OutputError(
                     "holds a pixel set made in another way", path=folder, hint="Choose another -o"
                 )
@@ -212,9 +212,14 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 
 def _entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
     try:
-        return [Entry(**values) for values in manifest["entries"]]
-    except (KeyError, TypeError) as error:
+        entries = [Entry(**values) for values in manifest["entries"]]
+        # A checksum left out would be a file left unchecked.
+        complete = all(isinstance(entry.sha256.get(array), str) for entry in entries for array in ARRAYS)
+    except (AttributeError, KeyError, TypeError) as error:
         raise InputError(f"an entry is incomplete ({error})", path=folder / MANIFEST) from error
+    if not complete:
+        raise InputError("an entry is incomplete (a checksum is missing)", path=folder / MANIFEST)
+    return entries
 
 
 def _sha256(path: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 
 from splinecli.capture import capture_name, find_captures, open_capture
 from splinecli.errors import InputError
+from splinecli.synthesis.measured import MeasuredLibrary
+from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.scenes import CLASSES, SceneConfig, draw_scene, render_scene
 from splinecli.training.pixel_sets import Pixels, PixelSetWriter
@@ -78,8 +81,9 @@ class ScenePlan:
 
     config: SceneConfig
     seed: int
-    meshes: tuple[Path, ...]
     count: int
+    meshes: tuple[Path, ...] = ()
+    measured_materials: Path | None = None
 
     def __len__(self) -> int:
         return self.count
@@ -87,8 +91,22 @@ class ScenePlan:
     @property
     def recipe(self) -> dict[str, Any]:
         """What decides the content of every scene; more scenes may join a set, so their number is left out."""
-        meshes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in self.meshes}
-        return {"scene": asdict(self.config), "seed": self.seed, "meshes": meshes}
+        materials = self.measured_materials
+        return {
+            "scene": asdict(self.config),
+            "seed": self.seed,
+            "meshes": {path.name: _sha256(path) for path in self.meshes},
+            "measured_materials": None if materials is None else _sha256(materials),
+        }
+
+    @cached_property
+    def library(self) -> MeasuredLibrary | None:
+        """The measured materials. Raises InputError."""
+        return None if self.measured_materials is None else read_measured(self.measured_materials)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def add_scene(writer: PixelSetWriter, plan: ScenePlan, index: int) -> list[str]:
@@ -103,7 +121,9 @@ def add_scene(writer: PixelSetWriter, plan: ScenePlan, index: int) -> list[str]:
     names = {kind: f"{scene_name}-{kind}" for kind in CLASSES}
     if not all(name in writer for name in names.values()):
         mesh = read_mesh(plan.meshes[index]) if index < len(plan.meshes) else None
-        rendered = render_scene(draw_scene(plan.seed, index, plan.config, mesh), plan.config)
+        draw_measured = plan.library.draw if plan.library else None
+        scene = draw_scene(plan.seed, index, plan.config, mesh, draw_measured=draw_measured)
+        rendered = render_scene(scene, plan.config)
         for kind, name in names.items():
             pixels = Pixels(
                 # Half precision, 0.05 %, is finer than the render's own noise.
@@ -112,5 +132,5 @@ def add_scene(writer: PixelSetWriter, plan: ScenePlan, index: int) -> list[str]:
                 light_directions=rendered.light_directions.astype(np.float32),
                 mask=rendered.mask,
             )
-            writer.add(name, scene_name, f"rendered: {rendered.kind}", pixels)
+            writer.add(name, scene_name, f"rendered: {rendered.shape}", pixels)
     return list(names.values())

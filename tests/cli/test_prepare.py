@@ -1,0 +1,186 @@
+"""`splinecli prepare`: captures and CyclesPS trees into pixel sets, going on, and its refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+
+@pytest.fixture
+def cycles_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The published layout: one object, 7 x 10 pixels, three kinds, four lights; values that tell where they are."""
+    monkeypatch.chdir(tmp_path)
+    for tree, kinds in (("PRPS", ("specular", "metallic")), ("PRPS_Diffuse", ("diffuse",))):
+        folder = tmp_path / "cycles" / tree / "Turtle"
+        folder.mkdir(parents=True)
+        lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
+        np.savetxt(folder / "light.txt", lights, fmt="%.6f")
+        normals = np.zeros((7, 10, 3))
+        normals[..., 0] = np.linspace(-0.5, 0.5, 10)
+        normals[..., 2] = np.sqrt(1 - normals[..., 0] ** 2)
+        tifffile.imwrite(folder / "gt_normal.tif", np.rint((normals + 1) / 2 * 65535).astype(np.uint16))
+        inside, boundary = np.zeros((2, 7, 10), np.uint8)
+        inside[1:6, 2:8] = 255
+        boundary[1:6, 8] = 1
+        cv2.imwrite(str(folder / "inboundary.png"), inside)
+        cv2.imwrite(str(folder / "onboundary.png"), boundary)
+        for kind in kinds:
+            (folder / f"images_{kind}").mkdir()
+            for light in range(4):
+                image = np.arange(7 * 10 * 3, dtype=np.uint16).reshape(7, 10, 3) + 1000 * light
+                tifffile.imwrite(folder / f"images_{kind}" / f"{light:05}.tif", image)
+    return Path("cycles")
+
+
+def arrays(entry: str) -> dict[str, np.ndarray]:
+    return {path.stem: np.load(path) for path in (Path("set") / entry).glob("*.npy")}
+
+
+def test_a_capture(run, capture, truth):
+    result = run("prepare", capture, "-o", "set")
+    assert result.code == 0
+    assert result.out == "set: 1 entries of 1 scenes, 448 pixels, 0 MB; look at set/contact_sheet.png\n"
+    assert result.err == "sphere: 448 pixels, 8 lights, sphere\n"
+    found = arrays("sphere")
+    mask = found["mask"]
+    assert (mask.shape, mask.sum()) == ((24, 24), 448)
+    np.testing.assert_allclose(found["normals"], truth[mask], atol=1e-6)
+    np.testing.assert_allclose(
+        found["observations"], (truth[mask] @ found["light_directions"].T) * 60_000 / 65_535, atol=1e-5
+    )
+
+
+def test_a_cycles_tree_reads_to_the_values_put_in(run, cycles_tree):
+    result = run("prepare", cycles_tree, "-o", "set", "--json")
+    summary = json.loads(result.out)
+    assert (result.code, summary["entries"], summary["scenes"]) == (0, 3, 1)
+    whole, half = arrays("Turtle_diffuse"), arrays("Turtle_specular")
+    image = np.arange(7 * 10 * 3).reshape(7, 10, 3).mean(axis=2)
+    expected = np.stack([image[1:6, 2:9].ravel() + 1000 * light for light in range(4)], axis=1) / 65535
+    np.testing.assert_allclose(whole["observations"], expected, rtol=1e-6)
+    np.testing.assert_allclose(whole["normals"][:7, 0], np.linspace(-0.5, 0.5, 10)[2:9], atol=2e-5)  # 16 bits
+    # Of PRPS, rows 2 and 4 and columns 2, 4, 6, 8, as the training of CNN-PS has it.
+    inner = expected.reshape(5, 7, 4)[1::2, ::2].reshape(8, 4)
+    np.testing.assert_allclose(half["observations"], inner, rtol=1e-6)
+    assert half["mask"].shape == (4, 5)
+    manifest = json.loads(Path("set/manifest.json").read_text())
+    assert {entry["scene"] for entry in manifest["entries"]} == {"Turtle"}
+    assert manifest["complete"] is True
+
+
+def test_the_sheet_shows_normals_and_images(run, cycles_tree):
+    run("prepare", cycles_tree, "-o", "set", "--quiet")
+    sheet = cv2.imread("set/contact_sheet.png")
+    # A framed strip of 7 tiles: the normals, and three entries under two lights each.
+    assert sheet.shape == (164, 7 * 160 + 8, 3)
+    middle = sheet[82, 82].astype(int)
+    assert middle[0] > 240  # blue is z
+    assert abs(middle[1] - 128) < 3  # green is y, and y is 0 here
+
+
+def test_given_again_it_goes_on(run, make_capture):
+    one, two = make_capture("one"), make_capture("two")
+    shutil.move(two / "image3.png", "hidden.png")
+    result = run("prepare", one, two, "-o", "set")
+    assert (result.code, result.out) == (3, "")
+    assert "two" in result.err
+    before = Path("set/one/observations.npy").stat()
+    assert run("train", "set", "-o", "run", "--steps", 1).code == 3  # unfinished
+    shutil.move("hidden.png", two / "image3.png")
+    assert run("prepare", one, two, "-o", "set").code == 0
+    assert Path("set/one/observations.npy").stat().st_mtime_ns == before.st_mtime_ns
+    assert {entry["name"] for entry in json.loads(Path("set/manifest.json").read_text())["entries"]} == {
+        "one",
+        "two",
+    }
+
+
+def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
+    capture = make_capture("a")
+    shutil.copytree(capture, "b/a")
+    assert run("prepare", capture, "b", "-o", "set", "--quiet").code == 0
+    assert Path("set/a-2/normals.npy").exists()
+
+
+@pytest.fixture
+def cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cube's mesh, its top turned to the camera."""
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    monkeypatch.chdir(tmp_path)
+    corners = [f"v {x} {y} {z}" for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    sides = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+    Path("cube.obj").write_text("\n".join([*corners, *(f"f {side}" for side in sides)]) + "\n")
+    return Path("cube.obj")
+
+
+def test_scenes_and_a_mesh_are_rendered(run, cube):
+    arguments = ("prepare", "--mesh", cube, "--size", 16, "--lights", 20, "-o", "set")
+    result = run(*arguments, "--scenes", 1)
+    assert result.code == 0
+    assert result.out.startswith("set: 6 entries of 2 scenes, ")
+    assert result.err.count(", 20 lights, rendered: ") == 6
+    for kind in ("diffuse", "specular", "metallic"):
+        found = arrays(f"scene0000-{kind}")
+        assert found["observations"].dtype == np.float16
+        assert found["observations"].shape == (found["mask"].sum(), 20)
+        assert (found["observations"] >= 0).all() and found["observations"].max() > 0
+        np.testing.assert_allclose(np.linalg.norm(found["normals"], axis=1), 1, atol=1e-5)
+    # The middle of the cube's top looks at the camera.
+    normals = np.zeros((16, 16, 3))
+    normals[found["mask"]] = found["normals"]
+    assert normals[7, 7, 2] > 0.9
+    before = Path("set/scene0001-diffuse/observations.npy").read_bytes()
+    # More scenes join the set, and those that are there stay.
+    assert run(*arguments, "--scenes", 2, "--quiet").code == 0
+    assert Path("set/scene0001-diffuse/observations.npy").read_bytes() == before
+    assert Path("set/scene0002-diffuse").is_dir()
+    refused = run(*arguments, "--scenes", 2, "--seed", 1)
+    assert (refused.code, refused.err) == (
+        5,
+        "splinecli: set: holds a pixel set made in another way. Choose another -o.\n",
+    )
+
+
+def test_a_scene_does_not_depend_on_those_before_it(run, cube):
+    common = ("prepare", "--size", 16, "--lights", 20, "--quiet")
+    run(*common, "--scenes", 2, "-o", "set")
+    shutil.move("set", "first")
+    # As after an interruption: the second scene is rendered in a process of its own.
+    manifest = json.loads(Path("first/manifest.json").read_text())
+    shutil.copytree("first", "set")
+    manifest["entries"] = manifest["entries"][:3]
+    Path("set/manifest.json").write_text(json.dumps(manifest))
+    run(*common, "--scenes", 2, "-o", "set")
+    for name in ("observations", "normals", "light_directions", "mask"):
+        path = f"scene0001-metallic/{name}.npy"
+        assert (Path("set") / path).read_bytes() == (Path("first") / path).read_bytes()
+
+
+def test_refusals(run, make_capture, cycles_tree, golden):
+    blind = make_capture("blind")
+    (blind / "normals_gt.npy").unlink()
+    Path("cycles/PRPS/Turtle/images_metallic/00002.tif").unlink()
+    Path("full").mkdir()
+    Path("full/notes.txt").write_text("mine")
+    Path("cube.txt").write_text("no mesh")
+    messages = []
+    for code, arguments in (
+        (2, ["-o", "set"]),
+        (3, ["missing", "-o", "set"]),
+        (3, [blind, "-o", "set"]),
+        (3, ["cycles", "-o", "set2"]),
+        (5, [make_capture("good"), "-o", "full"]),
+        (3, ["--mesh", "missing.ply", "-o", "set3"]),
+        (2, ["--scenes", -1, "-o", "set3"]),
+    ):
+        result = run("prepare", *arguments)
+        assert result.out == ""
+        messages.append(result.err)
+        assert result.code == code, result.err
+    golden("prepare_refusals.txt", "".join(messages))
