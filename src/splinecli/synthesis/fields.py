@@ -1,0 +1,191 @@
+"""Signed distance fields, about: functions of points (N, 3) that are negative inside a shape and grow at about
+unit rate across its surface; and the triangles of their zero.
+
+Smooth union: Quilez, "Smooth minimum" (https://iquilezles.org/articles/smin). Surface: marching cubes (Lewiner et
+al. 2003), its vertices moved onto the field's zero, with the field's own gradient as their normals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.synthesis.meshes import Floats, Mesh
+from splinecli.synthesis.ray_tracing import import_extra
+
+Field = Callable[[Floats], Floats]
+
+
+def ellipsoid(half_axes: Floats) -> Field:
+    """An ellipsoid about the origin; exact on its surface and for a sphere."""
+
+    def distance(points: Floats) -> Floats:
+        scaled = np.linalg.norm(points / half_axes, axis=1)
+        slope = np.linalg.norm(points / half_axes**2, axis=1)
+        return np.asarray(scaled * (scaled - 1) / np.maximum(slope, 1e-6))
+
+    return distance
+
+
+def box(half_widths: Floats, rounding: float) -> Field:
+    """A box about the origin with rounded edges."""
+
+    def distance(points: Floats) -> Floats:
+        beyond = np.abs(points) - (half_widths - np.float32(rounding))
+        outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0) - np.float32(rounding))
+
+    return distance
+
+
+def torus(radius: float, tube: float) -> Field:
+    """A ring about the z axis."""
+
+    def distance(points: Floats) -> Floats:
+        ring = np.hypot(points[:, 0], points[:, 1]) - np.float32(radius)
+        return np.hypot(ring, points[:, 2]) - np.float32(tube)
+
+    return distance
+
+
+def capsule(half_length: float, radius: float) -> Field:
+    """A rod along z with round ends."""
+
+    def distance(points: Floats) -> Floats:
+        along = points[:, 2] - np.clip(points[:, 2], -np.float32(half_length), np.float32(half_length))
+        return np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + along**2) - np.float32(radius)
+
+    return distance
+
+
+def moved(field: Field, rotation: Floats, centre: Floats) -> Field:
+    """The shape turned by a rotation matrix and then moved."""
+    return lambda points: field((points - centre) @ rotation)
+
+
+def smooth_union(first: Floats, second: Floats, blend: float) -> Floats:
+    """The distance to either of two shapes, whose seam is filleted over a width of `blend`."""
+    overlap = np.maximum(blend - np.abs(first - second), 0) / blend
+    return np.minimum(first, second) - overlap * overlap * np.float32(blend / 4)
+
+
+def smooth_cut(shape: Floats, tool: Floats, blend: float) -> Floats:
+    """The distance to a shape with another one taken out of it."""
+    return -smooth_union(-shape, tool, blend)
+
+
+def waves(rng: np.random.Generator, frequency: float, outputs: int = 1, count: int = 10) -> Field:
+    """A smooth random function of about unit variance (N, outputs): plane waves of random directions.
+
+    Wave numbers U(0.6, 1.4) * frequency, in cycles per unit length. One output is (N,).
+    """
+    directions = rng.normal(size=(3, count))
+    directions *= 2 * np.pi * frequency * rng.uniform(0.6, 1.4, count) / np.linalg.norm(directions, axis=0)
+    phases = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
+    mixing = rng.normal(size=(count, outputs)) * np.sqrt(2 / count)
+    matrix, mixing = directions.astype(np.float32), mixing.astype(np.float32)
+
+    def value(points: Floats) -> Floats:
+        mixed = np.sin(points @ matrix + phases) @ mixing
+        return np.asarray(mixed[:, 0] if outputs == 1 else mixed)
+
+    return value
+
+
+def ridges(rng: np.random.Generator, frequency: float, octaves: int = 2) -> Field:
+    """Sharp crests between round valleys, about -1 to 1 (N,): octaves of 1 - 2 |waves|, each half the last."""
+    layers = [waves(rng, frequency * 2**octave) for octave in range(octaves)]
+
+    def value(points: Floats) -> Floats:
+        total = sum(0.5**octave * (1 - 2 * np.abs(layer(points))) for octave, layer in enumerate(layers))
+        return np.asarray(total / (2 - 0.5 ** (octaves - 1)), dtype=np.float32)
+
+    return value
+
+
+def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
+    """Central differences (N, 3)."""
+    columns = []
+    for axis in np.eye(3, dtype=np.float32) * np.float32(step):
+        columns.append((field(points + axis) - field(points - axis)) / np.float32(2 * step))
+    return np.stack(columns, axis=1)
+
+
+def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: float) -> Mesh | None:
+    """The zero of a field in a box about the origin, sampled every `spacing`; None where there is none.
+
+    Only the largest connected part is kept: crumbs and inner bubbles go.
+    """
+    counts = [int(np.ceil(2 * half / spacing / COARSE)) * COARSE + 1 for half in half_widths]
+    axes = [((np.arange(count) - (count - 1) / 2) * spacing).astype(np.float32) for count in counts]
+    values = _sample(field, axes, spacing)
+    if not values.min() < 0 < values.max():
+        return None
+    measure = import_extra("skimage.measure")
+    found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
+    vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
+    vertices, faces = _largest_part(vertices, faces)
+    # One step of Newton's method: linear interpolation between samples leaves terraces.
+    slope = gradient(field, vertices)
+    squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
+    move = np.clip(field(vertices) / squared, -0.4 * spacing, 0.4 * spacing)
+    vertices = vertices - move[:, None] * slope
+    normals = gradient(field, vertices)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    corners = vertices[faces]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if (facing * normals[faces].sum(axis=1)).sum() < 0:
+        faces = faces[:, ::-1]
+    return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
+
+
+# Samples along the edge of the cells that are skipped where they lie far from the surface.
+COARSE = 4
+
+
+def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
+    """The field on the grid of three axes, exact near its zero and with the right sign elsewhere."""
+    coarse = _evaluate(field, *np.meshgrid(*(axis[::COARSE] for axis in axes), indexing="ij"))
+    # Fields grow at rates up to about 2, and a cell's centre is half its diagonal from its corners.
+    reach = 2 * COARSE * spacing * np.sqrt(3) / 2
+    near = np.abs(coarse) < reach
+    close = np.zeros([size - 1 for size in coarse.shape], dtype=bool)
+    for x in (0, 1):
+        for y in (0, 1):
+            for z in (0, 1):
+                close |= near[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]]
+    far = coarse
+    for axis in range(3):
+        close, far = np.repeat(close, COARSE, axis), np.repeat(far, COARSE, axis)
+    shape = tuple(len(axis) for axis in axes)
+    values = np.ascontiguousarray(far[: shape[0], : shape[1], : shape[2]])
+    exact = np.zeros(shape, dtype=bool)
+    # The upper faces of a cell belong to it too.
+    for x in (0, 1):
+        for y in (0, 1):
+            for z in (0, 1):
+                exact[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]] |= close
+    at = exact.nonzero()
+    values[at] = _evaluate(field, *(axis[index] for axis, index in zip(axes, at, strict=True)))
+    return values
+
+
+def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
+    points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
+    # In pieces that stay in the processor's cache.
+    pieces = [field(points[start : start + 32_768]) for start in range(0, len(points), 32_768)]
+    return np.concatenate(pieces).reshape(x.shape).astype(np.float32)
+
+
+def _largest_part(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, NDArray[np.int32]]:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ones = np.ones(2 * len(faces), dtype=np.int8)
+    ends = (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())
+    _, part = connected_components(coo_array((ones, ends), shape=(len(vertices),) * 2), directed=False)
+    kept = part == np.bincount(part).argmax()
+    row = np.cumsum(kept) - 1
+    return vertices[kept], row[faces[kept[faces[:, 0]]]].astype(np.int32)

@@ -1,0 +1,95 @@
+"""Triangle meshes in the camera's frame: x right, y up, z to the camera, which sees the square [-1, 1]^2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError
+
+Floats = NDArray[np.floating]
+
+# Half-width of the object in the camera's square.
+REACH = 0.94
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices (V, 3) float32, faces (T, 3) int32 rows of vertices, anticlockwise from outside; vertex_normals
+    (V, 3) float32, unit and outward, which shading interpolates.
+    """
+
+    vertices: Floats
+    faces: NDArray[np.int32]
+    vertex_normals: Floats
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """The mesh of a file in any format that trimesh reads (PLY, OBJ, STL, OFF, glTF), fitted into the frame.
+
+    Its +z axis looks at the camera. Normals are smooth-shaded: the mean of the faces around a vertex, weighted by
+    angle. Long edges are split, so that every part of the surface has vertices and can have a material.
+
+    Raises:
+        InputError: the file is missing, not a mesh, or has no faces.
+        UsageError: the extra `render` is not installed.
+    """
+    from splinecli.synthesis.ray_tracing import import_extra
+
+    trimesh = import_extra("trimesh")
+    if not Path(path).is_file():
+        raise InputError("there is no such mesh file", path=path)
+    try:
+        loaded = trimesh.load_mesh(path, process=True)
+        # Whatever splits vertices, such as texture coordinates, would split the smooth normals too.
+        loaded.merge_vertices(merge_tex=True, merge_norm=True)
+        vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+        normals = np.asarray(loaded.vertex_normals) if len(faces) else np.zeros((0, 3))
+    except Exception as error:  # readers of two dozen formats raise what they like
+        raise InputError(
+            f"not a mesh that can be read ({type(error).__name__}: {str(error).strip() or 'no reason given'})",
+            path=path,
+            hint="Give a triangle mesh as PLY, OBJ, STL, OFF or glTF",
+        ) from error
+    if not len(faces):
+        raise InputError("the mesh has no faces", path=path, hint="Point clouds cannot be rendered")
+    if not np.isfinite(vertices).all() or np.ptp(vertices[:, :2], axis=0).max() == 0:
+        raise InputError("the mesh has no extent that a camera along -z could see", path=path)
+    mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
+    return split_long_edges(fit_to_frame(mesh), longest=0.03)
+
+
+def fit_to_frame(mesh: Mesh, *, reach: float = REACH) -> Mesh:
+    """The mesh scaled and centred so that its wider extent in x and y is 2 * reach and it stands about z = 0."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    scale = 2 * reach / float((high - low)[:2].max())
+    vertices = (mesh.vertices - (low + high) / 2) * np.float32(scale)
+    return Mesh(vertices.astype(np.float32), mesh.faces, mesh.vertex_normals)
+
+
+def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = 2_000_000) -> Mesh:
+    """The same surface with each face quartered until its edges are at most `longest`, while faces stay under
+    `most_faces`.
+    """
+    # Position and normal are interpolated together: shading is to stay what it was.
+    corners = np.concatenate((mesh.vertices, mesh.vertex_normals), axis=1).astype(np.float64)
+    faces = mesh.faces.astype(np.int64)
+    while True:
+        ends = corners[faces, :3]
+        length = np.linalg.norm(ends - np.roll(ends, -1, axis=1), axis=2).max(axis=1)
+        long = length > longest
+        if not long.any() or len(faces) + 3 * long.sum() > most_faces:
+            break
+        split = faces[long]
+        edges = np.stack((split, np.roll(split, -1, axis=1)), axis=2).reshape(-1, 2)
+        unique, middle = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+        a, b, c = split.T
+        ab, bc, ca = (middle.reshape(-1, 3) + len(corners)).T
+        corners = np.concatenate((corners, corners[unique].mean(axis=1)))
+        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        faces = np.concatenate((faces[~long], *(np.stack(quarter, axis=1) for quarter in quarters)))
+    normals = corners[:, 3:] / np.maximum(np.linalg.norm(corners[:, 3:], axis=1, keepdims=True), 1e-12)
+    return Mesh(corners[:, :3].astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))

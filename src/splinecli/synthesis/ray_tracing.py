@@ -1,0 +1,108 @@
+"""Rays against a mesh, traced by Embree (https://www.embree.org) through embreex.
+
+embreex, scikit-image and trimesh are the extra `render`: nothing but rendering needs them, so they are imported
+when a scene is made.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import UsageError
+from splinecli.synthesis.meshes import Floats, Mesh
+
+# Rays start this far above the surface, in the camera's frame of half-width 1: float32 leaves hits uncertain by
+# 1e-7 or so, and a pixel of 128 is 0.016 wide.
+OFFSET = 1e-4
+
+
+def import_extra(module: str) -> ModuleType:
+    """A module of the extra `render`.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(
+            "rendering needs the extra packages",
+            hint="Install them with: pip install 'splinecli[render]'",
+        ) from error
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The first surface points that N rays meet.
+
+    triangle (N,) int: row of the mesh's faces; weights (N, 3): barycentric, of the triangle's corners;
+    position (N, 3): on the triangle; normal and facet_normal (N, 3): unit, interpolated and the triangle's own.
+    """
+
+    triangle: NDArray[np.int64]
+    weights: Floats
+    position: Floats
+    normal: Floats
+    facet_normal: Floats
+
+    def take(self, rays: NDArray[np.int64] | NDArray[np.bool_]) -> Hits:
+        """Some of the points."""
+        return Hits(*(getattr(self, name)[rays] for name in self.__dataclass_fields__))
+
+    def lifted(self) -> Floats:
+        """Starts of further rays (N, 3), off the surface on its outer side."""
+        return self.position + np.float32(OFFSET) * self.facet_normal
+
+
+class Tracer:
+    """A mesh made ready for rays. All arrays of origins and directions are (N, 3).
+
+    Raises:
+        UsageError: embreex is not installed.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._scene = import_extra("embreex.rtcore_scene").EmbreeScene()
+        corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
+        import_extra("embreex.mesh_construction").TriangleMesh(self._scene, corners)
+        facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(facing, axis=1, keepdims=True)
+        self._facet_normals = (facing / np.maximum(length, 1e-30)).astype(np.float32)
+
+    def first_hits(self, origins: Floats, directions: Floats) -> tuple[NDArray[np.int64], Hits]:
+        """The rays that meet the surface, as rows of the input (K,), and where (K points)."""
+        found = self._scene.run(_packed(origins), _packed(directions), output=True)
+        rays = (found["primID"] >= 0).nonzero()[0]
+        u, v = found["u"][rays], found["v"][rays]
+        return rays, self.points(found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1))
+
+    def points(self, triangle: NDArray[np.int64], weights: Floats) -> Hits:
+        """The surface points with these barycentric weights (N, 3) on these triangles (N,)."""
+        corners = self.mesh.faces[triangle]
+        position = np.einsum("nk,nkc->nc", weights, self.mesh.vertices[corners])
+        normal = np.einsum("nk,nkc->nc", weights, self.mesh.vertex_normals[corners])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        return Hits(triangle, weights, position, normal, self._facet_normals[triangle])
+
+    def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
+        """Which directions (F, 3) are free of the mesh from which origins, where `facing` (N, F) asks: (N, F)."""
+        free = np.zeros(facing.shape, dtype=bool)
+        # Light by light, since rays of one direction are one array shorter and traverse the tree together.
+        for light, asked in enumerate(facing.T):
+            rows = asked.nonzero()[0]
+            if len(rows):
+                blocked = self._scene.run(
+                    _packed(origins[rows]), _packed(directions[light : light + 1]), query="OCCLUDED"
+                )
+                free[rows, light] = blocked < 0
+        return free
+
+
+def _packed(vectors: Floats) -> Floats:
+    return np.ascontiguousarray(vectors, dtype=np.float32)

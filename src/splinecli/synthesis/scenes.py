@@ -1,0 +1,201 @@
+"""Scenes for training, after CyclesPS (Ikehata, "CNN-PS", ECCV 2018): one shape, three classes of materials that
+change over its surface, and directional lights all over the upper hemisphere.
+
+A scene is a function of (seed, index) alone, so an interrupted set goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splinecli.errors import UsageError
+from splinecli.synthesis.material import Material
+from splinecli.synthesis.meshes import Floats, Mesh
+from splinecli.synthesis.principled import PrincipledMaterial
+from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.rendering import look, render_direct, render_indirect
+from splinecli.synthesis.shapes import draw_shape
+
+CLASSES = ("diffuse", "specular", "metallic")
+# Lights stand at least this high, as a cosine with the viewing direction.
+MIN_LIGHT_Z = 0.03
+
+DrawMeasured = Callable[[int, torch.Generator], Material]
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """How scenes are drawn and rendered.
+
+    size: width and height in pixels; lights: F; samples: k of the k x k samples of a pixel; directions: paths
+    a pixel for indirect light; bounces: the most surfaces that light meets before the one that is seen, 0 for
+    direct light alone; measured_share: share of a scene's material classes that are drawn from measured
+    reflectances instead, where there are some.
+
+    Raises:
+        UsageError: a number is out of range.
+    """
+
+    size: int = 128
+    lights: int = 500
+    samples: int = 3
+    directions: int = 64
+    bounces: int = 4
+    measured_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        low = {"size": 4, "lights": 1, "samples": 1, "directions": 1, "bounces": 0}
+        for name, least in low.items():
+            if getattr(self, name) < least:
+                raise UsageError(f"{name} is {getattr(self, name)} and has to be at least {least}")
+        if not 0 <= self.measured_share <= 1:
+            raise UsageError(f"measured_share is {self.measured_share} and has to be from 0 to 1")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is rendered. name: unique in a set; shape: its kind; lights (F, 3): unit directions to the lights;
+    materials: one reflectance for each of the patches in each class; patch_of_face (T,): rows of those.
+    """
+
+    name: str
+    shape: str
+    mesh: Mesh
+    lights: Floats
+    materials: dict[str, Material]
+    patch_of_face: NDArray[np.int64]
+    seed: int
+
+
+@dataclass(frozen=True)
+class RenderedScene:
+    """A scene's images. mask (H, W); normals (P, 3) unit, pixels row-major; light_directions (F, 3);
+    observations (P, F) float32 by class, of which 1 is matte white that faces the light.
+    """
+
+    name: str
+    shape: str
+    mask: NDArray[np.bool_]
+    normals: Floats
+    light_directions: Floats
+    observations: dict[str, Floats]
+
+
+def draw_scene(
+    seed: int,
+    index: int,
+    config: SceneConfig,
+    mesh: Mesh | None = None,
+    *,
+    draw_measured: DrawMeasured | None = None,
+) -> Scene:
+    """Scene `index` of the set of a seed; of a given mesh, or of a random shape.
+
+    Patches: thousands (1 000 to 6 000) for 70 % of the scenes, 2 to 40 for 20 %, one for 10 %.
+
+    Raises:
+        UsageError: the extra `render` is not installed.
+    """
+    rng = np.random.default_rng([seed, index])
+    lights = draw_lights(config.lights, rng)
+    patches = _draw_patch_count(rng)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    render_seed = int(rng.integers(2**62))
+    materials: dict[str, Material] = {}
+    for name in CLASSES:
+        measured = torch.rand((), generator=generator) < config.measured_share
+        drawn = draw_measured(patches, generator) if draw_measured is not None and measured else None
+        materials[name] = draw_class(name, patches, generator) if drawn is None else drawn
+    # The shape comes last: what was drawn before does not depend on how much it draws.
+    shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng)
+    patch_of_face = draw_patches(mesh, patches, rng)
+    return Scene(f"{index:05d}", shape, mesh, lights, materials, patch_of_face, render_seed)
+
+
+def render_scene(
+    scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None
+) -> RenderedScene:
+    """The scene in all its materials; `progress` hears the share that is done, from 0 to 1.
+
+    Raises:
+        UsageError: the extra `render` is not installed.
+    """
+    tell = progress or (lambda _: None)
+    tracer = Tracer(scene.mesh)
+    view = look(tracer, config.size, config.samples)
+    parts = tracer, view, scene.lights, scene.materials, scene.patch_of_face
+    with torch.inference_mode():
+        radiance = render_direct(*parts, progress=lambda share: tell(0.4 * share))
+        if config.bounces and len(view.normals):
+            indirect = render_indirect(
+                *parts,
+                directions=config.directions,
+                bounces=config.bounces,
+                generator=torch.Generator().manual_seed(scene.seed),
+                progress=lambda share: tell(0.4 + 0.6 * share),
+            )
+            for name, received in indirect.items():
+                radiance[name] += received
+    observations = {name: values.numpy() for name, values in radiance.items()}
+    return RenderedScene(scene.name, scene.shape, view.mask, view.normals, scene.lights, observations)
+
+
+def draw_lights(count: int, rng: np.random.Generator) -> Floats:
+    """Directions (count, 3), about uniform over the upper hemisphere.
+
+    A Fibonacci spiral (Gonzalez 2010) turned at random, each light moved by a third of the mean distance.
+    """
+    order = np.arange(count)
+    z = 1 - (1 - MIN_LIGHT_Z) * (order + 0.5) / count
+    azimuth = order * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
+    radius = np.sqrt(1 - z * z)
+    directions = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1)
+    directions += rng.normal(size=(count, 3)) * np.sqrt(2 * np.pi / count) / 3
+    directions[:, 2] = np.maximum(directions[:, 2], MIN_LIGHT_Z * 1.5)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions.astype(np.float32)
+
+
+def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Rows 0 to patches - 1 for the faces (T,): Voronoi cells about random ones of them."""
+    from scipy.spatial import cKDTree
+
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    seeds = centres[rng.integers(len(centres), size=patches)]
+    return np.asarray(cKDTree(seeds).query(centres)[1], dtype=np.int64)
+
+
+def draw_class(name: str, patches: int, generator: torch.Generator) -> PrincipledMaterial:
+    """Random materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
+
+    base U(0, 1); metallic 1 for metals, else 0; specular U(0, 4) of the specular class, else U(0, 1); roughness
+    U(0.3, 0.7) of metals, else U(0, 1); sheen U(0, 1) on a fifth of the others.
+    """
+
+    def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
+        return torch.rand(patches, 1, generator=generator) * (high - low) + low
+
+    metal = name == "metallic"
+    zero = torch.zeros(patches, 1)
+    return PrincipledMaterial(
+        base=uniform(),
+        metallic=torch.ones_like(zero) if metal else zero,
+        specular=uniform(0.0, 4.0 if name == "specular" else 1.0),
+        roughness=uniform(0.3, 0.7) if metal else uniform(),
+        sheen=zero if metal else uniform() * (uniform() < 0.2),
+        clearcoat=zero,
+        clearcoat_gloss=zero,
+    )
+
+
+def _draw_patch_count(rng: np.random.Generator) -> int:
+    kind = rng.random()
+    if kind < 0.7:
+        return int(rng.integers(1_000, 6_001))
+    return int(rng.integers(2, 41)) if kind < 0.9 else 1

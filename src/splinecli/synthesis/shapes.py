@@ -1,0 +1,238 @@
+"""Random shapes with the folds, hollows and occlusions of sculptures, made of signed distance fields.
+
+Unions of round blobs alone are too convex: hardly anything in them shades or lights anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from splinecli.synthesis.fields import (
+    Field,
+    box,
+    capsule,
+    ellipsoid,
+    moved,
+    ridges,
+    smooth_cut,
+    smooth_union,
+    torus,
+    triangulate,
+    waves,
+)
+from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
+
+# Distance between the samples of the fields; 128 pixels over the frame are 0.0156 apart.
+SPACING = 0.0125
+
+
+def draw_shape(rng: np.random.Generator) -> tuple[str, Mesh]:
+    """A random shape and the name of its kind, fitted into the camera's frame.
+
+    Kinds: 40 % carved (warped unions of solids with pieces cut out), 20 % rough (spheres under noise), 15 %
+    relief (folded slabs that fill the frame), 25 % vessel (bowls and cups that show the camera their inside).
+
+    Raises:
+        UsageError: the extra `render` is not installed.
+    """
+    names = list(KINDS)
+    name = names[int(rng.choice(len(names), p=(0.4, 0.2, 0.15, 0.25)))]
+    return name, draw_shape_of_kind(name, rng)
+
+
+def draw_shape_of_kind(name: str, rng: np.random.Generator) -> Mesh:
+    """A random shape of one kind, `carved`, `rough`, `relief` or `vessel`; errors as of draw_shape."""
+    while True:
+        mesh = KINDS[name](rng)
+        # A cut now and then leaves nothing or crumbs.
+        if mesh is not None and len(mesh.faces) > 5_000:
+            return mesh
+
+
+def draw_rotation(rng: np.random.Generator) -> Floats:
+    """A rotation matrix (3, 3), uniform over all (Shoemake 1992)."""
+    w, x, y, z = (quaternion := rng.normal(size=4)) / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=np.float32,
+    )
+
+
+def turn(mesh: Mesh, rotation: Floats) -> Mesh:
+    """The mesh rotated about the origin."""
+    return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.vertex_normals @ rotation.T)
+
+
+def _draw_solid(rng: np.random.Generator, size: float) -> Field:
+    kind = rng.integers(4)
+    if kind == 0:
+        return ellipsoid((size * rng.uniform(0.45, 1.3, 3)).astype(np.float32))
+    if kind == 1:
+        return box((size * rng.uniform(0.35, 1.0, 3)).astype(np.float32), 0.12 * size)
+    if kind == 2:
+        return torus(size * rng.uniform(0.8, 1.2), size * rng.uniform(0.2, 0.4))
+    return capsule(size * rng.uniform(0.6, 1.6), size * rng.uniform(0.25, 0.5))
+
+
+def _place(field: Field, rng: np.random.Generator, reach: Range) -> Field:
+    direction = rng.normal(size=3)
+    centre = direction / np.linalg.norm(direction) * rng.uniform(*reach)
+    return moved(field, draw_rotation(rng), centre.astype(np.float32))
+
+
+Range = tuple[float, float]
+
+
+def _draw_waves(rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1) -> Field:
+    """Smooth noise, its frequency in cycles per unit and its height from its mean slope."""
+    frequency = rng.uniform(*frequencies)
+    height = np.float32(rng.uniform(*slopes) / (2 * np.pi * frequency))
+    noise = waves(rng, frequency, outputs)
+    return lambda points: height * noise(points)
+
+
+def _draw_folds(rng: np.random.Generator, frequencies: Range, slopes: Range) -> Field:
+    """Ridged noise; arguments as for smooth noise."""
+    frequency = rng.uniform(*frequencies)
+    height = np.float32(rng.uniform(*slopes) / (4 * np.pi * frequency))
+    noise = ridges(rng, frequency)
+    return lambda points: height * noise(points)
+
+
+def draw_carved(rng: np.random.Generator) -> Mesh | None:
+    """Three to seven solids grown together and bent, three to eight pieces taken out, often with folds on top."""
+    solids = [
+        _place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5)) for _ in range(rng.integers(3, 8))
+    ]
+    tools = [
+        _place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7)) for _ in range(rng.integers(3, 9))
+    ]
+    blend, seam = rng.uniform(0.05, 0.25), rng.uniform(0.02, 0.08)
+    bend = _draw_waves(rng, (0.4, 0.9), (0.1, 0.5), outputs=3)
+    folds = _draw_folds(rng, (0.9, 2.2), (0.2, 0.8)) if rng.random() < 0.55 else None
+
+    def distance(points: Floats) -> Floats:
+        bent = points + bend(points)
+        shape = solids[0](bent)
+        for solid in solids[1:]:
+            shape = smooth_union(shape, solid(bent), blend)
+        for tool in tools:
+            shape = smooth_cut(shape, tool(bent), seam)
+        return shape - folds(bent) if folds else shape
+
+    mesh = triangulate(distance, (1.25, 1.25, 1.25), SPACING)
+    return None if mesh is None else fit_to_frame(turn(mesh, draw_rotation(rng)))
+
+
+def draw_rough(rng: np.random.Generator) -> Mesh | None:
+    """A sphere raised and sunk by noise, smooth or ridged, often with craters."""
+    swell = _draw_waves(rng, (0.5, 1.2), (0.3, 0.9))
+    drawn = _draw_folds if rng.random() < 0.6 else _draw_waves
+    detail = drawn(rng, (1.2, 2.4), (0.2, 0.7))
+    bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
+    craters = [
+        _place(
+            ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8)
+        )
+        for _ in range(rng.integers(0, 9))
+    ]
+
+    def distance(points: Floats) -> Floats:
+        bent = points + bend(points)
+        shape = np.linalg.norm(bent, axis=1) - np.float32(0.7) - swell(bent) - detail(bent)
+        for crater in craters:
+            shape = smooth_cut(shape, crater(bent), 0.05)
+        # Noise steepens the field; distances are to stay distances.
+        return np.asarray(shape * np.float32(0.7))
+
+    mesh = triangulate(distance, (1.3, 1.3, 1.3), SPACING)
+    return None if mesh is None else fit_to_frame(turn(mesh, draw_rotation(rng)))
+
+
+def draw_relief(rng: np.random.Generator) -> Mesh | None:
+    """A slab that fills the frame, folded into ridges, valleys and overhangs."""
+    swell, folds = _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), _draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
+    bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
+    pits = [
+        _place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0)) for _ in range(rng.integers(0, 6))
+    ]
+    slab = box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
+
+    def distance(points: Floats) -> Floats:
+        bent = points + bend(points)
+        # Across the slab the noise runs slower, so that heights stay heights and overhangs are an exception.
+        flat = bent * np.array((1, 1, 0.3), dtype=np.float32)
+        shape: Floats = (bent[:, 2] - swell(flat) - folds(flat)) * np.float32(0.7)
+        for pit in pits:
+            shape = smooth_cut(shape, pit(bent), 0.05)
+        return np.maximum(shape, slab(points))
+
+    return triangulate(distance, (1.09, 1.09, 0.85), SPACING)
+
+
+def draw_vessel(rng: np.random.Generator) -> Mesh | None:
+    """A bowl, cup or vase, round or fluted, its mouth up to 55 degrees from the camera; half hold or wear things."""
+    half_height = rng.uniform(0.3, 0.75)
+    wall = np.float32(rng.uniform(0.05, 0.12))
+    profile = _draw_profile(rng)
+    flutes, twist = int(rng.integers(3, 13)), rng.uniform(-2, 2)
+    depth = rng.uniform(0.1, 0.5) / flutes if rng.random() < 0.5 else 0.0
+    folds = _draw_folds(rng, (0.8, 2.0), (0.1, 0.4)) if rng.random() < 0.5 else None
+    extras = [
+        _place(_draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6)) for _ in range(rng.integers(0, 4))
+    ]
+    if rng.random() < 0.5:
+        extras = []
+    floor = np.float32(-half_height + 2 * wall)
+
+    def distance(points: Floats) -> Floats:
+        height = points[:, 2] / np.float32(half_height)
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) + np.float32(twist) * points[:, 2]
+        radius = profile(height) * (1 + np.float32(depth) * np.cos(flutes * azimuth))
+        side = (np.hypot(points[:, 0], points[:, 1]) - radius) * np.float32(0.75)
+        outer = -smooth_union(-side, half_height - np.abs(points[:, 2]), 0.08)
+        # The inside is the outside drawn in by the wall, and open at the top.
+        inner = -smooth_union(-(side + wall), points[:, 2] - floor, 0.25)
+        shape = -smooth_union(-outer, inner, 0.03)
+        for extra in extras:
+            shape = smooth_union(shape, extra(points), 0.04)
+        return shape - folds(points) if folds else shape
+
+    mesh = triangulate(distance, (1.15, 1.15, half_height + 0.2), SPACING)
+    if mesh is None:
+        return None
+    tilt, azimuth = np.radians(55) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+    return fit_to_frame(turn(mesh, _tilt(tilt, azimuth)))
+
+
+def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
+    """Radius over height from -1 to 1: a smooth curve through five random radii, wider at the mouth for half."""
+    from scipy.interpolate import PchipInterpolator
+
+    radii = rng.uniform(0.35, 0.9, 5)
+    if rng.random() < 0.5:
+        radii = np.sort(radii)
+    table = PchipInterpolator(np.linspace(-1, 1, 5), radii)(np.linspace(-1, 1, 256)).astype(np.float32)
+    return lambda height: np.interp(height, np.linspace(-1, 1, 256), table).astype(np.float32)
+
+
+def _tilt(angle: float, azimuth: float) -> Floats:
+    """The rotation that takes +z by an angle towards an azimuth in the image."""
+    c, s, a, b = np.cos(angle), np.sin(angle), np.cos(azimuth), np.sin(azimuth)
+    about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    about_z = np.array([[a, -b, 0], [b, a, 0], [0, 0, 1]])
+    return np.asarray(about_z @ about_y @ about_z.T, dtype=np.float32)
+
+
+KINDS: dict[str, Callable[[np.random.Generator], Mesh | None]] = {
+    "carved": draw_carved,
+    "rough": draw_rough,
+    "relief": draw_relief,
+    "vessel": draw_vessel,
+}
