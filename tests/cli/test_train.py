@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import re
+import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 
 @pytest.fixture(autouse=True)
 def small_runs(tmp_path, monkeypatch):
     """Tiny networks and few validation pixels: these tests are about the command, not about learning."""
+    import torch
+
     from splinecli.networks.config import NetworkConfig
     from splinecli.training import config, loop
 
@@ -21,6 +28,19 @@ def small_runs(tmp_path, monkeypatch):
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(loop, "VALIDATION_PIXELS", 32)
     monkeypatch.chdir(tmp_path)
+    # More threads only wait for one another in networks as small as these.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Saving without drawing, which takes longer than all of such a run."""
+    from splinecli.training.records import Records
+
+    monkeypatch.setattr(Records, "draw", lambda self, maps: None)
 
 
 def rows() -> list[dict[str, str]]:
@@ -28,19 +48,51 @@ def rows() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+FILES = {
+    "weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv", "curves.png", "maps.png",
+}  # fmt: skip
+
+
+def settings() -> dict[str, Any]:
+    values: dict[str, Any] = json.loads(Path("run/config.json").read_text())
+    return values
+
+
+def write_set(folder: str, *, finished: bool = True) -> None:
+    """Matte pixels in three scenes under 14 lights."""
+    from splinecli.training.pixel_sets import Pixels, PixelSetWriter
+
+    random = np.random.default_rng(0)
+    writer = PixelSetWriter(Path(folder), {"by": "hand"})
+    for scene in "abc":
+        normals, lights = random.normal(size=(50, 3)), random.normal(size=(14, 3))
+        for vectors in (normals, lights):
+            vectors[:, 2] = np.abs(vectors[:, 2]) + 0.3
+            vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        observations = (normals @ lights.T).clip(0)
+        arrays = [array.astype(np.float32) for array in (observations, normals, lights)]
+        writer.add(scene, scene, "a test", Pixels(*arrays, np.ones((5, 10), bool)))
+    if finished:
+        writer.finish()
+
+
 def test_a_run_and_its_continuation(run):
     result = run("train", "-o", "run", "--steps", 3)
     assert (result.code, result.out) == (0, "run/weights.safetensors\n")
     assert "step 3, 48 pixels" in result.err
-    files = {path.name for path in Path("run").iterdir()}
-    assert files == {"weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv"}
-    assert json.loads(Path("run/config.json").read_text())["steps"] == 3
+    assert {path.name for path in Path("run").iterdir()} == FILES
+    assert settings()["steps"] == 3
+    assert settings()["sources"] == {"generator": 1.0}
     assert [row["step"] for row in rows()] == ["3"]
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet") == type(result)(0, "", "")
     assert [row["step"] for row in rows()] == ["3", "5"]
+    # The settings may be given again as long as they are the run's.
+    again = ["--resume", "--steps", 6, "--preset", "compact", "--seed", 0, "--quiet"]
+    assert run("train", "-o", "run", *again).code == 0
+    assert [row["step"] for row in rows()] == ["3", "5", "6"]
 
 
-def test_the_weights_work(run, make_capture):
+def test_the_weights_work(run, make_capture, no_pictures):
     run("train", "-o", "run", "--steps", 1, "--quiet")
     report = json.loads(
         run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
@@ -49,8 +101,107 @@ def test_the_weights_work(run, make_capture):
     assert report["angular_error_deg"]["mean"] < 5
 
 
-def test_refusals(run, golden):
+def test_a_run_on_pixel_sets(run, make_capture):
+    write_set("set")
+    write_set("more/set")
+    result = run("train", "set", "more/set", "-o", "run", "--n-lights", "4-8", "--steps", 4, "--seed", 5)
+    assert result.code == 0, result.err
+    assert {path.name for path in Path("run").iterdir()} == FILES
+    values = settings()
+    # A run can be taken up from another folder.
+    assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
+    lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
+    assert (lights, values["seed"]) == ([4, 8, 8], 5)
+    report = json.loads(
+        run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
+    )
+    assert report["angular_error_deg"]["mean"] < 10
+    # As it was begun; then from elsewhere.
+    assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet").code == 0
+    Path("elsewhere").mkdir()
+    os.chdir("elsewhere")
+    assert run("train", "-o", "../run", "--resume", "--steps", 6, "--quiet").code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sources"),
+    [
+        (["set"], {"set": 1.0}),
+        (["set", "--generator-weight", "0.5"], {"set": 1.0, "generator": 0.5}),
+        (["set", "--generator-weight", "0"], {"set": 1.0}),
+        (["--generator-weight", "2"], {"generator": 2.0}),
+    ],
+)
+def test_sources(run, no_pictures, arguments, sources):
+    write_set("set")
+    assert run("train", *arguments, "-o", "run", "--steps", 1, "--quiet").code == 0
+    found = {name if name == "generator" else Path(name).name: w for name, w in settings()["sources"].items()}
+    assert found == sources
+    assert all(name == "generator" or Path(name).is_absolute() for name in settings()["sources"])
+
+
+def test_settings_come_from_preset_file_and_options(run, no_pictures):
+    Path("a.toml").write_text("seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n")
+    options = ["--param", "batch_size=4", "--param", "pixels.ambient_share=0", "--n-lights", 12, "--steps", 1]
+    assert run("train", "-o", "run", "--config", "a.toml", *options, "--quiet").code == 0
+    values = settings()
+    assert (values["seed"], values["batch_size"], values["steps"]) == (4, 4, 1)
+    assert (values["pixels"]["wall_share"], values["pixels"]["ambient_share"]) == (0.25, 0)
+    assert (values["pixels"]["min_lights"], values["pixels"]["max_lights"]) == (12, 12)
+    # The configuration of one run makes another.
+    assert run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
+    assert json.loads(Path("other/config.json").read_text()) == values | {"seed": 9}
+
+
+def test_alternating_updates_with_every_term(run, no_pictures):
+    terms = ["updates=alternating", "symmetric_weight=0.02", "asymmetric_weight=2e-5", "li_net_norm=sum"]
+    options = [word for term in terms for word in ("--param", term)]
+    assert run("train", "-o", "run", "--steps", 6, *options, "--quiet").code == 0
+    (row,) = rows()
+    assert float(row["symmetric"]) > 0
+    assert float(row["asymmetric"]) > 0
+
+
+def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
+    result = run("train", "-o", "run", "--steps", 1, "--tensorboard")
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        "splinecli: --tensorboard needs the package tensorboard."
+        " Install it: pip install 'splinecli[tensorboard]'.\n"
+    )
+
+
+def test_processes_that_cannot_share_a_batch(run, monkeypatch):
+    from splinecli.training import distributed
+
+    monkeypatch.setattr(distributed, "join_workers", lambda device: (distributed.Workers(0, 3), device))
+    result = run("train", "-o", "run", "--steps", 1)
+    assert (result.code, result.out) == (2, "")
+    assert "3 processes cannot share the 4 shards" in result.err
+    assert not Path("run").exists()
+
+
+def test_a_restarted_worker_goes_on_by_itself(run, no_pictures, monkeypatch):
+    assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
+    monkeypatch.setattr("splinecli.training.distributed.is_to_go_on", lambda: True)
+    assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
+    assert [row["step"] for row in rows()] == ["3", "5"]
+    # Where there is no checkpoint yet, it begins.
+    assert run("train", "-o", "other", "--steps", 1, "--quiet").code == 0
+
+
+def test_refusals(run, golden, no_pictures):
     run("train", "-o", "run", "--steps", 1)
+    Path("unknown.toml").write_text("[pixels]\nlights = 5\n")
+    Path("broken.toml").write_text("steps =\n")
+    write_set("set")
+    write_set("unfinished", finished=False)
+    write_set("changed")
+    normals = Path("changed/b/normals.npy")
+    normals.write_bytes(normals.read_bytes()[:-1] + b"?")
+    Path("empty").mkdir()
     messages = []
     for code, arguments in (
         (5, ["-o", "run"]),
@@ -58,11 +209,42 @@ def test_refusals(run, golden):
         (4, ["-o", "other", "--resume"]),
         (2, ["-o", "other", "--preset", "huge"]),
         (2, ["-o", "other", "--steps", 1, "--minutes", 1]),
-        (2, ["-o", "run", "--resume", "--preset", "paper"]),
         (2, []),
+        # settings
+        (4, ["-o", "other", "--param", "sead=1"]),
+        (4, ["-o", "other", "--param", "network.widht=8"]),
+        (4, ["-o", "other", "--param", "updates=both"]),
+        (4, ["-o", "other", "--param", "batch_size=6"]),
+        (2, ["-o", "other", "--param", "seed"]),
+        (4, ["-o", "other", "--config", "unknown.toml"]),
+        (4, ["-o", "other", "--config", "broken.toml"]),
+        (4, ["-o", "other", "--config", "none.toml"]),
+        (4, ["-o", "other", "--generator-weight", 0]),
+        *((2, ["-o", "other", f"--n-lights={text}"]) for text in ("few", "2", "9-4", "4-", "")),
+        # another run's checkpoint
+        (4, ["-o", "run", "--resume", "--steps", 2, "--param", "network.size=paper"]),
+        (4, ["-o", "run", "--resume", "--steps", 2, "--seed", 1]),
+        (4, ["-o", "run", "--resume", "--steps", 2, "--n-lights", 10]),
+        # sets
+        (3, ["missing", "-o", "other"]),
+        (3, ["empty", "-o", "other"]),
+        (3, ["unfinished", "-o", "other"]),
+        (3, ["set", "changed", "-o", "other"]),
     ):
         result = run("train", *arguments)
-        assert (result.code, result.out) == (code, "")
-        messages.append(result.err)
+        assert (result.code, result.out) == (code, ""), arguments
+        messages.append(re.sub("[0-9a-f]{16}", "<checksum>", result.err.replace(f"{Path.cwd()}/", "")))
     golden("train_refusals.txt", "".join(messages))
     assert not Path("other").exists()
+    assert [row["step"] for row in rows()] == ["1"]
+
+
+def test_another_preset_is_refused_by_its_network(run, no_pictures):
+    # The compact network of these tests is smaller, but its size by name is what is told.
+    run("train", "-o", "run", "--steps", 1)
+    result = run("train", "-o", "run", "--resume", "--steps", 2, "--preset", "paper")
+    assert (result.code, result.out) == (4, "")
+    message = (
+        "run/checkpoint.safetensors: the run was begun with network.size = 'compact', this asks for 'paper'"
+    )
+    assert message in result.err

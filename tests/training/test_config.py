@@ -28,7 +28,7 @@ def test_settings_left_out_have_their_defaults() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"stepz": 5}, "unknown training setting 'stepz'; known are angle_weight, average_decay, batch_size"),
+        ({"stepz": 5}, "unknown training setting 'stepz'; known are angle_weight, asymmetric_weight"),
         (
             {"pixels": {"lights": 5}},
             "unknown training setting 'lights'; known are ambient_share, cast_shadows",
@@ -46,7 +46,22 @@ def test_settings_left_out_have_their_defaults() -> None:
         ({"precision": "float16"}, "'precision' is 'float16'; expected 'bfloat16' or 'float32'"),
         ({"pixels": {"wall_share": 1.5}}, "'wall_share' is 1.5; expected a number from 0 to 1"),
         ({"pixels": {"cast_shadows": 1}}, "'cast_shadows' is 1; expected true or false"),
-        ({"pixels": {"min_lights": 0}}, "'min_lights' is 0; expected a whole number from 1"),
+        ({"pixels": {"min_lights": 0}}, "'min_lights' is 0; expected a whole number from 3"),
+        (
+            {"pixels": {"min_lights": 9, "max_lights": 8}},
+            "min_lights, usual_lights, max_lights are 9, 10, 8; expected them in rising order",
+        ),
+        ({"shards": 3}, "'batch_size' is 256; expected a multiple of shards = 3"),
+        ({"updates": "both"}, "'updates' is 'both'; expected 'joint' or 'alternating'"),
+        ({"ne_net_updates": 0}, "'ne_net_updates' is 0; expected a whole number from 1"),
+        ({"li_net_norm": "max"}, "'li_net_norm' is 'max'; expected 'mean' or 'sum'"),
+        ({"ne_net_norm": ["sum"]}, "expected 'mean' or 'sum'"),
+        ({"symmetric_weight": -0.1}, "'symmetric_weight' is -0.1; expected a number from 0"),
+        ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),
+        ({"sources": ["set"]}, "'sources' is .* expected a table of settings"),
+        ({"sources": {"set": True}}, "the weight of source 'set' is True; expected a number from 0"),
+        ({"sources": {"set": float("inf")}}, "the weight of source 'set' is inf"),
+        ({"sources": {"set": 0}}, "'sources' gives no source a weight above 0"),
     ],
 )
 def test_refused(values: dict[str, Any], message: str) -> None:
@@ -56,10 +71,14 @@ def test_refused(values: dict[str, Any], message: str) -> None:
 
 def test_presets_by_name() -> None:
     assert preset("compact") == TrainingConfig()
-    # The paper's section 4 and the authors' code (field notes, section 5).
+    # The paper's section 4; its code where that is silent (docs/training.md).
     paper = preset("paper")
     assert (paper.batch_size, paper.learning_rate, paper.steps) == (128, 1e-4, 200_000)
-    assert (paper.beta1, paper.beta2) == (0.5, 0.999)
+    assert (paper.beta1, paper.beta2, paper.weight_decay) == (0.9, 0.999, 0.0)
+    assert (paper.updates, paper.ne_net_updates) == ("alternating", 5)
+    assert (paper.symmetric_weight, paper.asymmetric_weight) == (2e-2, 2e-5)
+    assert (paper.eta, paper.lambda_c) == (1.0, 50.0)
+    assert (paper.pixels.min_lights, paper.pixels.max_lights, paper.pixels.usual_lights) == (10, 10, 10)
     assert paper.network.size == "paper"
     with pytest.raises(UsageError, match="no preset named 'tiny'; expected one of compact, paper"):
         preset("tiny")

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-import csv
+import errno
 import itertools
 import json
 import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,29 +24,29 @@ from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.weights import load_weights
-from splinecli.observation_map import cell_directions, sparse_map
-from splinecli.synthesis.pixels import PixelBatch, PixelGenerator
+from splinecli.synthesis.batches import PixelBatch
+from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training import loop
 from splinecli.training.checkpoint import read_checkpoint_config
-from splinecli.training.config import TrainingConfig, preset
+from splinecli.training.config import GENERATOR, TrainingConfig, preset
+from splinecli.training.distributed import Workers
 from splinecli.training.loop import (
     CHECKPOINT,
-    METRICS,
+    CHECKPOINT_SECONDS,
     WEIGHTS,
-    Metrics,
     Trainer,
     learning_rate,
-    truth_in_frame,
-    validation_deg,
-    validation_set,
+    stream_seed,
 )
+from splinecli.training.pixel_sets import PixelSet
+from splinecli.training.records import METRICS, Metrics, read_metrics
+from splinecli.training.validation import validation_deg
 
 CPU = torch.device("cpu")
+MakeSet = Callable[..., PixelSet]
 
 
-@pytest.fixture(autouse=True)
-def small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "VALIDATION_PIXELS", 64)
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 
 class OneBatch(PixelGenerator):
@@ -76,28 +84,29 @@ def test_the_authors_schedule(progress: float, expected: float) -> None:
 
 
 def learn(config: TrainingConfig, folder: Path) -> list[float]:
-    """Loss, angle and map error at the end of a run on one batch, over those at its start."""
-    trainer = Trainer(replace(config, learning_rate=1e-2, turn_jitter_deg=0.0), folder, CPU)
-    trainer.pixels = OneBatch(config)
+    """Loss, angle, map error and its share at the lights after a run on one batch, over those at its start."""
+    trainer = Trainer(replace(config, learning_rate=1e-2, turn_jitter_deg=0.0, shards=1), folder, CPU)
+    trainer.source = OneBatch(config)
     results = torch.stack([trainer.step() for _ in range(config.steps)])
-    shares: list[float] = (results[-5:].mean(dim=0) / results[:3].mean(dim=0)).tolist()
+    shares: list[float] = (results[-5:].mean(dim=0) / results[:3].mean(dim=0)).tolist()[:4]
     return shares
 
 
 @pytest.mark.parametrize("size", [16, 32])
 def test_normals_of_one_batch_are_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path, size: int) -> None:
-    loss, angle, _ = learn(replace(tiny, network=replace(tiny.network, map_size=size), steps=200), tmp_path)
+    config = replace(tiny, network=replace(tiny.network, map_size=size), steps=200, seed=1)
+    loss, angle, _, _ = learn(config, tmp_path)
     assert angle < 0.4
     # The maps of 16 pixels are more than so few channels can hold.
     assert loss < 0.7
 
 
 def test_the_dense_map_of_one_pixel_is_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path) -> None:
-    config = replace(
-        tiny, network=replace(tiny.network, width=32), batch_size=1, angle_weight=0.0, steps=200, seed=4
-    )
-    _, angle, on_map = learn(config, tmp_path)
+    network = replace(tiny.network, width=32)
+    config = replace(tiny, network=network, batch_size=1, shards=1, angle_weight=0.0, steps=200, seed=6)
+    _, angle, on_map, masked = learn(config, tmp_path)
     assert on_map < 0.5
+    assert masked < 0.1
     # The normals are not asked for, so they stay where they were.
     assert angle == pytest.approx(1, abs=0.1)
 
@@ -106,16 +115,29 @@ def losses(trainer: Trainer, steps: int) -> list[float]:
     return [trainer.step()[0].item() for _ in range(steps)]
 
 
-def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny: TrainingConfig, tmp_path: Path) -> None:
-    whole = Trainer(tiny, tmp_path / "whole", CPU)
+@pytest.mark.parametrize("updates", ["joint", "alternating"])
+@pytest.mark.parametrize("pixels", ["generator", "set", "both"])
+def test_a_run_taken_up_goes_on_as_if_never_stopped(
+    tiny: TrainingConfig, tmp_path: Path, make_set: MakeSet, updates: Any, pixels: str
+) -> None:
+    sources = {"generator": {GENERATOR: 1.0}, "set": {}, "both": {GENERATOR: 1.0}}[pixels]
+    if pixels != "generator":
+        sources[str(make_set().folder)] = 1.0
+    config = replace(
+        tiny, updates=updates, ne_net_updates=2, sources=sources, symmetric_weight=0.02,
+        asymmetric_weight=1e-4, warmup_steps=4,
+    )  # fmt: skip
+    whole = Trainer(config, tmp_path / "whole", CPU)
     expected = losses(whole, 6)
-    first = Trainer(tiny, tmp_path / "halves", CPU)
+    first = Trainer(config, tmp_path / "halves", CPU)
     assert losses(first, 3) == expected[:3]
     first.save()
+    torch.rand(100)  # what others draw in between does not matter
     second = Trainer(
         read_checkpoint_config(tmp_path / "halves" / CHECKPOINT), tmp_path / "halves", CPU, resume=True
     )
     assert second.clock == first.clock
+    # The same operations on the same numbers; only their places in memory differ.
     assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
         for name, tensor in getattr(whole, network).state_dict().items():
@@ -124,8 +146,63 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny: TrainingConfig, tmp_pa
             )
 
 
+def test_every_stream_of_a_run_is_another() -> None:
+    seeds = {
+        stream_seed(seed, step, stream)
+        for seed in (0, 1, 2**32 - 1)
+        for step in (0, 1, 2, 100_000)
+        for stream in (0, 1, 2, 3, 2**31, 2**31 + 1)
+    }
+    assert len(seeds) == 3 * 4 * 6
+    assert all(0 <= seed < 2**63 for seed in seeds)
+    assert stream_seed(5, 6, 7) == stream_seed(5, 6, 7)
+
+
+def test_workers_share_out_the_very_pixels_of_one(tiny: TrainingConfig, tmp_path: Path) -> None:
+    batch, turn_deg, mirrored = Trainer(tiny, tmp_path / "one", CPU).draw()
+    pixels = tiny.batch_size // tiny.shards
+    mirrors = set()
+    for rank in range(2):
+        folder = tmp_path / f"rank {rank}"
+        follower = Trainer(tiny, folder, CPU, workers=Workers(rank, 2))
+        assert folder.exists() == (rank == 0)  # the leader alone writes
+        part, part_turn_deg, part_mirrored = follower.draw()
+        mirrors.add(part_mirrored)
+        for index, shard in enumerate((rank, rank + 2)):
+            here, there = (slice(at * pixels, (at + 1) * pixels) for at in (shard, index))
+            assert torch.equal(batch.scene.normals[here], part.scene.normals[there])
+            assert torch.equal(turn_deg[here], part_turn_deg[there])
+            lights = part.valid.shape[1]
+            assert torch.equal(
+                (batch.observations * batch.valid)[here, :lights],
+                (part.observations * part.valid)[there],
+            )
+    assert mirrors == {mirrored}
+    assert 0 < turn_deg.abs().max() <= tiny.turn_jitter_deg
+
+
+def test_half_of_the_batches_are_mirrored(tiny: TrainingConfig, tmp_path: Path) -> None:
+    trainer = Trainer(replace(tiny, batch_size=1, shards=1), tmp_path, CPU)
+    mirrored = []
+    for step in range(100):
+        trainer.clock.step = step
+        mirrored.append(trainer.draw()[2])
+    # Four standard deviations of the binomial.
+    assert sum(mirrored) == pytest.approx(50, abs=20)
+
+
+def test_the_paper_s_size_sees_its_pixels_as_they_are(tiny: TrainingConfig, tmp_path: Path) -> None:
+    config = replace(tiny, network=NetworkConfig(size="paper"), batch_size=4)
+    trainer = Trainer(config, tmp_path, CPU)
+    for step in range(8):
+        trainer.clock.step = step
+        _, turn_deg, mirrored = trainer.draw()
+        assert not turn_deg.any()
+        assert not mirrored
+
+
 def test_dropout_is_the_same_in_every_run_of_a_seed(tiny: TrainingConfig, tmp_path: Path) -> None:
-    config = replace(tiny, network=NetworkConfig(size="paper", map_size=32), batch_size=2)
+    config = replace(tiny, network=NetworkConfig(size="paper", map_size=32), batch_size=2, shards=1)
     one, other = Trainer(config, tmp_path / "one", CPU), Trainer(config, tmp_path / "other", CPU)
     first = one.step()[0]
     torch.rand(1000)  # somebody else draws from the global generator in between
@@ -151,11 +228,6 @@ def test_a_checkpoint_of_another_network(tiny: TrainingConfig, tmp_path: Path) -
         Trainer(replace(tiny, network=replace(tiny.network, width=10)), tmp_path, CPU, resume=True)
 
 
-def read_metrics(folder: Path) -> list[dict[str, str]]:
-    with (folder / METRICS).open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_run_writes_its_files(
     tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,54 +235,68 @@ def test_a_run_writes_its_files(
     seen: list[tuple[float, Metrics]] = []
     trainer = Trainer(replace(tiny, steps=10), tmp_path, CPU)
     last = trainer.run(lambda progress, metrics: seen.append((progress, metrics)))
+    # And the pictures, which are not drawn here.
     assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, "config.json", METRICS, WEIGHTS]
     assert [(progress, metrics.step) for progress, metrics in seen] == [(0.4, 4), (0.8, 8), (1.0, 10)]
     assert seen[-1][1] == last
-    rows = read_metrics(tmp_path)
-    assert list(rows[0]) == [field.name for field in fields(Metrics)]
-    assert [row["step"] for row in rows] == ["4", "8", "10"]
-    assert [row["pixels"] for row in rows] == ["64", "128", "160"]
+    assert last is not None
+    header = (tmp_path / METRICS).read_text().splitlines()[0]
+    assert header.split(",") == [field.name for field in fields(Metrics)]
+    rows = read_metrics(tmp_path / METRICS)
+    assert [row.step for row in rows] == [4, 8, 10]
+    assert [row.pixels for row in rows] == [64, 128, 160]
     # Validated when saved: here at the end alone, on the averaged weights that the weight file holds.
-    assert [bool(row["validation_deg"]) for row in rows] == [False, False, True]
+    assert [row.validation_deg is not None for row in rows] == [False, False, True]
     assert last.validation_deg is not None
     loaded = load_weights(tmp_path / WEIGHTS).network
-    again = validation_deg(loaded, validation_set(trainer.config, CPU))
+    again = validation_deg(loaded, trainer.validation)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
-    assert float(rows[-1]["loss"]) == pytest.approx(last.loss, rel=1e-5)
+    assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
     assert TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text())) == trainer.config
 
 
-def test_metrics_are_means_over_the_steps(tiny: TrainingConfig, tmp_path: Path) -> None:
-    expected = torch.stack([Trainer(tiny, tmp_path / "a", CPU).step() for _ in range(1)]).mean(dim=0)
-    last = Trainer(replace(tiny, steps=1), tmp_path / "b", CPU).run()
-    assert (last.loss, last.angle_deg, last.map_error) == pytest.approx(expected.tolist(), rel=1e-6)
-    steps = Trainer(tiny, tmp_path / "c", CPU)
-    means = torch.stack([steps.step() for _ in range(tiny.steps)]).mean(dim=0)
-    last = Trainer(tiny, tmp_path / "d", CPU).run()
-    assert (last.loss, last.angle_deg, last.map_error) == pytest.approx(means.tolist(), rel=1e-5)
+def summary(metrics: Metrics | None) -> list[float]:
+    assert metrics is not None
+    return [
+        metrics.loss, math.radians(metrics.angle_deg), metrics.map_error, metrics.masked_map_error,
+        metrics.symmetric or math.nan, metrics.asymmetric or math.nan,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.02])
+def test_metrics_are_means_over_the_steps(tiny: TrainingConfig, tmp_path: Path, weight: float) -> None:
+    config = replace(tiny, symmetric_weight=weight)
+    for steps in (1, config.steps):
+        trainer = Trainer(config, tmp_path / f"{steps} by hand", CPU)
+        means = torch.stack([trainer.step() for _ in range(steps)]).mean(dim=0)
+        last = Trainer(replace(config, steps=steps), tmp_path / f"{steps}", CPU).run()
+        assert summary(last) == pytest.approx(means.tolist(), rel=1e-6, nan_ok=True)
+        assert last is not None
+        assert (last.symmetric is None) == (last.asymmetric is None) == (weight == 0)
 
 
 def test_a_finished_run_can_be_lengthened_but_not_run_again(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(tiny, tmp_path, CPU).run()
     with pytest.raises(ModelError, match="the run is at its end already"):
         Trainer(tiny, tmp_path, CPU, resume=True).run()
-    longer = Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True)
-    assert longer.run().step == 9
-    assert [row["step"] for row in read_metrics(tmp_path)] == ["6", "9"]
+    last = Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True).run()
+    assert last is not None
+    assert last.step == 9
+    assert [row.step for row in read_metrics(tmp_path / METRICS)] == [6, 9]
 
 
 def test_lines_after_the_last_checkpoint_are_written_once(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(tiny, tmp_path, CPU).run()
     with (tmp_path / METRICS).open("a") as file:
-        file.write("8,128,0.1,0.001,0.5,9.0,0.1,\n10,160,0.1,0.0")  # the run was killed here
+        file.write("8,128,0.1,0.001,0.5,9.0,0.1,0.1,,,\n10,160,0.1,0.0")  # the run was killed here
     Trainer(replace(tiny, steps=10), tmp_path, CPU, resume=True).run()
-    assert [row["step"] for row in read_metrics(tmp_path)] == ["6", "10"]
+    assert [row.step for row in read_metrics(tmp_path / METRICS)] == [6, 10]
 
 
 def test_metrics_of_a_run_without_checkpoint_are_not_mixed_in(tiny: TrainingConfig, tmp_path: Path) -> None:
     (tmp_path / METRICS).write_text("step\n50\n")
     Trainer(tiny, tmp_path, CPU).run()
-    assert [row["step"] for row in read_metrics(tmp_path)] == ["6"]
+    assert [row.step for row in read_metrics(tmp_path / METRICS)] == [6]
 
 
 def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,17 +307,167 @@ def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path, monkeypatch: 
     trainer.clock.seconds = 0.3
     assert trainer.progress == pytest.approx(0.5)
     last = trainer.run()
+    assert last is not None
     assert last.step > 1
     assert trainer.clock.seconds >= 0.6
 
 
-def test_a_loss_that_is_not_finite_ends_the_run(tiny: TrainingConfig, tmp_path: Path) -> None:
-    trainer = Trainer(tiny, tmp_path, CPU)
-    trainer.step()
-    with torch.no_grad():
-        next(trainer.network.parameters()).fill_(torch.nan)
-    with pytest.raises(ModelError, match=r"the loss is nan at step 1\. Lower the learning rate\."):
+def poison(trainer: Trainer, what: str) -> None:
+    """Make the next loss, or its gradient alone, other than finite."""
+    parameter = next(trainer.network.ne_net.parameters())
+    if what == "loss":
+        original = trainer.source.draw
+
+        def draw(pixels: int) -> PixelBatch:
+            batch = original(pixels)
+            return replace(batch, observations=batch.observations * torch.nan)
+
+        trainer.source.draw = draw  # type: ignore[method-assign]
+    else:
+        parameter.register_hook(lambda gradient: gradient * math.inf)
+
+
+@pytest.mark.parametrize("what", ["loss", "gradient"])
+@pytest.mark.parametrize("updates", ["joint", "alternating"])
+def test_what_is_not_finite_ends_the_run_before_it_does_harm(
+    tiny: TrainingConfig, tmp_path: Path, what: str, updates: Any
+) -> None:
+    trainer = Trainer(replace(tiny, updates=updates), tmp_path, CPU)
+    losses(trainer, 2)
+    trainer.save()
+    files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    weights = [p.detach().clone() for p in (*trainer.network.parameters(), *trainer.average.parameters())]
+    poison(trainer, what)
+    with pytest.raises(
+        ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"
+    ):
         trainer.run()
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
+    after = (*trainer.network.parameters(), *trainer.average.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(weights, after, strict=True))
+    assert trainer.clock.step == 2
+    # The kept checkpoint goes on.
+    assert math.isfinite(losses(Trainer(trainer.config, tmp_path, CPU, resume=True), 1)[0])
+
+
+@pytest.mark.parametrize("refusal", ["full disk", "file size limit"])
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(
+    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: str
+) -> None:
+    Trainer(tiny, tmp_path, CPU).run()
+    before = {name: (tmp_path / name).read_bytes() for name in (CHECKPOINT, WEIGHTS)}
+    longer = Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if refusal == "full disk":
+
+        def full(handle: int, mode: str) -> Any:
+            os.close(handle)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr("splinecli.files.os.fdopen", full)
+        message = r"checkpoint\.safetensors: cannot be written \(No space left on device\)"
+    else:
+        message = r"checkpoint\.safetensors: cannot be written \(File too large\)"
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
+    try:
+        with pytest.raises(OutputError, match=message):
+            longer.run()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        monkeypatch.undo()
+    assert {name: (tmp_path / name).read_bytes() for name in (CHECKPOINT, WEIGHTS)} == before
+    assert not [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
+    assert Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True).clock.step == 6
+
+
+def test_at_most_a_minute_is_lost() -> None:
+    assert CHECKPOINT_SECONDS <= 60
+
+
+def test_checkpoints_come_by_the_clock(
+    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    readings = itertools.count()
+    monkeypatch.setattr("splinecli.training.loop.time.monotonic", lambda: next(readings) * 5.0)
+    trainer = Trainer(replace(tiny, steps=14), tmp_path, CPU)
+    saved: list[int] = []
+    save = trainer.save
+    monkeypatch.setattr(trainer, "save", lambda: (saved.append(trainer.clock.step), save()))
+    trainer.run()
+    # A step reads the clock twice, 10 s; so five steps are the first to take more than 45.
+    assert saved == [5, 10, 14]
+    assert [row.step for row in read_metrics(tmp_path / METRICS)] == saved
+
+
+def test_the_validation_pixels_are_the_same_when_taken_up(tiny: TrainingConfig, tmp_path: Path) -> None:
+    trainer = Trainer(tiny, tmp_path, CPU)
+    losses(trainer, 2)
+    trainer.save()
+    again = Trainer(tiny, tmp_path, CPU, resume=True)
+    assert torch.equal(again.validation.observations, trainer.validation.observations)
+    other = Trainer(replace(tiny, seed=1), tmp_path / "other", CPU)
+    assert not torch.equal(other.validation.scene.normals, trainer.validation.scene.normals)
+
+
+DRIVER = """
+import json, sys
+from pathlib import Path
+import torch
+from splinecli.training import loop
+from splinecli.training.config import TrainingConfig
+from splinecli.training.records import Records
+torch.set_num_threads(1)
+loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, loop.VALIDATION_PIXELS = 0.3, 3, 16
+Records.draw = lambda self, maps: None
+config = TrainingConfig.from_dict(json.loads(sys.argv[1]))
+loop.Trainer(config, Path(sys.argv[2]), torch.device("cpu"), resume=sys.argv[3] == "resume").run()
+"""
+
+
+def run_and_kill(config: TrainingConfig, folder: Path, start: str, seconds: float) -> None:
+    """Kill the run some time after it has written a checkpoint."""
+    path, before = folder / CHECKPOINT, (folder / CHECKPOINT).stat().st_mtime if start == "resume" else 0.0
+    driver = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, json.dumps(config.to_dict()), str(folder), start]
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not (path.exists() and path.stat().st_mtime > before):
+            assert driver.poll() is None, "the run ended by itself"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(seconds)
+    finally:
+        driver.kill()
+        assert driver.wait() == -signal.SIGKILL
+
+
+def test_a_killed_run_goes_on(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(tiny, batch_size=4, steps=10_000_000)
+    folder = tmp_path / "run"
+    run_and_kill(config, folder, "new", 0.17)
+    first = read_metrics(folder / METRICS)[0]
+    run_and_kill(config, folder, "resume", 0.41)
+    monkeypatch.setattr(loop, "REPORT_STEPS", 3)
+    monkeypatch.setattr(loop, "VALIDATION_PIXELS", 16)
+    taken_up = Trainer(config, folder, CPU, resume=True)
+    step = taken_up.clock.step
+    kept = [p.detach().clone() for p in taken_up.network.parameters()]
+    taken_up.config = replace(config, steps=step + 7)
+    taken_up.run()
+    rows = read_metrics(folder / METRICS)
+    assert rows[0] == first
+    steps = [row.step for row in rows]
+    # No line twice and none left out: each stands for the steps since the one before.
+    assert all(1 <= later - earlier <= 3 for earlier, later in itertools.pairwise([0, *steps]))
+    assert step in steps
+    assert steps[-1] == step + 7
+    assert [row.pixels for row in rows] == [4 * row.step for row in rows]
+    # What was taken up after two kills is where a run would be that nobody stopped.
+    whole = Trainer(config, tmp_path / "whole", CPU)
+    losses(whole, step)
+    expected = [p.detach() for p in whole.network.parameters()]
+    torch.testing.assert_close(kept, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path) -> None:
@@ -239,52 +475,15 @@ def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path
     expected = losses(plain, 3)
     found = []
     for _ in range(3):
-        validation_deg(checked.average, validation_set(tiny, CPU))
+        validation_deg(checked.average, checked.validation)
         found += losses(checked, 1)
     assert found == expected
-
-
-def test_validation_is_the_mean_angle_to_the_truth(tiny: TrainingConfig, tmp_path: Path) -> None:
-    network, batch = Trainer(tiny, tmp_path, CPU).network.eval(), validation_set(tiny, CPU)
-    assert (batch.valid.sum(dim=1) == tiny.pixels.usual_lights).all()
-    with torch.no_grad():
-        normals = network(batch.observations, batch.light_directions, batch.valid)
-    cosine = (normals.double() * batch.scene.normals).sum(dim=1).clamp(-1, 1)
-    assert validation_deg(network, batch) == pytest.approx(cosine.acos().rad2deg().mean().item(), abs=1e-3)
 
 
 def test_bfloat16_only_where_the_device_has_it(tiny: TrainingConfig, tmp_path: Path) -> None:
     config = replace(tiny, precision="bfloat16")
     assert Trainer(config, tmp_path / "a", CPU).bfloat16 == (choose_precision("auto", CPU) == "bfloat16")
     assert not Trainer(tiny, tmp_path / "b", CPU).bfloat16
-
-
-@pytest.mark.parametrize("mirror", [False, True])
-def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, tmp_path: Path, mirror: bool) -> None:
-    # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map there.
-    network = Trainer(tiny, tmp_path, CPU).network
-    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(40)
-    directions, inside = cell_directions()
-    lights = directions[inside][3::29]
-    observations = batch.scene.radiance(lights)
-    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.scene, torch.ones(40, 1))
-    # Without a turn beyond multiples of 90 degrees, centres stay centres.
-    cosine, sine = torch.zeros(40), torch.ones(40)
-    views = network.look(observations, lights)
-    dense, normals = truth_in_frame(seen, cosine, sine, views.scale, mirror)
-    turned = torch.stack((-lights[:, 1], lights[:, 0], lights[:, 2]), dim=1)
-    expected_normals = torch.stack(
-        (-seen.scene.normals[:, 1], *seen.scene.normals[:, [0, 2]].unbind(1)), dim=1
-    )
-    if mirror:
-        turned, expected_normals = (
-            vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals)
-        )
-    sparse = sparse_map(observations / views.scale, turned)
-    assert sparse.holds[0].sum() == len(lights)
-    torch.testing.assert_close(dense * sparse.holds, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
-    torch.testing.assert_close(normals, expected_normals)
-    assert dense.max() <= 1
 
 
 def test_the_average_follows_the_weights(tiny: TrainingConfig, tmp_path: Path) -> None:

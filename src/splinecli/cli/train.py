@@ -68,7 +68,7 @@ def train(
     """
     from splinecli.devices import choose_device
     from splinecli.training.config_files import parse_parameter
-    from splinecli.training.distributed import is_restarted, join_workers, leave_workers
+    from splinecli.training.distributed import is_to_go_on, join_workers, leave_workers
     from splinecli.training.loop import CHECKPOINT, WEIGHTS, Trainer
 
     if steps is not None and minutes is not None:
@@ -81,8 +81,8 @@ def train(
     changes += [parse_parameter(text) for text in param or []]
     if seed is not None:
         changes.append({"seed": seed})
-    # Started again by torchrun, after a worker failed: the same command goes on.
-    resume = resume or (is_restarted() and (output / CHECKPOINT).exists())
+    # Under torchrun's --max-restarts the same command begins a run and goes on with it.
+    resume = resume or (is_to_go_on() and (output / CHECKPOINT).exists())
     settings = _configure(output, preset, config, changes, resume=resume)
     if steps is not None:
         settings = replace(settings, steps=steps, minutes=0.0)

@@ -80,10 +80,11 @@ class TrainingConfig:
             raise ModelError(
                 f"training setting 'batch_size' is {self.batch_size}; expected a multiple of shards = {self.shards}"
             )
-        if self.pixels.min_lights > self.pixels.max_lights:
+        lights = self.pixels
+        if not lights.min_lights <= lights.usual_lights <= lights.max_lights:
             raise ModelError(
-                f"training setting 'min_lights' is {self.pixels.min_lights};"
-                f" expected at most max_lights = {self.pixels.max_lights}"
+                f"training settings min_lights, usual_lights, max_lights are {lights.min_lights},"
+                f" {lights.usual_lights}, {lights.max_lights}; expected them in rising order"
             )
         if self.network.grid != "even":
             raise ModelError(

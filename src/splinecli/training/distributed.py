@@ -8,14 +8,17 @@ clock.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
-from splinecli.errors import UsageError
+from splinecli.errors import ModelError, UsageError
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,8 @@ class Workers:
             return numbers
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         message = torch.cat([*(gradient.flatten() for gradient in gradients), numbers.to(gradients[0])])
-        dist.all_reduce(message)
+        with _losses_of_peers_named():
+            dist.all_reduce(message)
         message /= self.count
         sizes = [*(gradient.numel() for gradient in gradients), len(numbers)]
         *averaged, numbers_averaged = torch.split(message, sizes)
@@ -57,8 +61,22 @@ class Workers:
         if self.count == 1:
             return value
         shared = torch.tensor([value], dtype=torch.float64, device=device)
-        dist.broadcast(shared, src=0)
+        with _losses_of_peers_named():
+            dist.broadcast(shared, src=0)
         return float(shared.item())
+
+
+@contextmanager
+def _losses_of_peers_named() -> Iterator[None]:
+    """Raise ModelError where the others cannot be reached any more."""
+    try:
+        yield
+    except RuntimeError as error:
+        reason = (str(error).splitlines() or ["no reason given"])[0][:200]
+        raise ModelError(
+            f"another process of the run stopped ({reason})",
+            hint="Its own message says why; --resume goes on",
+        ) from error
 
 
 def is_launched() -> bool:
@@ -66,9 +84,12 @@ def is_launched() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ or int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
-def is_restarted() -> bool:
-    """Whether torchrun started it again after a worker failed: it then has to go on with the run."""
-    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+def is_to_go_on() -> bool:
+    """Whether torchrun was told to start processes again when one fails: they then go on with the run.
+
+    Not whether it just did so: after the failure of another machine's process it does not say so to this one's.
+    """
+    return int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0
 
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
@@ -79,7 +100,14 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(device)
     if not dist.is_initialized():
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        store, rank, count = next(rendezvous("env://"))
+        if os.environ.get("LOCAL_WORLD_SIZE") == str(count):
+            # torchrun keeps its store over a restart: the addresses of processes that are gone still stand in
+            # it. Only on one machine do all processes agree on the number of the attempt.
+            attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+            store = PrefixStore(f"splinecli attempt {attempt}", store)
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        dist.init_process_group(backend, store=store, rank=rank, world_size=count)
     return Workers(dist.get_rank(), dist.get_world_size()), device
 
 

@@ -58,7 +58,7 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
     centre = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
     y, x = torch.meshgrid(-centre, centre, indexing="ij")
     axis = normals[:, :2].to(maps.dtype)
-    axis = axis / (axis.square().sum(1, keepdim=True) + AXIS_LENGTH**2).sqrt()
+    axis = axis / axis.square().sum(1, keepdim=True).clamp(min=AXIS_LENGTH**2).sqrt()
     axis_x, axis_y = axis[:, 0, None, None], axis[:, 1, None, None]
     along = x * axis_x + y * axis_y
     # grid_sample counts rows downwards: -y.

@@ -29,6 +29,7 @@ from splinecli.files import check_writable, current_umask, refusals_as_output_er
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"
+_TEMPORARY = ".unfinished-"
 ARRAYS = ("observations", "normals", "light_directions", "mask")
 
 
@@ -91,6 +92,8 @@ class PixelSetWriter:
             self._entries = {entry.name: entry for entry in _entries(manifest, folder)}
         elif folder.is_dir() and any(folder.iterdir()):
             raise OutputError("is not empty and holds no pixel set", path=folder, hint="Choose another -o")
+        for left in folder.glob(f"{_TEMPORARY}*"):  # of a run that was killed while it wrote
+            shutil.rmtree(left, ignore_errors=True)
         self._write_manifest(complete=False)
 
     def __contains__(self, name: str) -> bool:
@@ -104,7 +107,10 @@ class PixelSetWriter:
     def add(self, name: str, scene: str, source: str, pixels: Pixels) -> None:
         """Write an entry. Raises OutputError, and then leaves nothing of it."""
         folder = self.folder / name
-        with refusals_as_output_errors(folder), tempfile.TemporaryDirectory(dir=self.folder) as temporary:
+        with (
+            refusals_as_output_errors(folder),
+            tempfile.TemporaryDirectory(prefix=_TEMPORARY, dir=self.folder) as temporary,
+        ):
             work = Path(temporary) / "entry"
             work.mkdir()
             for array in ARRAYS:
@@ -183,7 +189,8 @@ def _load(folder: Path) -> Pixels:
     for array in ARRAYS:
         path = folder / f"{array}.npy"
         try:
-            arrays.append(np.load(path, mmap_mode="r", allow_pickle=False))
+            # As plain arrays: every slice of a memmap object costs ten times as much.
+            arrays.append(np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)))
         except (OSError, ValueError) as error:
             raise InputError(f"cannot be read as an array ({error})", path=path) from error
     return Pixels(*arrays)

@@ -155,10 +155,9 @@ def _drop_lines_after(step: int, path: Path) -> None:
         return
     header, *lines = path.read_text("utf-8").splitlines() or [""]
     expected = ",".join(field.name for field in fields(Metrics))
-    numbers = [line.partition(",")[0] for line in lines]
-    kept = [
-        line for line, number in zip(lines, numbers, strict=True) if number.isdigit() and int(number) <= step
-    ]
+    # Of a line that was cut short, on a full disk, the step may lack its last digits.
+    whole = [line.split(",") for line in lines if line.count(",") == expected.count(",")]
+    kept = [",".join(values) for values in whole if values[0].isdigit() and int(values[0]) <= step]
     if kept and header == expected:
         write_text(path, "\n".join([header, *kept]) + "\n")
     else:  # of a run that ended before its first checkpoint, or of another version

@@ -111,9 +111,10 @@ class PixelSetSource:
     def _choose_lights(self, scene: SampledScene, counts: Tensor) -> tuple[Tensor, Tensor]:
         uniform = torch.rand(scene.known.shape, generator=self.generator, device=self.generator.device)
         largest = torch.rand(len(counts), 1, generator=self.generator, device=self.generator.device)
-        zenith_deg = torch.rad2deg(scene.light_directions[..., 2].clamp(-1, 1).acos())
-        beyond = (zenith_deg - (20 + 70 * largest)).clamp(min=0)
-        rank = torch.where(beyond > 0, 1 + beyond, uniform).masked_fill(~scene.known, torch.inf)
+        # As cosines, which fall as the angle grows.
+        lowest = torch.deg2rad(20 + 70 * largest).cos()
+        z = scene.light_directions[..., 2]
+        rank = torch.where(z >= lowest, uniform, 2 - z).masked_fill(~scene.known, torch.inf)
         order = rank.argsort(dim=1)[:, : int(counts.max())]
         chosen = torch.arange(order.shape[1], device=counts.device) < counts[:, None]
         return order, chosen & scene.known.gather(1, order)

@@ -1,0 +1,177 @@
+"""Configurations from files and the command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splinecli.errors import ModelError, UsageError
+from splinecli.training.config import GENERATOR, TrainingConfig, preset
+from splinecli.training.config_files import check_same_run, configure, parse_parameter, read_config_file
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, "utf-8")
+    return path
+
+
+def test_without_anything_it_is_compact() -> None:
+    assert configure() == preset("compact")
+    assert configure("paper") == preset("paper")
+    with pytest.raises(UsageError, match="no preset named 'huge'; expected one of compact, paper"):
+        configure("huge")
+
+
+def test_a_toml_file_over_a_preset(tmp_path: Path) -> None:
+    file = write(
+        tmp_path / "a.toml",
+        'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n',
+    )
+    paper = preset("paper")
+    expected = replace(
+        paper,
+        batch_size=64,
+        pixels=replace(paper.pixels, wall_share=0.3),
+        network=replace(paper.network, map_size=16),
+    )
+    assert configure(None, file) == expected
+    # A preset that is asked for by name comes before the file's.
+    compact = preset("compact")
+    assert configure("compact", file) == replace(
+        compact,
+        batch_size=64,
+        pixels=replace(compact.pixels, wall_share=0.3),
+        network=replace(compact.network, map_size=16),
+    )
+
+
+def test_the_config_of_a_run(tmp_path: Path) -> None:
+    config = replace(preset("paper"), seed=7, sources={"/data/set": 1.0, GENERATOR: 0.5}, minutes=2.0)
+    file = write(tmp_path / "config.json", json.dumps(config.to_dict(), indent=2))
+    assert configure(None, file) == config
+    assert configure("compact", file) == config  # it names every setting
+
+
+def test_presets_then_files_then_changes_in_their_order(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.toml", "seed = 1\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n")
+    changes: list[dict[str, Any]] = [
+        {"seed": 2, "pixels": {"ambient_share": 0.1}},
+        {"seed": 3},
+        {"pixels": {"ambient_share": 0.2}},
+    ]
+    config = configure(None, file, changes)
+    assert (config.seed, config.batch_size) == (3, 64)
+    assert (config.pixels.wall_share, config.pixels.ambient_share) == (0.3, 0.2)
+    assert configure(None, file, changes[:1]).seed == 2
+    assert configure(None, file).seed == 1
+
+
+def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
+    assert configure(None, file).sources == {"/data/a": 2.0, "/data/b": 1.0}
+    assert configure(None, file, [{"sources": {"/data/c": 1.0}}]).sources == {"/data/c": 1.0}
+    with pytest.raises(ModelError, match="gives no source a weight above 0"):
+        configure(None, None, [{"sources": {}}])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepz = 5", "unknown training setting 'stepz'"),
+        ("[pixels]\nwall = 0.3", "unknown training setting 'wall'"),
+        ("[network]\nwidht = 5", "unknown network setting 'widht'"),
+        ("network = 5", "training setting 'network' is 5; expected a table"),
+        ("batch_size = 6", "'batch_size' is 6; expected a multiple of shards = 4"),
+        ('sources = "set"', "'sources' is 'set'; expected a table"),
+        ("[sources]\ngenerator = -1", "the weight of source 'generator' is -1"),
+        ("steps = ", "is not TOML"),
+        ("steps = 5\nsteps = 6", "is not TOML"),
+    ],
+)
+def test_what_is_wrong_in_a_file_names_the_file(tmp_path: Path, text: str, message: str) -> None:
+    file = write(tmp_path / "a.toml", text)
+    with pytest.raises(ModelError, match=message) as caught:
+        configure(None, file, [{"seed": 1}])
+    assert caught.value.path == file
+
+
+def test_what_is_wrong_on_the_command_line_does_not(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.toml", "seed = 1")
+    with pytest.raises(ModelError, match="unknown training setting 'stepz'") as caught:
+        configure(None, file, [{"stepz": 1}])
+    assert caught.value.path is None
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"none\.toml: cannot be read \(No such file or directory\)"):
+        read_config_file(tmp_path / "none.toml")
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_config_file(tmp_path)
+    with pytest.raises(ModelError, match=r"a\.json: is not JSON"):
+        read_config_file(write(tmp_path / "a.json", "{"))
+    with pytest.raises(ModelError, match=r"a\.json: holds no table of settings"):
+        read_config_file(write(tmp_path / "a.json", "[1]"))
+    (tmp_path / "b.toml").write_bytes(b"preset = '\xff'")
+    with pytest.raises(ModelError, match=r"b\.toml: is not TOML"):
+        read_config_file(tmp_path / "b.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("seed=3", {"seed": 3}),
+        ("learning_rate=1e-3", {"learning_rate": 1e-3}),
+        ("pixels.cast_shadows=false", {"pixels": {"cast_shadows": False}}),
+        ("updates=alternating", {"updates": "alternating"}),
+        ('updates="alternating"', {"updates": "alternating"}),
+        ("network.size = paper", {"network": {"size": "paper"}}),
+        (
+            "pixels.measured_materials=/data/a=b.npz",
+            {"pixels": {"measured_materials": "/data/a=b.npz"}},
+        ),
+        ("a.b.c=1", {"a": {"b": {"c": 1}}}),
+        ("sources={generator = 1.0}", {"sources": {"generator": 1.0}}),
+        ("seed=", {"seed": ""}),
+    ],
+)
+def test_parameters(text: str, expected: dict[str, Any]) -> None:
+    assert parse_parameter(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "seed", "=3", "pixels.=3", ".seed=3", "a..b=1", " =1"])
+def test_bad_parameters(text: str) -> None:
+    with pytest.raises(UsageError, match="expected NAME=VALUE such as") as caught:
+        parse_parameter(text)
+    assert repr(text) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"seed": 1}, "seed = 0, this asks for 1"),
+        ({"network": replace(TrainingConfig().network, width=32)}, r"network\.width = 64, this asks for 32"),
+        ({"pixels": replace(TrainingConfig().pixels, wall_share=0.1)}, r"pixels\.wall_share = 0\.45"),
+        ({"sources": {"/data/set": 1.0}}, r"sources\.generator = 1\.0, this asks for None"),
+    ],
+)
+def test_another_run_is_refused_by_the_name_of_the_setting(
+    tmp_path: Path, changes: dict[str, Any], name: str
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(ModelError, match=f"the run was begun with {name}") as caught:
+        check_same_run(TrainingConfig(), replace(TrainingConfig(), **changes), path)
+    assert caught.value.path == path
+
+
+def test_another_preset_is_refused_by_its_network(tmp_path: Path) -> None:
+    # Of the many settings that differ, the one that says most.
+    with pytest.raises(ModelError, match=r"network\.size = 'compact', this asks for 'paper'"):
+        check_same_run(preset("compact"), preset("paper"), tmp_path)
+
+
+def test_the_length_of_a_run_may_change(tmp_path: Path) -> None:
+    check_same_run(TrainingConfig(), replace(TrainingConfig(), steps=9, minutes=3.0), tmp_path)

@@ -1,0 +1,195 @@
+"""Several processes: the losses of one, whatever the update; and a run that outlives one of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splinecli.errors import UsageError
+from splinecli.networks.weights import load_weights
+from splinecli.training import distributed
+from splinecli.training.config import TrainingConfig
+from splinecli.training.distributed import Workers, is_launched, is_to_go_on, join_workers
+from splinecli.training.loop import WEIGHTS, Trainer
+from splinecli.training.records import METRICS, read_metrics
+
+CPU = torch.device("cpu")
+STEPS = 6
+
+
+def environment(**more: str) -> dict[str, str]:
+    kept = {
+        name: text for name, text in os.environ.items() if not name.startswith(("TORCHELASTIC", "PYTEST"))
+    }
+    return kept | {"OMP_NUM_THREADS": "1"} | more
+
+
+def free_port() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return str(probe.getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    ("count", "total", "shards"), [(1, 4, [[0, 1, 2, 3]]), (2, 4, [[0, 2], [1, 3]]), (3, 3, [[0], [1], [2]])]
+)
+def test_every_shard_is_somebody_s(count: int, total: int, shards: list[list[int]]) -> None:
+    assert [list(Workers(rank, count).shards(total)) for rank in range(count)] == shards
+    assert [Workers(rank, count).leads for rank in range(count)] == [True] + [False] * (count - 1)
+
+
+def test_shards_that_cannot_be_shared_out(tiny: TrainingConfig, tmp_path: Path) -> None:
+    message = r"3 processes cannot share the 4 shards of a batch evenly\. Give --param shards=3, or start"
+    with pytest.raises(UsageError, match=message):
+        Trainer(tiny, tmp_path / "run", CPU, workers=Workers(0, 3))
+    assert not (tmp_path / "run").exists()
+
+
+def test_alone_nothing_is_exchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("WORLD_SIZE", "TORCHELASTIC_RUN_ID", "TORCHELASTIC_MAX_RESTARTS"):
+        monkeypatch.delenv(name, raising=False)
+    assert not is_launched()
+    assert not is_to_go_on()
+    assert join_workers(CPU) == (Workers(0, 1), CPU)
+    numbers = torch.ones(6)
+    assert Workers().average([], numbers) is numbers
+    assert Workers().agree(1 / 3, CPU) == 1 / 3
+
+
+def test_torchrun_s_signs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    assert not is_launched()
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert is_launched()
+    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
+    assert not is_to_go_on()
+    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "1")
+    assert is_to_go_on()
+
+
+def test_a_restart_never_meets_the_addresses_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    # torchrun's store outlives the processes; who finds an old address in it waits for nobody.
+    kept, stores = torch.distributed.HashStore(), []
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    monkeypatch.setattr(distributed, "rendezvous", lambda url: iter([(kept, 1, 2)]))
+    monkeypatch.setattr(
+        torch.distributed, "init_process_group", lambda backend, *, store, **_: stores.append(store)
+    )
+    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    for attempt in range(2):
+        monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", str(attempt))
+        assert join_workers(CPU) == (Workers(1, 2), CPU)
+        assert not stores[attempt].check(["address"])
+        stores[attempt].set("address", "here")
+
+
+WORKER = """
+import json, sys
+from pathlib import Path
+import torch
+from splinecli.training import loop
+from splinecli.training.config import TrainingConfig
+from splinecli.training.distributed import join_workers, leave_workers
+loop.VALIDATION_PIXELS = 16
+workers, device = join_workers(torch.device("cpu"))
+assert workers.agree(7.0 + workers.rank, device) == 7.0
+for name, values in json.loads(Path("configs.json").read_text()).items():
+    trainer = loop.Trainer(TrainingConfig.from_dict(values), Path(name), device, workers=workers)
+    losses = torch.stack([trainer.step() for _ in range(int(sys.argv[1]))])
+    torch.save((losses, trainer.network.state_dict()), f"{name} {workers.rank}.pt")
+leave_workers()
+"""
+
+
+def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Path) -> None:
+    config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-4, ne_net_updates=2)
+    configs = {"joint": config, "alternating": replace(config, updates="alternating")}
+    text = json.dumps({name: values.to_dict() for name, values in configs.items()})
+    (tmp_path / "configs.json").write_text(text)
+    address = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", WORKER, str(STEPS)], cwd=tmp_path, env=environment(RANK=rank, **address)
+        )
+        for rank in "01"
+    ]
+    try:
+        assert [process.wait(timeout=100) for process in processes] == [0, 0]
+    finally:
+        for process in processes:
+            process.kill()
+    for name, values in configs.items():
+        alone = Trainer(values, tmp_path / f"{name} alone", CPU)
+        expected = torch.stack([alone.step() for _ in range(STEPS)])
+        weights = alone.network.state_dict()
+        states = []
+        for rank in range(2):
+            losses, state = torch.load(tmp_path / f"{name} {rank}.pt", weights_only=True)
+            # Sums over the pixels are taken in another order: float32's rounding.
+            torch.testing.assert_close(losses, expected, rtol=1e-5, atol=0, equal_nan=True)
+            assert state.keys() == weights.keys()
+            states.append(state)
+            # Adam divides by the gradient's size, so where that is next to nothing rounding shows.
+            torch.testing.assert_close(state, dict(weights), rtol=1e-3, atol=1e-5)
+        assert all(torch.equal(states[0][key], states[1][key]) for key in weights)
+        # Of two, the leader alone writes.
+        assert (tmp_path / name / "config.json").exists()
+
+
+FAILING = """
+import os, signal, sys
+from splinecli.cli.main import main
+from splinecli.training import loop
+from splinecli.training.records import Records
+loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, loop.VALIDATION_PIXELS = 0.05, 5, 16
+Records.draw = lambda self, maps: None
+step = loop.Trainer.step
+def failing(self):
+    saved = (self.folder / loop.CHECKPOINT).exists()
+    if self.workers.rank == 1 and saved and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0":
+        open("killed", "w").close()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(self)
+loop.Trainer.step = failing
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_run_outlives_one_of_its_processes(tmp_path: Path) -> None:
+    # On the processor, one process of two is killed after the first checkpoint; torchrun starts both again.
+    (tmp_path / "worker.py").write_text(FAILING)
+    steps = 60
+    settings = ["network.width=8", "network.li_blocks=1", "network.ne_blocks=1", "network.head_width=8"]
+    settings += ["batch_size=8", "precision=float32"]
+    options = [word for setting in settings for word in ("--param", setting)]
+    torchrun = subprocess.Popen(
+        [
+            sys.executable, "-m", "torch.distributed.run", "--standalone", "--max-restarts", "1",
+            "--nproc-per-node", "2", "worker.py",
+            "train", "-o", "run", "--steps", str(steps), "--device", "cpu", *options,
+        ],
+        cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        out, err = torchrun.communicate(timeout=100)
+    finally:
+        torchrun.terminate()  # which it passes on to its workers
+        torchrun.wait()
+    assert torchrun.returncode == 0, err
+    assert out == "run/weights.safetensors\n"
+    rows = read_metrics(tmp_path / "run" / METRICS)
+    assert rows[-1].step == steps
+    assert sorted({row.step for row in rows}) == [row.step for row in rows]
+    assert rows[0].step < steps  # the lines of before are still there
+    assert load_weights(tmp_path / "run" / WEIGHTS).network.config.width == 8
+    assert (tmp_path / "killed").exists()

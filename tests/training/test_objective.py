@@ -1,0 +1,255 @@
+"""What is minimised: which terms, by which weights, and whose parameters they move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.spline_net import SplineNet
+from splinecli.observation_map import cell_directions, sparse_map
+from splinecli.synthesis.batches import PixelBatch, join_batches
+from splinecli.synthesis.pixels import PixelGenerator
+from splinecli.training import objective
+from splinecli.training.config import TrainingConfig, preset
+from splinecli.training.loop import Trainer
+from splinecli.training.losses import asymmetric_loss, asymmetries, symmetric_loss
+from splinecli.training.objective import Part, compute_losses, part_of_step, truth_in_frame
+
+CPU = torch.device("cpu")
+SILENT = {"angle_weight": 0.0, "map_weight": 0.0, "masked_weight": 0.0}
+
+
+@pytest.fixture
+def network(tiny: TrainingConfig) -> SplineNet:
+    """Random in all layers: the last ones start at zero and let no gradient through."""
+    torch.manual_seed(0)
+    network = SplineNet(tiny.network)
+    for parameter in network.parameters():
+        if not parameter.any():
+            nn.init.normal_(parameter, std=0.1)
+    return network
+
+
+@pytest.fixture
+def batch(tiny: TrainingConfig) -> PixelBatch:
+    return PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(12)
+
+
+def moved(module: nn.Module) -> bool:
+    """Whether any parameter has a gradient other than zero."""
+    return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
+
+
+def test_five_steps_for_ne_net_then_one_for_li_net(tiny: TrainingConfig) -> None:
+    alternating = replace(tiny, updates="alternating")
+    parts = [part_of_step(alternating, step) for step in range(12)]
+    assert parts == (["ne_net"] * 5 + ["li_net"]) * 2
+    assert [part_of_step(replace(alternating, ne_net_updates=1), step) for step in range(3)] == [
+        "ne_net", "li_net", "ne_net",
+    ]  # fmt: skip
+    assert {part_of_step(tiny, step) for step in range(12)} == {"both"}
+    assert preset("paper").updates == "alternating"
+    assert preset("paper").ne_net_updates == 5
+
+
+@pytest.mark.parametrize("part", ["both", "ne_net", "li_net"])
+def test_only_the_part_gets_gradients(
+    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, part: Part
+) -> None:
+    config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-4)
+    compute_losses(network, batch, config, part=part).total.backward()
+    for name in ("li_net", "ne_net"):
+        parameters = list(getattr(network, name).parameters())
+        if part in ("both", name):
+            assert all(p.grad is not None for p in parameters)
+            assert moved(getattr(network, name))
+        else:
+            assert all(p.grad is None for p in parameters)
+    assert all(p.requires_grad for p in network.parameters())
+
+
+def test_what_was_frozen_before_stays_frozen_also_after_a_failure(
+    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frozen = next(network.ne_net.parameters()).requires_grad_(False)
+    states = [p.requires_grad for p in network.parameters()]
+    compute_losses(network, batch, tiny, part="li_net")
+    assert [p.requires_grad for p in network.parameters()] == states
+
+    def fail(*_: object) -> Tensor:
+        assert not any(p.requires_grad for p in network.ne_net.parameters())
+        raise RuntimeError("in the middle")
+
+    monkeypatch.setattr(network, "estimate", fail)
+    with pytest.raises(RuntimeError, match="in the middle"):
+        compute_losses(network, batch, tiny, part="li_net")
+    assert [p.requires_grad for p in network.parameters()] == states
+    assert not frozen.requires_grad
+
+
+def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny: TrainingConfig, tmp_path: Path) -> None:
+    config = replace(
+        tiny, updates="alternating", ne_net_updates=2, weight_decay=0.1, learning_rate=1e-2,
+        symmetric_weight=0.02, asymmetric_weight=1e-4,
+    )  # fmt: skip
+    trainer = Trainer(config, tmp_path, CPU)
+
+    def state(name: str) -> list[Tensor]:
+        return [p.detach().clone() for p in getattr(trainer.network, name).parameters()]
+
+    # Momentum of earlier steps and weight decay must not move what is fixed, either.
+    for step in range(7):
+        fixed, updated = ("ne_net", "li_net") if step % 3 == 2 else ("li_net", "ne_net")
+        before, old = state(fixed), state(updated)
+        trainer.step()
+        assert all(torch.equal(a, b) for a, b in zip(before, state(fixed), strict=True))
+        assert not all(torch.equal(a, b) for a, b in zip(old, state(updated), strict=True))
+
+
+@pytest.mark.parametrize("weight", ["symmetric_weight", "asymmetric_weight"])
+def test_the_special_terms_reach_ne_net_through_its_normals(
+    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, weight: str
+) -> None:
+    config = replace(tiny, **SILENT, **{weight: 1.0})
+    compute_losses(network, batch, config, part="ne_net").total.backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.ne_net.parameters())
+    assert moved(network.ne_net)
+
+
+def test_the_angle_reaches_li_net_through_the_fixed_ne_net(
+    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch
+) -> None:
+    config = replace(tiny, **SILENT | {"angle_weight": 1.0})
+    compute_losses(network, batch, config, part="li_net").total.backward()
+    assert moved(network.li_net)
+    assert not moved(network.ne_net)
+
+
+@pytest.mark.parametrize("part", ["both", "ne_net", "li_net"])
+@pytest.mark.parametrize(("li_net_norm", "ne_net_norm"), [("mean", "sum"), ("sum", "mean")])
+def test_the_total_is_the_weighted_sum_of_its_terms(
+    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, part: Part,
+    li_net_norm: str, ne_net_norm: str,
+) -> None:  # fmt: skip
+    config = replace(
+        tiny, angle_weight=0.7, map_weight=0.5, masked_weight=0.3, symmetric_weight=0.02,
+        asymmetric_weight=1e-3, eta=2.0, lambda_c=10.0, li_net_norm=li_net_norm, ne_net_norm=ne_net_norm,
+    )  # fmt: skip
+    with torch.no_grad():
+        found = compute_losses(network, batch, config, part=part)
+        views = network.look(batch.observations, batch.light_directions, batch.valid)
+        dense_truth, normal_truth = truth_in_frame(batch, views, size=32)
+        dense = network.interpolate(views)
+        normals = network.estimate(views, dense)
+        cells = cell_directions(32)[1].sum()
+        # Each term by the paper's formulas (eqs. 5 and 8).
+        error = (dense - dense_truth.values).abs()
+        on_map = (error * dense_truth.known).sum((1, 2, 3))
+        masked = (error * dense_truth.known * views.holds).sum((1, 2, 3))
+        seen = (dense_truth.known * views.holds).sum((1, 2, 3))
+        angle = (normals * normal_truth).sum(1).clamp(-1, 1).acos().mean()
+        special = {}
+        for name, maps, axes, norm in (
+            ("li_net", dense, normal_truth, li_net_norm),
+            ("ne_net", dense_truth.values, normals, ne_net_norm),
+        ):
+            fine, coarse = asymmetries(maps, axes, dense_truth.filled)
+            share = 1 / cells if norm == "mean" else 1.0
+            if part in ("both", name):
+                both = symmetric_loss(fine), asymmetric_loss(fine, coarse, eta=2.0, lambda_c=10.0)
+                special[name] = share * torch.stack(both)
+        symmetric, asymmetric = torch.stack(list(special.values())).sum(0)
+    assert found.angle.item() == pytest.approx(angle.item(), abs=1e-4)
+    assert found.on_map.item() == pytest.approx((on_map / cells).mean().item(), rel=1e-5)
+    assert found.masked.item() == pytest.approx((masked / seen).mean().item(), rel=1e-5)
+    assert found.symmetric.item() == pytest.approx(symmetric.item(), rel=1e-5)
+    assert found.asymmetric.item() == pytest.approx(asymmetric.item(), rel=1e-5)
+    total = 0.7 * found.angle + 0.02 * symmetric + 1e-3 * asymmetric
+    if part != "ne_net":
+        total += 0.5 * (on_map if li_net_norm == "sum" else on_map / cells).mean()
+        total += 0.3 * (masked if li_net_norm == "sum" else masked / seen).mean()
+    assert found.total.item() == pytest.approx(total.item(), rel=1e-5)
+
+
+def test_special_terms_without_weight_are_not_computed(
+    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Callable[..., object]] = []
+    monkeypatch.setattr(objective, "asymmetries", lambda *args: calls.append(args) or asymmetries(*args))
+    losses = compute_losses(network, batch, tiny)
+    assert not calls
+    assert losses.symmetric.isnan()
+    assert losses.asymmetric.isnan()
+    assert losses.total.isfinite()
+    compute_losses(network, batch, replace(tiny, symmetric_weight=1.0))
+    assert len(calls) == 2
+
+
+def test_halves_of_a_batch_have_its_losses_as_their_mean(tiny: TrainingConfig, network: SplineNet) -> None:
+    # What training by several processes rests on.
+    generator = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0))
+    halves = [generator.draw(6), generator.draw(6)]
+    config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-3)
+    with torch.no_grad():
+        parts = [torch.stack(compute_losses(network, half, config)) for half in halves]
+        whole = torch.stack(compute_losses(network, join_batches(halves), config))
+    torch.testing.assert_close((parts[0] + parts[1]) / 2, whole)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: bool) -> None:
+    # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map there.
+    network = SplineNet(tiny.network)
+    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(40)
+    directions, inside = cell_directions()
+    lights = directions[inside][3::29]
+    exposure = torch.linspace(0.3, 2, 40)[:, None]
+    observations = batch.scene.radiance(lights) * exposure
+    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.scene, exposure)
+    # Without a turn beyond multiples of 90 degrees, centres stay centres.
+    views = network.look(observations, lights)._replace(
+        cosine=torch.zeros(40), sine=torch.ones(40), mirrored=mirror
+    )
+    dense, normals = truth_in_frame(seen, views, size=32)
+    turned = torch.stack((-lights[:, 1], lights[:, 0], lights[:, 2]), dim=1)
+    expected_normals = torch.stack(
+        (-seen.scene.normals[:, 1], *seen.scene.normals[:, [0, 2]].unbind(1)), dim=1
+    )
+    if mirror:
+        turned, expected_normals = (
+            vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals)
+        )
+    sparse = sparse_map(observations / views.scale, turned)
+    assert sparse.holds[0].sum() == len(lights)
+    torch.testing.assert_close(dense.values * sparse.holds, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(normals, expected_normals)
+    assert dense.values.max() == 1  # highlights that no light has hit are cut
+    assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))
+    assert torch.equal(dense.filled, dense.known)
+
+
+def test_truth_and_views_share_any_turn(tiny: TrainingConfig) -> None:
+    # At any turn: a matte scene's dense map is that of its turned normal.
+    network = SplineNet(replace(tiny.network, map_size=16))
+    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(5)
+    turn_deg = torch.tensor([0.0, 10.0, -35.0, 90.0, 200.0])
+    views = network.look(batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg)
+    dense, normals = truth_in_frame(batch, views, size=16)
+    azimuth = torch.atan2(batch.scene.normals[:, 1], batch.scene.normals[:, 0])
+    turned = azimuth + torch.atan2(views.sine, views.cosine)
+    torch.testing.assert_close(torch.cos(torch.atan2(normals[:, 1], normals[:, 0]) - turned), torch.ones(5))
+    torch.testing.assert_close(normals[:, 2], batch.scene.normals[:, 2])
+    assert dense.values.shape == (5, 1, 16, 16)
+
+
+def test_all_terms_of_the_paper_s_preset_are_finite(tiny: TrainingConfig) -> None:
+    network = SplineNet(NetworkConfig(size="paper"))
+    few = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(2)
+    losses = compute_losses(network, few, preset("paper"), part="li_net")
+    assert all(torch.isfinite(loss) for loss in losses)
