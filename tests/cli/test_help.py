@@ -13,7 +13,10 @@ from splinecli.cli.man import man_page
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("command", ["", "infer", "evaluate", "train", "import-weights"])
+COMMANDS = ["infer", "evaluate", "prepare", "train", "import-weights"]
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_text(command, run, golden):
     result = run(*filter(None, [command]), "--help")
     assert (result.code, result.err) == (0, "")
@@ -27,7 +30,7 @@ def test_man_page_is_up_to_date():
 
 def test_man_page_names_every_option(run):
     page = man_page().replace("\\-", "-")
-    for command in ("infer", "evaluate", "train", "import-weights"):
+    for command in COMMANDS:
         options = [word for word in run(command, "--help").out.split() if word.startswith("--")]
         assert options
         for option in options:

@@ -48,6 +48,8 @@ EXAMPLES = (
         "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
         "Methods compared.",
     ),
+    ("splinecli prepare --scenes 6 -o set", "A pixel set of six rendered scenes in three materials."),
+    ("splinecli train set --preset compact --steps 300 -o run", "A short training on it."),
     (
         "splinecli train -o runs/mine --minutes 90",
         "New weights; then --weights runs/mine/weights.safetensors.",

@@ -24,9 +24,7 @@ def prepare(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="SET", help="Folder of the pixel set.")],
     sources: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="[SOURCE]...", help="Captures with ground truth, folders of them, CyclesPS trees."
-        ),
+        typer.Argument(metavar="SOURCE", help="Captures with ground truth, folders of them, CyclesPS trees."),
     ] = None,
     scenes: Annotated[int, typer.Option(metavar="N", min=0, help="Render N scenes.")] = 0,
     mesh: Annotated[

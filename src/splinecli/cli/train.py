@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def train(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the run.")],
     sets: Annotated[
-        list[Path] | None, typer.Argument(metavar="[SET]...", help="Pixel sets made by 'splinecli prepare'.")
+        list[Path] | None, typer.Argument(metavar="SET", help="Pixel sets made by 'splinecli prepare'.")
     ] = None,
     preset: Annotated[
         str | None, typer.Option(metavar="NAME", help="compact or paper. [default: compact]")
