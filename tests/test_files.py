@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import OutputError
-from splinecli.files import write_bytes, write_text
+from splinecli.files import held_folder, write_bytes, write_text
 
 
 def names_in(folder: Path) -> list[str]:
@@ -65,3 +65,27 @@ def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: 
             write_bytes(path, b"new")
         assert path.read_bytes() == b"old"
         assert names_in(tmp_path) == ["out.bin"]
+
+
+def test_a_folder_is_written_into_by_one_at_a_time(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl", reason="this system has no such locks")
+    folder = tmp_path / "run"
+    with held_folder(folder):
+        with (
+            pytest.raises(OutputError, match=r"run: another splinecli is writing into it\. Wait for it"),
+            held_folder(folder),
+        ):
+            pytest.fail("two at once")
+        (folder / "content").touch()
+    with held_folder(folder):
+        assert (folder / "content").exists()
+
+
+def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), held_folder(tmp_path / "new"):
+        raise ZeroDivisionError
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "old").mkdir()
+    with pytest.raises(ZeroDivisionError), held_folder(tmp_path / "old"):
+        raise ZeroDivisionError
+    assert (tmp_path / "old").exists()

@@ -7,8 +7,12 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from splinecli.errors import OutputError
+
+LOCK = ".lock"
+"""A file in a folder that one process at a time writes into."""
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -54,6 +58,42 @@ def check_writable(folder: Path) -> None:
         )
     if not os.access(place, os.W_OK | os.X_OK):
         raise OutputError("may not be written into", path=place, hint="Choose another place with -o")
+
+
+@contextmanager
+def held_folder(folder: Path) -> Iterator[None]:
+    """Make the folder and keep other processes of splinecli from writing into it. Raises OutputError.
+
+    A folder that was made for what then failed, and is still empty, goes again.
+    """
+    made = not folder.exists()
+    with refusals_as_output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK).open("a")
+    try:
+        _lock(lock, folder)
+        yield
+    except BaseException:
+        if made and [path.name for path in folder.iterdir()] == [LOCK]:
+            (folder / LOCK).unlink()
+            folder.rmdir()
+        raise
+    finally:
+        # Otherwise the file stays: without it two processes could hold locks on two files of one name.
+        lock.close()
+
+
+def _lock(file: IO[str], folder: Path) -> None:
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise OutputError(
+            "another splinecli is writing into it", path=folder, hint="Wait for it, or choose another -o"
+        ) from error
 
 
 def write_text(path: Path, content: str) -> None:

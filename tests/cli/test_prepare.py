@@ -88,10 +88,11 @@ def test_given_again_it_goes_on(run, make_capture):
     one, two = make_capture("one"), make_capture("two")
     shutil.move(two / "image3.png", "hidden.png")
     result = run("prepare", one, two, "-o", "set")
-    assert (result.code, result.out) == (3, "")
+    # The good one is there; the bad one is named.
+    assert result.code == 3
+    assert result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
     assert "two" in result.err
     before = Path("set/one/observations.npy").stat()
-    assert run("train", "set", "-o", "run", "--steps", 1).code == 3  # unfinished
     shutil.move("hidden.png", two / "image3.png")
     assert run("prepare", one, two, "-o", "set").code == 0
     assert Path("set/one/observations.npy").stat().st_mtime_ns == before.st_mtime_ns
@@ -104,8 +105,28 @@ def test_given_again_it_goes_on(run, make_capture):
 def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     capture = make_capture("a")
     shutil.copytree(capture, "b/a")
-    assert run("prepare", capture, "b", "-o", "set", "--quiet").code == 0
-    assert Path("set/a-2/normals.npy").exists()
+    assert run("prepare", capture, "b", capture, "-o", "set", "--quiet").code == 0
+    assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
+    # In another order they keep their names.
+    before = [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")]
+    assert run("prepare", "b", capture, "-o", "set", "--quiet").code == 0
+    assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
+    assert [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")] == before
+
+
+def test_another_capture_of_a_name_joins_later_under_another(run, make_capture):
+    capture = make_capture("a")
+    shutil.copytree(capture, "b/a")
+    run("prepare", capture, "-o", "set", "--quiet")
+    assert run("prepare", "b/a", "-o", "set").err == "a-2: 448 pixels, 8 lights, b/a\n"
+
+
+def test_a_capture_that_changed_is_not_taken_for_what_it_was(run, capture):
+    run("prepare", capture, "-o", "set", "--quiet")
+    np.save(capture / "normals_gt.npy", np.load(capture / "normals_gt.npy")[::-1])
+    result = run("prepare", capture, "-o", "set")
+    assert (result.code, result.out) == (5, "")
+    assert "the entry sphere was made with files = " in result.err
 
 
 @pytest.fixture
@@ -126,7 +147,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
     assert result.out.startswith("set: 6 entries of 2 scenes, ")
     assert result.err.count(", 20 lights, rendered: ") == 6
     for kind in ("diffuse", "specular", "metallic"):
-        found = arrays(f"scene0000-{kind}")
+        found = arrays(f"cube-{kind}")
         assert found["observations"].dtype == np.float16
         assert found["observations"].shape == (found["mask"].sum(), 20)
         assert (found["observations"] >= 0).all() and found["observations"].max() > 0
@@ -135,15 +156,24 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
     normals = np.zeros((16, 16, 3))
     normals[found["mask"]] = found["normals"]
     assert normals[7, 7, 2] > 0.9
-    before = Path("set/scene0001-diffuse/observations.npy").read_bytes()
+    before = Path("set/scene0000-diffuse/observations.npy").read_bytes()
     # More scenes join the set, and those that are there stay.
     assert run(*arguments, "--scenes", 2, "--quiet").code == 0
-    assert Path("set/scene0001-diffuse/observations.npy").read_bytes() == before
-    assert Path("set/scene0002-diffuse").is_dir()
+    assert Path("set/scene0000-diffuse/observations.npy").read_bytes() == before
+    assert Path("set/scene0001-diffuse").is_dir()
     refused = run(*arguments, "--scenes", 2, "--seed", 1)
     assert (refused.code, refused.err) == (
         5,
-        "splinecli: set: holds a pixel set made in another way. Choose another -o.\n",
+        "splinecli: set: the entry cube-diffuse was made with seed = 0, this asks for 1. Choose another -o.\n",
+    )
+
+
+def test_a_mesh_that_the_camera_cannot_see(run, cube):
+    Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
+    result = run("prepare", "--mesh", "back.obj", "--size", 16, "--lights", 20, "-o", "set")
+    assert (result.code, result.out) == (3, "")
+    assert result.err.startswith(
+        "splinecli: back.obj: the camera sees nothing of it. The camera looks along -z"
     )
 
 
@@ -174,7 +204,7 @@ def test_refusals(run, make_capture, cycles_tree, golden):
         (2, ["-o", "set"]),
         (3, ["missing", "-o", "set"]),
         (3, [blind, "-o", "set"]),
-        (3, ["cycles", "-o", "set2"]),
+        (3, ["cycles/PRPS/Turtle/images_metallic", "-o", "set2"]),
         (5, [make_capture("good"), "-o", "full"]),
         (3, ["--mesh", "missing.ply", "-o", "set3"]),
         (2, ["--scenes", -1, "-o", "set3"]),

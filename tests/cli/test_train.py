@@ -48,7 +48,7 @@ def rows() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-FILES = {
+FILES = {".lock",
     "weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv", "curves.png", "maps.png",
 }  # fmt: skip
 
@@ -63,7 +63,7 @@ def write_set(folder: str, *, finished: bool = True) -> None:
     from splinecli.training.pixel_sets import Pixels, PixelSetWriter
 
     random = np.random.default_rng(0)
-    writer = PixelSetWriter(Path(folder), {"by": "hand"})
+    writer = PixelSetWriter(Path(folder))
     for scene in "abc":
         normals, lights = random.normal(size=(50, 3)), random.normal(size=(14, 3))
         for vectors in (normals, lights):
@@ -71,7 +71,7 @@ def write_set(folder: str, *, finished: bool = True) -> None:
             vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         observations = (normals @ lights.T).clip(0)
         arrays = [array.astype(np.float32) for array in (observations, normals, lights)]
-        writer.add(scene, scene, "a test", Pixels(*arrays, np.ones((5, 10), bool)))
+        writer.add(scene, scene, "a test", {"by": "hand"}, Pixels(*arrays, np.ones((5, 10), bool)))
     if finished:
         writer.finish()
 

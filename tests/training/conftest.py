@@ -86,9 +86,11 @@ def make_set(tmp_path: Path) -> MakeSet:
         ),
         dtype: DTypeLike = np.float32,
     ) -> PixelSet:
-        writer = PixelSetWriter(tmp_path / name, {"by": "hand"})
+        writer = PixelSetWriter(tmp_path / name)
         for index, (entry, scene, pixels, lights) in enumerate(entries):
-            writer.add(entry, scene, "a test", matte_pixels(pixels, lights, seed=index, dtype=dtype))
+            writer.add(
+                entry, scene, "a test", {"by": "hand"}, matte_pixels(pixels, lights, seed=index, dtype=dtype)
+            )
         return writer.finish()
 
     return make

@@ -29,7 +29,7 @@ def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
 def test_everything_comes_back(trainer: Trainer, tiny: TrainingConfig, tmp_path: Path) -> None:
     assert read_checkpoint_config(tmp_path / CHECKPOINT) == tiny
     other = Trainer(tiny, tmp_path / "other", CPU)
-    clock = load_checkpoint(tmp_path / CHECKPOINT, other.network, other.average, other.optimizer)
+    clock = load_checkpoint(tmp_path / CHECKPOINT, other.network, other.average, other.optimizer, {})
     assert clock == trainer.clock == Clock(step=1, pixels=16, seconds=trainer.clock.seconds)
     for name in ("network", "average"):
         for key, tensor in getattr(trainer, name).state_dict().items():

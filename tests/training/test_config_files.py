@@ -11,7 +11,7 @@ import pytest
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
-from splinecli.training.config_files import check_same_run, configure, parse_parameter, read_config_file
+from splinecli.training.config_files import configure, configure_resumed, parse_parameter, read_config_file
 
 
 def write(path: Path, text: str) -> Path:
@@ -150,28 +150,46 @@ def test_bad_parameters(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "name"),
+    ("change", "message"),
     [
         ({"seed": 1}, "seed = 0, this asks for 1"),
-        ({"network": replace(TrainingConfig().network, width=32)}, r"network\.width = 64, this asks for 32"),
-        ({"pixels": replace(TrainingConfig().pixels, wall_share=0.1)}, r"pixels\.wall_share = 0\.45"),
-        ({"sources": {"/data/set": 1.0}}, r"sources\.generator = 1\.0, this asks for None"),
+        ({"network": {"width": 32}}, r"network\.width = 64, this asks for 32"),
+        ({"pixels": {"wall_share": 0.1}}, r"pixels\.wall_share = 0\.45"),
+        ({"sources": {"/data/set": 1.0}}, r"sources\./data/set = None, this asks for 1\.0"),
     ],
 )
 def test_another_run_is_refused_by_the_name_of_the_setting(
-    tmp_path: Path, changes: dict[str, Any], name: str
+    tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    with pytest.raises(ModelError, match=f"the run was begun with {name}") as caught:
-        check_same_run(TrainingConfig(), replace(TrainingConfig(), **changes), path)
+    with pytest.raises(ModelError, match=f"the run was begun with {message}") as caught:
+        configure_resumed(TrainingConfig(), path, changes=[change])
     assert caught.value.path == path
 
 
 def test_another_preset_is_refused_by_its_network(tmp_path: Path) -> None:
     # Of the many settings that differ, the one that says most.
-    with pytest.raises(ModelError, match=r"network\.size = 'compact', this asks for 'paper'"):
-        check_same_run(preset("compact"), preset("paper"), tmp_path)
+    for given in ({"preset_name": "paper"}, {"file": write(tmp_path / "a.toml", 'preset = "paper"')}):
+        with pytest.raises(ModelError, match=r"network\.size = 'compact', this asks for 'paper'"):
+            configure_resumed(preset("compact"), tmp_path, **given)
 
 
-def test_the_length_of_a_run_may_change(tmp_path: Path) -> None:
-    check_same_run(TrainingConfig(), replace(TrainingConfig(), steps=9, minutes=3.0), tmp_path)
+def test_what_is_not_asked_for_stays_as_it_was_begun(tmp_path: Path) -> None:
+    begun = preset("compact", seed=5, batch_size=32)
+    assert configure_resumed(begun, tmp_path) == begun
+    assert configure_resumed(begun, tmp_path, changes=[{"batch_size": 32}]) == begun
+    # A preset stands for all its settings.
+    with pytest.raises(ModelError, match="batch_size = 32, this asks for 256"):
+        configure_resumed(begun, tmp_path, "compact", changes=[{"seed": 5}])
+
+
+def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.toml", "steps = 12\nlearning_rate = 1e-4")
+    asked = configure_resumed(preset("compact", seed=5), tmp_path, None, file, [{"minutes": 3.0}])
+    assert asked == preset("compact", seed=5, steps=12, learning_rate=1e-4, minutes=3.0)
+
+
+def test_paths_of_sources_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = write(tmp_path / "a.toml", "[sources]\nset = 2.0\ngenerator = 1.0")
+    assert configure(None, file).sources == {str(tmp_path / "set"): 2.0, "generator": 1.0}

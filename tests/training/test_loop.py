@@ -338,9 +338,7 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(
     files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     weights = [p.detach().clone() for p in (*trainer.network.parameters(), *trainer.average.parameters())]
     poison(trainer, what)
-    with pytest.raises(
-        ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"
-    ):
+    with pytest.raises(ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower rate"):
         trainer.run()
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
     after = (*trainer.network.parameters(), *trainer.average.parameters())

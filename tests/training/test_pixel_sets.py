@@ -29,10 +29,10 @@ def everything(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: type) -> None:
     folder = tmp_path / "new" / "set"
-    writer = PixelSetWriter(folder, RECIPE)
+    writer = PixelSetWriter(folder)
     written = {name: matte_pixels(7, 5 + seed, seed=seed, dtype=dtype) for seed, name in enumerate("ab")}
     for name, pixels in written.items():
-        writer.add(name, f"scene {name}", "a test", pixels)
+        writer.add(name, f"scene {name}", "a test", RECIPE, pixels)
         assert name in writer
     assert writer.describe("b") == "b: 7 pixels, 6 lights, a test"
     finished = writer.finish()
@@ -49,7 +49,8 @@ def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: typ
             np.testing.assert_array_equal(found, expected)
     assert opened.load(opened.entries[0]).observations.dtype == dtype
     manifest = read_manifest(folder)
-    assert (manifest["format"], manifest["recipe"]) == (FORMAT, RECIPE)
+    assert manifest["format"] == FORMAT
+    assert [entry["recipe"] for entry in manifest["entries"]] == [RECIPE, RECIPE]
     assert (manifest["n_pixels"], manifest["complete"]) == (14, True)
     assert sorted(path.name for path in folder.iterdir()) == ["a", "b", MANIFEST]
 
@@ -57,8 +58,8 @@ def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: typ
 def test_an_entry_that_cannot_be_written_leaves_nothing(
     tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = PixelSetWriter(tmp_path, RECIPE)
-    writer.add("a", "a", "a test", matte_pixels(7, 5))
+    writer = PixelSetWriter(tmp_path)
+    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     before = everything(tmp_path)
     save, saved = np.save, []
 
@@ -71,7 +72,7 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
 
     monkeypatch.setattr(np, "save", full)
     with pytest.raises(OutputError, match=r"b: cannot be written \(No space left on device\)"):
-        writer.add("b", "b", "a test", matte_pixels(7, 5))
+        writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
     assert len(saved) == 3
     assert everything(tmp_path) == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", MANIFEST]
@@ -79,7 +80,7 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
     assert [entry["name"] for entry in read_manifest(tmp_path)["entries"]] == ["a"]
     # And with room again it goes on.
     monkeypatch.setattr(np, "save", save)
-    writer.add("b", "b", "a test", matte_pixels(7, 5))
+    writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
     writer.finish()
     assert [entry.name for entry in open_pixel_set(tmp_path).entries] == ["a", "b"]
 
@@ -88,68 +89,80 @@ def test_an_entry_is_named_only_once_it_is_there(
     tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Killed between the entry's renaming and the manifest's: the next run puts the entry there again.
-    writer = PixelSetWriter(tmp_path, RECIPE)
+    writer = PixelSetWriter(tmp_path)
     monkeypatch.setattr(
         writer, "_write_manifest", lambda *, complete: (_ for _ in ()).throw(KeyboardInterrupt)
     )
     with pytest.raises(KeyboardInterrupt):
-        writer.add("a", "a", "a test", matte_pixels(9, 4, seed=1))
+        writer.add("a", "a", "a test", RECIPE, matte_pixels(9, 4, seed=1))
     assert read_manifest(tmp_path)["entries"] == []
-    again = PixelSetWriter(tmp_path, RECIPE)
+    again = PixelSetWriter(tmp_path)
     assert "a" not in again
-    again.add("a", "a", "a test", matte_pixels(7, 5, seed=2))
+    again.add("a", "a", "a test", RECIPE, matte_pixels(7, 5, seed=2))
     finished = again.finish()
     assert open_pixel_set(tmp_path) == finished
     assert finished.entries[0].n_pixels == 7
 
 
 def test_going_on_keeps_what_is_there(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
-    PixelSetWriter(tmp_path, RECIPE).add("a", "a", "a test", matte_pixels(7, 5))
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()}
-    again = PixelSetWriter(tmp_path, {"seed": 1, "scenes": {"lights": 30}})
+    again = PixelSetWriter(tmp_path)
     assert "a" in again
-    again.add("b", "b", "a test", matte_pixels(3, 5))
+    again.add("b", "b", "a test", RECIPE, matte_pixels(3, 5))
     assert again.finish() == open_pixel_set(tmp_path)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()} == before
     # A finished set can be added to, and is not to be trained on until that is done.
-    more = PixelSetWriter(tmp_path, RECIPE)
+    more = PixelSetWriter(tmp_path)
+    assert len(open_pixel_set(tmp_path).entries) == 2
+    more.add("c", "c", "a test", RECIPE, matte_pixels(3, 5))
     with pytest.raises(InputError, match="not finished"):
         open_pixel_set(tmp_path)
-    assert len(more.finish().entries) == 2
+    assert len(more.finish().entries) == 3
 
 
-def test_a_set_made_in_another_way_is_left_alone(tmp_path: Path, make_set: MakeSet) -> None:
-    folder = make_set().folder
-    before = everything(folder)
+def test_an_entry_made_in_another_way_is_not_taken_for_this_one(
+    tmp_path: Path, matte_pixels: Callable[..., Any]
+) -> None:
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    writer = PixelSetWriter(tmp_path)
+    assert writer.holds("a", dict(reversed(RECIPE.items())))
+    assert not writer.holds("b", RECIPE)
     with pytest.raises(
-        OutputError, match=r"set: holds a pixel set made in another way\. Choose another -o\."
+        OutputError, match=r"the entry a was made with seed = 1, this asks for 2\. Choose another -o\."
     ):
-        PixelSetWriter(folder, {"by": "machine"})
-    assert everything(folder) == before
+        writer.holds("a", {**RECIPE, "seed": 2})
+    with pytest.raises(OutputError, match=r"was made with scenes = .* asks for None"):
+        writer.holds("a", {"seed": 1})
+    assert open_folder_names(tmp_path) == ["a", MANIFEST]
+
+
+def open_folder_names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("\\begin")
     with pytest.raises(OutputError, match="is not empty and holds no pixel set"):
-        PixelSetWriter(tmp_path, RECIPE)
+        PixelSetWriter(tmp_path)
     assert everything(tmp_path) == {"thesis.tex": b"\\begin"}
     with pytest.raises(OutputError, match="is a file"):
-        PixelSetWriter(tmp_path / "thesis.tex", RECIPE)
+        PixelSetWriter(tmp_path / "thesis.tex")
 
 
 def test_a_manifest_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / MANIFEST).write_text('{"name": "an app"}')
     with pytest.raises(InputError, match="is no manifest of a pixel set: found format None"):
-        PixelSetWriter(tmp_path, RECIPE)
+        PixelSetWriter(tmp_path)
     assert everything(tmp_path) == {MANIFEST: b'{"name": "an app"}'}
 
 
 def test_an_unfinished_set_is_refused(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
-    PixelSetWriter(tmp_path, RECIPE).add("a", "a", "a test", matte_pixels(7, 5))
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     with pytest.raises(InputError, match=r"not finished\. Run its 'splinecli prepare' again: it goes on\."):
         open_pixel_set(tmp_path)
     with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
-        PixelSetWriter(tmp_path / "empty", RECIPE).finish()
+        PixelSetWriter(tmp_path / "empty").finish()
         open_pixel_set(tmp_path / "empty")
 
 
@@ -219,13 +232,10 @@ def test_no_manifest(make_set: MakeSet, text: str, message: str) -> None:
 
 
 def test_a_damaged_manifest_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / MANIFEST).write_text(f'{{"format": "{FORMAT}", "entries": []}}')
-    with pytest.raises(OutputError, match="made in another way"):
-        PixelSetWriter(tmp_path, RECIPE)
     text = json.dumps({"format": FORMAT, "recipe": RECIPE, "entries": [{"name": "a"}]})
     (tmp_path / MANIFEST).write_text(text)
     with pytest.raises(InputError, match="an entry is incomplete"):
-        PixelSetWriter(tmp_path, RECIPE)
+        PixelSetWriter(tmp_path)
     assert (tmp_path / MANIFEST).read_text() == text
 
 

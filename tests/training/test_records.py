@@ -125,7 +125,11 @@ def test_maps_are_shown_in_columns() -> None:
             np.testing.assert_array_equal(np.ma.filled(image.get_array(), np.nan), values)
             assert image.get_clim() == (0, 1)
             assert image.get_extent()[2] > image.get_extent()[3]  # row 0, y = +1, on top
-    assert [row[0].get_ylabel() for row in axes] == ["sparse map", "LI-Net's dense map", "true dense map"]
+    assert [row[0].get_ylabel() for row in axes] == [
+        "sparse map",
+        "LI-Net's dense map",
+        "true map, gaps filled",
+    ]
     assert [axis.get_title() for axis in axes[0]] == ["1.2 deg", "20.0 deg", "3.0 deg"]
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +13,7 @@ import typer
 
 from splinecli.cli.options import JsonOption, QuietOption, SeedOption
 from splinecli.cli.talk import Talk
-from splinecli.errors import UsageError
+from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from splinecli.training.pixel_sets import PixelSet
@@ -46,41 +48,51 @@ def prepare(
     seed: SeedOption = 0,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
-) -> None:
+) -> int:
     """Make a pixel set, the training data of `splinecli train SET`.
 
     Every pixel comes with its true normal and what it shows under all lights. Rendering needs the extra
     packages of 'splinecli[render]'. Writes SET/manifest.json, a folder for each entry, and
-    SET/contact_sheet.png to look at. An interrupted command, given again, goes on.
+    SET/contact_sheet.png to look at. An interrupted command, given again, goes on, and what is new joins a set that
+    is there. A capture that cannot be read is named and passed over; the exit code is then 3.
     """
-    from splinecli.files import check_writable, write_bytes
+    from splinecli.capture import find_captures
+    from splinecli.files import check_writable, held_folder, write_bytes
     from splinecli.outputs import encode_png
     from splinecli.training.contact_sheet import contact_sheet
     from splinecli.training.pixel_sets import PixelSetWriter
-    from splinecli.training.preparation import add_capture, add_scene, list_captures
+    from splinecli.training.preparation import add_capture, add_scene, name_captures
 
     if not sources and not scenes and not mesh:
         raise UsageError("nothing to prepare", hint="Name a SOURCE, or ask for --scenes N or --mesh FILE")
     check_writable(output)
-    captures = list_captures(sources or [])
-    plan = None
-    if scenes or mesh:
-        plan = _plan(scenes, mesh or [], seed, size, lights, measured, measured_share)
-    writer = PixelSetWriter(output, plan.recipe if plan else {})
+    for source in sources or []:
+        find_captures(source)  # a wrong one is refused before anything is made
+    plan = _plan(scenes, mesh or [], seed, size, lights, measured, measured_share)
     talk = Talk(quiet=quiet)
-    with talk.progress("preparing", len(captures) + (len(plan) if plan else 0)) as advance:
-        for name, folder in captures.items():
-            add_capture(writer, name, folder)
-            talk.say(writer.describe(name))
-            advance(1)
-        for index in range(len(plan) if plan else 0):
-            assert plan is not None
-            for name in add_scene(writer, plan, index):
-                talk.say(writer.describe(name))
-            advance(1)
-    pixel_set = writer.finish()
-    write_bytes(output / CONTACT_SHEET, encode_png(contact_sheet(pixel_set)))
-    summary = _summary(pixel_set)
+    skipped: list[dict[str, str]] = []
+    with held_folder(output):
+        writer = PixelSetWriter(output)
+        captures, scene_names = name_captures(sources or [], writer), plan.names()
+        with talk.progress("preparing", len(captures) + len(scene_names)) as advance:
+            for name, folder in captures.items():
+                try:
+                    add_capture(writer, name, folder)
+                    talk.say(writer.describe(name))
+                except InputError as error:
+                    skipped.append({"source": str(folder), "reason": str(error)})
+                    print(f"splinecli: {error}", file=sys.stderr)
+                advance(1)
+            for position in range(len(scene_names)):
+                done = _Share(advance)
+                for name in add_scene(writer, plan, position, done.reach):
+                    talk.say(writer.describe(name))
+                done.reach(1.0)
+        if not len(writer):
+            return InputError.exit_code
+        pixel_set = writer.finish()
+        write_bytes(output / CONTACT_SHEET, encode_png(contact_sheet(pixel_set)))
+    summary = {**_summary(pixel_set), "skipped": skipped}
     if as_json:
         print(json.dumps(summary, indent=2))
     elif not quiet:
@@ -88,6 +100,18 @@ def prepare(
             f"{output}: {summary['entries']} entries of {summary['scenes']} scenes, {summary['n_pixels']} pixels,"
             f" {summary['bytes'] / 1e6:.0f} MB; look at {output / CONTACT_SHEET}"
         )
+    return InputError.exit_code if skipped else 0
+
+
+class _Share:
+    """Turns the share of a scene that is done into steps of the bar."""
+
+    def __init__(self, advance: Callable[[float], None]) -> None:
+        self.advance, self.done = advance, 0.0
+
+    def reach(self, share: float) -> None:
+        self.advance(share - self.done)
+        self.done = share
 
 
 def _plan(
@@ -112,7 +136,7 @@ def _plan(
         lights=lights or config.lights,
         measured_share=measured_share if measured else 0.0,
     )
-    plan = ScenePlan(config, seed, len(meshes) + scenes, tuple(meshes), measured)
+    plan = ScenePlan(config, seed, scenes, tuple(meshes), measured)
     _ = plan.library  # the same of a bad file
     return plan
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -67,6 +68,7 @@ def train(
     torchrun all processes train together.
     """
     from splinecli.devices import choose_device
+    from splinecli.files import check_writable, held_folder
     from splinecli.training.config_files import parse_parameter
     from splinecli.training.distributed import is_to_go_on, join_workers, leave_workers
     from splinecli.training.loop import CHECKPOINT, WEIGHTS, Trainer
@@ -88,12 +90,22 @@ def train(
         settings = replace(settings, steps=steps, minutes=0.0)
     if minutes is not None:
         settings = replace(settings, minutes=minutes)
+    check_writable(output)
     workers, own_device = join_workers(choose_device(device.value))
     talk = Talk(quiet=quiet or not workers.leads)
-    try:
+    with ExitStack() as stack:
+        stack.callback(leave_workers)
+        workers.shards(settings.shards)  # refused before the folder is made
+        if workers.leads:
+            stack.enter_context(held_folder(output))
         trainer = Trainer(
             settings, output, own_device, resume=resume, workers=workers, tensorboard=tensorboard
         )
+        if trainer.unheld:
+            names = ", ".join(trainer.unheld)
+            talk.warn(
+                f"{names}: a single scene, of which nothing is held back: validation is on training pixels"
+            )
         with talk.progress("training", 1.0, start=trainer.progress) as advance:
             shown = trainer.progress
 
@@ -106,8 +118,6 @@ def train(
                     talk.say(f"step {metrics.step}, {metrics.pixels} pixels, {_losses(metrics)}")
 
             trainer.run(report)
-    finally:
-        leave_workers()
     if not quiet and workers.leads:
         print(output / WEIGHTS)
 
@@ -121,15 +131,13 @@ def _configure(
     resume: bool,
 ) -> TrainingConfig:
     from splinecli.training.checkpoint import read_checkpoint_config
-    from splinecli.training.config_files import check_same_run, configure
+    from splinecli.training.config_files import configure, configure_resumed
     from splinecli.training.loop import CHECKPOINT
 
     if not resume:
         return configure(preset, file, changes)
     begun = read_checkpoint_config(output / CHECKPOINT)
-    if preset is not None or file is not None or changes:
-        check_same_run(begun, configure(preset, file, changes), output / CHECKPOINT)
-    return begun
+    return configure_resumed(begun, output / CHECKPOINT, preset, file, changes)
 
 
 def _sources(sets: list[Path], generator_weight: float | None) -> dict[str, float]:
@@ -156,7 +164,7 @@ def _light_counts(text: str) -> dict[str, int]:
 
 
 def _losses(metrics: Metrics) -> str:
-    checked = "" if metrics.validation_deg is None else f", {metrics.validation_deg:.2f} deg on unseen pixels"
+    checked = "" if metrics.validation_deg is None else f", {metrics.validation_deg:.2f} deg in validation"
     return (
         f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f}, map {metrics.map_error:.3f},"
         f" {metrics.angle_deg:.2f} deg{checked}"

@@ -38,8 +38,9 @@ def save_checkpoint(
     average: SplineNet,
     optimizer: torch.optim.Optimizer,
     clock: Clock,
+    sets: dict[str, str],
 ) -> None:
-    """Write the whole state of a run. Raises OutputError."""
+    """Write the whole state of a run; `sets` are the SHA-256 of its pixel sets. Raises OutputError."""
     tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", network), ("average", average)):
         tensors |= {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
@@ -53,6 +54,7 @@ def save_checkpoint(
         "format": FORMAT,
         "config": json.dumps(config.to_dict()),
         "clock": json.dumps(asdict(clock)),
+        "sets": json.dumps(sets),
         "tensors_sha256": tensors_sha256(plain),
     }
     write_bytes(path, save(plain, metadata))
@@ -69,9 +71,17 @@ def load_checkpoint(
     network: SplineNet,
     average: SplineNet,
     optimizer: torch.optim.Optimizer,
+    sets: dict[str, str],
 ) -> Clock:
-    """Put a run's state back. Raises ModelError where the file does not fit the run."""
+    """Put a run's state back. Raises ModelError where the file, or one of the pixel sets, is not the run's."""
     tensors, metadata = _read(path)
+    for name, sha256 in read_json_entry(metadata, "sets", path).items():
+        if sets.get(name) != sha256:
+            raise ModelError(
+                f"the pixel set {name} is not what it was when the run was begun",
+                path=path,
+                hint="Put it back as it was, or choose another -o and begin anew",
+            )
     groups: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimizer": {}}
     for name, tensor in tensors.items():
         prefix, _, rest = name.partition(".")
@@ -91,4 +101,5 @@ def load_checkpoint(
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    return read_tensors(path, FORMAT, "Start a run with 'splinecli train -o RUN' first")
+    hint = "A run begins without --resume; where this file is damaged, remove it or choose another -o"
+    return read_tensors(path, FORMAT, hint)

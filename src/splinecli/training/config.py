@@ -31,8 +31,8 @@ class TrainingConfig:
             hundredth, or ("stepped", the authors' way) to a tenth over the last tenth.
         steps, minutes: the run's length; minutes wins where it is above 0.
         beta1, beta2, weight_decay: of AdamW, which is Adam where weight_decay is 0.
-        gradient_limit: largest norm of the gradient.
-        average_decay: decay of the running average of the weights, which is what gets saved.
+        gradient_limit: largest norm of the gradient; 0 for none.
+        average_decay: decay of the running average of the weights, which is what gets saved; 0 for none.
         turn_jitter_deg: canonical networks see each pixel turned further by up to this, either way, and half
             of the batches mirrored, so that estimates from several views can be averaged.
         angle_weight, map_weight, masked_weight: of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
@@ -131,6 +131,8 @@ _LOWEST = {
     "min_lights": 3, "max_lights": 3, "usual_lights": 3,
 }  # fmt: skip
 
+_BELOW_ONE = ("beta1", "beta2", "average_decay")
+
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
@@ -154,9 +156,12 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
             expected = f"a whole number from {lowest}"
             fits = isinstance(value, int) and not isinstance(value, bool) and value >= lowest
         else:
-            highest = 1.0 if name.endswith("_share") else math.inf
-            expected = "a number from 0 to 1" if highest == 1 else "a number from 0"
-            fits = _is_number(value) and 0 <= value <= highest
+            fits = _is_number(value) and 0 <= value < math.inf
+            expected = "a number from 0"
+            if name.endswith("_share"):
+                fits, expected = fits and value <= 1, "a number from 0 to 1"
+            elif name in _BELOW_ONE:
+                fits, expected = fits and value < 1, "a number from 0 to below 1"
         if not fits:
             raise ModelError(f"training setting {name!r} is {value!r}; expected {expected}")
 
@@ -177,6 +182,8 @@ PRESETS = {
         beta2=0.999,
         weight_decay=0.0,
         turn_jitter_deg=0.0,
+        gradient_limit=0.0,
+        average_decay=0.0,
         symmetric_weight=2e-2,
         asymmetric_weight=2e-5,
         li_net_norm="sum",

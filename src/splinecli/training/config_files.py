@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.errors import ModelError, UsageError
-from splinecli.training.config import TrainingConfig, preset
+from splinecli.training.config import GENERATOR, TrainingConfig, preset
 
 DEFAULT_PRESET = "compact"
 
@@ -69,12 +69,19 @@ def configure(
         raise ModelError(error.problem, path=file, hint=error.hint) from error
     for change in changes:
         values = _merge(values, change)
-    config = TrainingConfig.from_dict(values)
-    if not config.pixels.measured_materials:
-        return config
-    # Absolute, so that a run can be taken up from another folder.
-    materials = str(Path(config.pixels.measured_materials).absolute())
-    return replace(config, pixels=replace(config.pixels, measured_materials=materials))
+    return _with_absolute_paths(TrainingConfig.from_dict(values))
+
+
+def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
+    # So that a run can be taken up from another folder.
+    sources = {
+        name if name == GENERATOR else str(Path(name).absolute()): weight
+        for name, weight in config.sources.items()
+    }
+    pixels = config.pixels
+    if pixels.measured_materials:
+        pixels = replace(pixels, measured_materials=str(Path(pixels.measured_materials).absolute()))
+    return replace(config, sources=sources, pixels=pixels)
 
 
 def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -86,16 +93,43 @@ def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def check_same_run(begun: TrainingConfig, asked: TrainingConfig, path: Path) -> None:
-    """Raise ModelError where a run begun with one configuration is to go on with another, length aside."""
+CHANGEABLE = ("steps", "minutes", "learning_rate", "gradient_limit")
+"""What a run may change when it is gone on with."""
+
+
+def configure_resumed(
+    begun: TrainingConfig,
+    path: Path,
+    preset_name: str | None = None,
+    file: Path | None = None,
+    changes: Sequence[dict[str, Any]] = (),
+) -> TrainingConfig:
+    """The configuration of a run that was begun, with what is asked for now.
+
+    Without a preset, what is not asked for stays as it was begun.
+
+    Raises:
+        UsageError, ModelError: as for `configure`; or a setting differs that only another run can have; the
+            message names it and the run's checkpoint, `path`.
+    """
+    settings = read_config_file(file) if file else {}
+    if preset_name is None and "preset" not in settings:
+        values = begun.to_dict()
+        for change in (settings, *changes):
+            values = _merge(values, change)
+        asked = _with_absolute_paths(TrainingConfig.from_dict(values))
+    else:
+        asked = configure(preset_name, file, changes)
     old, new = _flat(begun.to_dict()), _flat(asked.to_dict())
-    for name in old | new:
-        if name not in ("steps", "minutes") and old.get(name) != new.get(name):
+    # In the order of the configuration: what says most, such as the network's size, comes first.
+    for name in [*new, *(name for name in old if name not in new)]:
+        if name not in CHANGEABLE and old.get(name) != new.get(name):
             raise ModelError(
                 f"the run was begun with {name} = {old.get(name)!r}, this asks for {new.get(name)!r}",
                 path=path,
-                hint="Leave the settings out to go on as it was begun, or choose another -o",
+                hint="Leave the setting out to go on as it was begun, or choose another -o",
             )
+    return asked
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -22,7 +22,7 @@ from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.training.checkpoint import Clock, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.distributed import Workers
-from splinecli.training.objective import Losses, compute_losses, part_of_step
+from splinecli.training.objective import Losses, Part, compute_losses, part_of_step
 from splinecli.training.records import Metrics, Records, none_for_nan
 from splinecli.training.sources import open_sources
 from splinecli.training.validation import sample_maps, validation_deg
@@ -31,10 +31,11 @@ CHECKPOINT = "checkpoint.safetensors"
 WEIGHTS = "weights.safetensors"
 VALIDATION_PIXELS = 2048
 CHECKPOINT_SECONDS = 45.0
-REPORT_STEPS = 50
+REPORT_STEPS = 60
 
 # Random streams of a step, beside those of its shards, which are numbered from 0.
-_BATCH_STREAM, _DROPOUT_STREAM, _VALIDATION_STREAM = 2**31, 2**31 + 1, 2**31 + 2
+# The last is that of process 0; the others' follow it.
+_BATCH_STREAM, _VALIDATION_STREAM, _DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 + 2
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
@@ -86,6 +87,7 @@ class Trainer:
             )
         sources = open_sources(config, self.generator, validation_generator)
         self.source = sources.training
+        self.sets, self.unheld = sources.sets, sources.unheld
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -100,7 +102,9 @@ class Trainer:
         self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
         self.clock = Clock()
         if resume:
-            self.clock = load_checkpoint(folder / CHECKPOINT, self.network, self.average, self.optimizer)
+            self.clock = load_checkpoint(
+                folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets
+            )
         if self.workers.leads:
             self.records = Records(folder, self.clock.step, tensorboard=tensorboard)
             self.validation = sources.validation.draw(VALIDATION_PIXELS)
@@ -128,24 +132,30 @@ class Trainer:
                 "the run is at its end already", path=self.folder, hint="Give it more --steps or --minutes"
             )
         metrics = None
-        losses: list[Tensor] = []
+        losses: dict[Part, list[Tensor]] = {}
+        count = 0
         saved = time.monotonic()
         started = saved - self.clock.seconds
         while self.progress < 1:
-            losses.append(self.step())
+            part = part_of_step(self.config, self.clock.step)
+            losses.setdefault(part, []).append(self.step())
+            count += 1
             self.clock.seconds = self.workers.agree(time.monotonic() - started, self.device)
             due = self.progress >= 1 or time.monotonic() - saved > CHECKPOINT_SECONDS
-            if self.workers.leads and (due or len(losses) == REPORT_STEPS):
-                metrics = self._metrics(torch.stack(losses).mean(dim=0), check=due)
+            if not (due or count >= REPORT_STEPS):
+                continue
+            if self.workers.leads:
+                if due:
+                    self._check_weights()
+                means = [torch.stack(steps).mean(dim=0) for steps in losses.values()]
+                metrics = self._metrics(torch.stack(means), check=due)
                 self.records.append(metrics)
                 if due:
                     self.save()
                     saved = time.monotonic()
                 if report:
                     report(self.progress, metrics)
-                losses = []
-            elif not self.workers.leads:
-                losses = []
+            losses, count = {}, 0
         return metrics
 
     def draw(self) -> tuple[PixelBatch, Tensor, bool]:
@@ -185,14 +195,10 @@ class Trainer:
         numbers = self.workers.average(
             self.network.parameters(), torch.stack([loss.detach().double() for loss in losses])
         ).cpu()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit or math.inf)
         for name, value in (("loss", numbers[0]), ("gradient", norm)):
             if not torch.isfinite(value):
-                raise ModelError(
-                    f"the {name} is {value.item()} at step {self.clock.step}",
-                    path=self.folder,
-                    hint="The last checkpoint is kept; go on from it, or begin anew, with a lower learning rate",
-                )
+                raise self._not_finite(f"the {name} is {value.item()}")
         self.optimizer.step()
         self._follow()
         self.clock.step += 1
@@ -202,10 +208,29 @@ class Trainer:
     def save(self) -> None:
         """Write checkpoint, averaged weights and pictures. Raises OutputError."""
         save_checkpoint(
-            self.folder / CHECKPOINT, self.config, self.network, self.average, self.optimizer, self.clock
+            self.folder / CHECKPOINT,
+            self.config,
+            self.network,
+            self.average,
+            self.optimizer,
+            self.clock,
+            self.sets,
         )
         save_weights(self.average, self.folder / WEIGHTS)
         self.records.draw(sample_maps(self.average, self.validation))
+
+    def _check_weights(self) -> None:
+        """Raise ModelError before anything that is not finite is saved."""
+        for name, tensor in self.network.state_dict().items():
+            if not torch.isfinite(tensor).all():
+                raise self._not_finite(f"the tensor {name} is no longer finite")
+
+    def _not_finite(self, problem: str) -> ModelError:
+        lower = "a lower rate, such as --param learning_rate=1e-4"
+        hint = f"Begin anew with {lower}"
+        if (self.folder / CHECKPOINT).exists():
+            hint = f"The last checkpoint is kept: --resume goes on from it with {lower}"
+        return ModelError(f"{problem} at step {self.clock.step}", path=self.folder, hint=hint)
 
     def _follow(self) -> None:
         # A young average would remember the start for too long: its decay grows with the steps.
@@ -216,18 +241,20 @@ class Trainer:
                 averaged.lerp_(current, 1 - decay)
 
     def _metrics(self, means: Tensor, *, check: bool) -> Metrics:
-        losses = Losses(*means.tolist())
+        """From the means (N, 6) over the steps of each part: of "both", or of NE-Net and LI-Net."""
+        # Each network has a loss of its own, and those are added up; the errors are of one kind.
+        summed, averaged = Losses(*means.sum(dim=0).tolist()), Losses(*means.mean(dim=0).tolist())
         checked_deg = validation_deg(self.average, self.validation, bfloat16=self.bfloat16) if check else None
         return Metrics(
             step=self.clock.step,
             pixels=self.clock.pixels,
             minutes=round(self.clock.seconds / 60, 3),
             learning_rate=self.optimizer.param_groups[0]["lr"],
-            loss=float(losses.total),
-            angle_deg=math.degrees(losses.angle),
-            map_error=float(losses.on_map),
-            masked_map_error=float(losses.masked),
-            symmetric=none_for_nan(float(losses.symmetric)),
-            asymmetric=none_for_nan(float(losses.asymmetric)),
+            loss=float(summed.total),
+            angle_deg=math.degrees(averaged.angle),
+            map_error=float(averaged.on_map),
+            masked_map_error=float(averaged.masked),
+            symmetric=none_for_nan(float(summed.symmetric)),
+            asymmetric=none_for_nan(float(summed.asymmetric)),
             validation_deg=checked_deg,
         )

@@ -1,6 +1,6 @@
 """Pixel sets: pixels with known normals under many lights, on disk as memory-mapped arrays with a manifest.
 
-    SET/manifest.json                       format, version, recipe, entries with counts and checksums
+    SET/manifest.json                       format, version, entries with counts, recipes and checksums
     SET/<entry>/observations.npy            (P, F), linear, float16 where rendered and float32 where read
     SET/<entry>/normals.npy                 (P, 3) float32, unit
     SET/<entry>/light_directions.npy        (F, 3) float32, unit
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import InputError, OutputError
-from splinecli.files import check_writable, current_umask, refusals_as_output_errors, write_text
+from splinecli.files import LOCK, check_writable, current_umask, refusals_as_output_errors, write_text
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"
@@ -45,11 +45,16 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Entry:
-    """What the manifest says of an entry. Entries of one `scene` share their shape, so they are held together."""
+    """What the manifest says of an entry.
+
+    Entries of one `scene` share their shape, so they are held together. The recipe holds plain values that
+    decide the whole content.
+    """
 
     name: str
     scene: str
     source: str
+    recipe: dict[str, Any]
     n_pixels: int
     n_lights: int
     sha256: dict[str, str]
@@ -57,10 +62,15 @@ class Entry:
 
 @dataclass(frozen=True)
 class PixelSet:
-    """A finished, verified set."""
+    """A finished, verified set; `sha256` is that of its entries' checksums."""
 
     folder: Path
     entries: tuple[Entry, ...]
+
+    @property
+    def sha256(self) -> str:
+        content = json.dumps([[entry.name, entry.sha256] for entry in self.entries], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()
 
     def load(self, entry: Entry) -> Pixels:
         """The entry's arrays, mapped and not read. Raises InputError."""
@@ -68,44 +78,53 @@ class PixelSet:
 
 
 class PixelSetWriter:
-    """Writes a set entry by entry; a set that was begun with the same recipe is gone on with."""
+    """Writes a set entry by entry. A set that is there is gone on with: more entries may join it at any time."""
 
-    def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
-        """Begin or go on.
-
-        Args:
-            recipe: plain values that decide the whole content.
-
-        Raises:
-            OutputError: the folder cannot be written, or holds something else.
-        """
+    def __init__(self, folder: Path) -> None:
+        """Begin or go on. Raises OutputError where the folder cannot be written or holds something else."""
         check_writable(folder)
         self.folder = folder
-        self.recipe: dict[str, Any] = json.loads(json.dumps(recipe))
         self._entries: dict[str, Entry] = {}
         if (folder / MANIFEST).exists():
-            manifest = _read_manifest(folder)
-            if manifest.get("recipe") != self.recipe:
-                raise OutputError(
-                    "holds a pixel set made in another way", path=folder, hint="Choose another -o"
-                )
-            self._entries = {entry.name: entry for entry in _entries(manifest, folder)}
-        elif folder.is_dir() and any(folder.iterdir()):
+            self._entries = {entry.name: entry for entry in _entries(_read_manifest(folder), folder)}
+        elif folder.is_dir() and any(path.name != LOCK for path in folder.iterdir()):
             raise OutputError("is not empty and holds no pixel set", path=folder, hint="Choose another -o")
+        else:
+            self._write_manifest(complete=False)
         for left in folder.glob(f"{_TEMPORARY}*"):  # of a run that was killed while it wrote
             shutil.rmtree(left, ignore_errors=True)
-        self._write_manifest(complete=False)
+
+    def __len__(self) -> int:
+        return len(self._entries)
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
+
+    def holds(self, name: str, recipe: dict[str, Any]) -> bool:
+        """Whether the entry is there, made by this recipe. Raises OutputError where it is there by another."""
+        if name not in self._entries:
+            return False
+        asked, found = _plain(recipe), self._entries[name].recipe
+        for key in [*asked, *found]:
+            if asked.get(key) != found.get(key):
+                raise OutputError(
+                    f"the entry {name} was made with {key} = {found.get(key)!r}, this asks for {asked.get(key)!r}",
+                    path=self.folder,
+                    hint="Choose another -o",
+                )
+        return True
+
+    def recipe_of(self, name: str) -> dict[str, Any]:
+        """The recipe of an entry that is there."""
+        return self._entries[name].recipe
 
     def describe(self, name: str) -> str:
         """A line on an entry that is there."""
         entry = self._entries[name]
         return f"{name}: {entry.n_pixels} pixels, {entry.n_lights} lights, {entry.source}"
 
-    def add(self, name: str, scene: str, source: str, pixels: Pixels) -> None:
-        """Write an entry. Raises OutputError, and then leaves nothing of it."""
+    def add(self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels) -> None:
+        """Write an entry of at least one pixel. Raises OutputError, and then leaves nothing of it."""
         folder = self.folder / name
         with (
             refusals_as_output_errors(folder),
@@ -121,7 +140,7 @@ class PixelSetWriter:
                 shutil.rmtree(folder)
             work.rename(folder)
         n_pixels, n_lights = pixels.observations.shape
-        self._entries[name] = Entry(name, scene, source, n_pixels, n_lights, checksums)
+        self._entries[name] = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
         self._write_manifest(complete=False)
 
     def finish(self) -> PixelSet:
@@ -135,10 +154,14 @@ class PixelSetWriter:
             "version": __version__,
             "complete": complete,
             "n_pixels": sum(entry.n_pixels for entry in self._entries.values()),
-            "recipe": self.recipe,
             "entries": [asdict(entry) for entry in self._entries.values()],
         }
         write_text(self.folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+
+
+def _plain(recipe: dict[str, Any]) -> dict[str, Any]:
+    plain: dict[str, Any] = json.loads(json.dumps(recipe))
+    return plain
 
 
 def open_pixel_set(folder: Path) -> PixelSet:

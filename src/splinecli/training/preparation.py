@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture import capture_name, find_captures, open_capture
+from splinecli.capture import CaptureFiles, capture_name, find_captures, open_capture
 from splinecli.errors import InputError
 from splinecli.synthesis.measured import MeasuredLibrary
 from splinecli.synthesis.measured_files import read_measured
@@ -19,23 +20,41 @@ from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.scenes import CLASSES, SceneConfig, draw_scene, render_scene
 from splinecli.training.pixel_sets import Pixels, PixelSetWriter
 
+RENDERER = 1
+"""To be raised when the same scene comes out otherwise: a set must not mix both without saying so."""
 
-def list_captures(sources: Sequence[Path]) -> dict[str, Path]:
+_MESH_INDICES = 1_000_000
+
+
+def name_captures(sources: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
     """The captures in folders of captures, datasets and CyclesPS trees, by the name of their entries.
+
+    A capture keeps the name that it has in the set; a new one gets its own, with a number where that is taken.
 
     Raises:
         InputError: a source holds no capture.
     """
+    # A folder that is named twice counts once: its pixels must not be held back and trained on.
+    folders = {folder.resolve(): folder for source in sources for folder in find_captures(source)}
     captures: dict[str, Path] = {}
-    for source in sources:
-        for folder in find_captures(source):
-            name = plain = capture_name(folder)
-            count = 1
-            while name in captures:
-                count += 1
-                name = f"{plain}-{count}"
-            captures[name] = folder
+    for folder in folders.values():
+        name = plain = capture_name(folder)
+        count = 1
+        while name in captures or (
+            name in writer and writer.recipe_of(name).get("source") != str(folder.resolve())
+        ):
+            count += 1
+            name = f"{plain}-{count}"
+        captures[name] = folder
     return captures
+
+
+def _fingerprint(files: CaptureFiles) -> str:
+    """Changes when a file of the capture does: its name, size or time."""
+    named = (files.light_directions, files.light_intensities, files.mask, files.ground_truth)
+    paths = [*files.images, *files.boundaries, *(path for path in named if path is not None)]
+    states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    return hashlib.sha256(json.dumps(states).encode()).hexdigest()
 
 
 def add_capture(writer: PixelSetWriter, name: str, folder: Path) -> None:
@@ -46,14 +65,16 @@ def add_capture(writer: PixelSetWriter, name: str, folder: Path) -> None:
 
     Raises:
         InputError: the capture cannot be read, or holds no ground truth.
-        OutputError: the entry cannot be written.
+        OutputError: the entry cannot be written, or is there from other files.
     """
-    if name in writer:
-        return
     source = open_capture(folder)
-    capture = source.read()
-    if capture.ground_truth is None:
+    recipe = {"source": str(folder.resolve()), "files": _fingerprint(source.files)}
+    if writer.holds(name, recipe):
+        return
+    if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
+    capture = source.read()
+    assert capture.ground_truth is not None
     truth = capture.ground_truth[capture.mask]
     used = truth.any(axis=1)
     holder = source.files.folder.absolute()
@@ -72,12 +93,12 @@ def add_capture(writer: PixelSetWriter, name: str, folder: Path) -> None:
         mask=mask[::step, ::step],
     )
     # An object's kinds of material share its shape.
-    writer.add(name, holder.name if is_cyclesps else name, str(folder), pixels)
+    writer.add(name, holder.name if is_cyclesps else name, str(folder), recipe, pixels)
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """Scenes to be rendered: those of the user's meshes first, then procedural ones."""
+    """Scenes to be rendered: those of the user's meshes, and `count` procedural ones."""
 
     config: SceneConfig
     seed: int
@@ -85,52 +106,76 @@ class ScenePlan:
     meshes: tuple[Path, ...] = ()
     measured_materials: Path | None = None
 
-    def __len__(self) -> int:
-        return self.count
-
-    @property
-    def recipe(self) -> dict[str, Any]:
-        """What decides the content of every scene; more scenes may join a set, so their number is left out."""
-        materials = self.measured_materials
-        return {
-            "scene": asdict(self.config),
-            "seed": self.seed,
-            "meshes": {path.name: _sha256(path) for path in self.meshes},
-            "measured_materials": None if materials is None else _sha256(materials),
-        }
-
     @cached_property
     def library(self) -> MeasuredLibrary | None:
         """The measured materials. Raises InputError."""
         return None if self.measured_materials is None else read_measured(self.measured_materials)
+
+    def names(self) -> list[str]:
+        """The scenes' names: of the meshes after their files, numbered where two are called the same."""
+        names: list[str] = []
+        for path in self.meshes:
+            name, count = path.stem, 1
+            while name in names:
+                count += 1
+                name = f"{path.stem}-{count}"
+            names.append(name)
+        return [*names, *(f"scene{index:04}" for index in range(self.count))]
+
+    def recipe(self, position: int) -> dict[str, Any]:
+        """What decides the content of a scene."""
+        materials = self.measured_materials
+        mesh = self.meshes[position] if position < len(self.meshes) else None
+        return {
+            "renderer": RENDERER,
+            **asdict(self.config),
+            "seed": self.seed,
+            "mesh": None if mesh is None else _sha256(mesh),
+            "measured_materials": None if materials is None else _sha256(materials),
+        }
 
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def add_scene(writer: PixelSetWriter, plan: ScenePlan, index: int) -> list[str]:
+def add_scene(
+    writer: PixelSetWriter,
+    plan: ScenePlan,
+    position: int,
+    progress: Callable[[float], None] | None = None,
+) -> list[str]:
     """Render a scene of the plan in all its materials, unless it is there; returns its entries' names.
 
     Raises:
-        InputError: its mesh, or the file of measured materials, cannot be used.
-        OutputError: an entry cannot be written.
+        InputError: its mesh, or the file of measured materials, cannot be used, or the camera sees nothing of it.
+        OutputError: an entry cannot be written, or is there in another way.
         UsageError: the packages of the extra `render` are missing.
     """
-    scene_name = f"scene{index:04}"
+    scene_name, recipe = plan.names()[position], plan.recipe(position)
     names = {kind: f"{scene_name}-{kind}" for kind in CLASSES}
-    if not all(name in writer for name in names.values()):
-        mesh = read_mesh(plan.meshes[index]) if index < len(plan.meshes) else None
-        draw_measured = plan.library.draw if plan.library else None
-        scene = draw_scene(plan.seed, index, plan.config, mesh, draw_measured=draw_measured)
-        rendered = render_scene(scene, plan.config)
-        for kind, name in names.items():
-            pixels = Pixels(
-                # Half precision, 0.05 %, is finer than the render's own noise.
-                observations=rendered.observations[kind].astype(np.float16),
-                normals=rendered.normals.astype(np.float32),
-                light_directions=rendered.light_directions.astype(np.float32),
-                mask=rendered.mask,
-            )
-            writer.add(name, scene_name, f"rendered: {rendered.shape}", pixels)
+    if all(writer.holds(name, recipe) for name in names.values()):
+        return list(names.values())
+    given = position < len(plan.meshes)
+    mesh = read_mesh(plan.meshes[position]) if given else None
+    # Meshes have random numbers of their own: scenes stay what they are when a mesh joins them.
+    index = _MESH_INDICES + position if given else position - len(plan.meshes)
+    draw_measured = plan.library.draw if plan.library else None
+    scene = draw_scene(plan.seed, index, plan.config, mesh, draw_measured=draw_measured)
+    rendered = render_scene(scene, plan.config, progress)
+    if not rendered.mask.any():
+        raise InputError(
+            "the camera sees nothing of it",
+            path=plan.meshes[position] if given else scene_name,
+            hint="The camera looks along -z at the outer sides of faces, anticlockwise seen from outside",
+        )
+    for kind, name in names.items():
+        pixels = Pixels(
+            # Half precision, 0.05 %, is finer than the render's own noise.
+            observations=rendered.observations[kind].astype(np.float16),
+            normals=rendered.normals.astype(np.float32),
+            light_directions=rendered.light_directions.astype(np.float32),
+            mask=rendered.mask,
+        )
+        writer.add(name, scene_name, f"rendered: {rendered.shape}", recipe, pixels)
     return list(names.values())

@@ -28,6 +28,8 @@ EVENTS = "tensorboard"
 class Metrics:
     """One line of metrics.csv: means over the steps since the last line; angles in degrees.
 
+    loss, symmetric and asymmetric are those of LI-Net and of NE-Net together, where they are updated in turn.
+
     None for what was not computed: the special losses where their weights are 0, validation between saves.
     """
 
@@ -102,6 +104,12 @@ def curves_figure(rows: list[Metrics]) -> Figure:
     loss, angle, maps = figure.subplots(1, 3)
     steps = [row.step for row in rows]
     loss.plot(steps, [row.loss for row in rows])
+    for name, label in (("symmetric", "Ls"), ("asymmetric", "La")):
+        special = [(row.step, value) for row in rows if (value := getattr(row, name)) is not None]
+        if special:
+            loss.plot(*zip(*special, strict=True), label=f"{label}, unweighted", alpha=0.5)
+    loss.lines[0].set_label("whole loss")
+    loss.legend()
     loss.set_title("loss")
     angle.plot(steps, [row.angle_deg for row in rows], label="training", alpha=0.5)
     checked = [row for row in rows if row.validation_deg is not None]
@@ -130,7 +138,7 @@ def maps_figure(maps: SampleMaps) -> Figure:
     count = len(maps.sparse)
     figure = Figure(figsize=(1.6 * count + 0.8, 5.4), layout="constrained")
     axes = figure.subplots(3, count, squeeze=False)
-    names = ("sparse map", "LI-Net's dense map", "true dense map")
+    names = ("sparse map", "LI-Net's dense map", "true map, gaps filled")
     for name, row, cells in zip(names, axes, (maps.sparse, maps.dense, maps.truth), strict=True):
         row[0].set_ylabel(name)
         for axis, values in zip(row, cells, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splinecli.errors import InputError
 from splinecli.observation_map import cell_directions, rotate_about_view_axis, sparse_map
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, join_batches, photograph
 from splinecli.synthesis.lights import draw_light_counts
@@ -19,7 +21,7 @@ from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.pixel_sets import Entry, Pixels, PixelSet, open_pixel_set
 
 FILL_STEPS = 3
-"""Gaps of a dense map are interpolated up to this many cells from a light."""
+"""Gaps of a dense map are interpolated up to so many cells from a light."""
 
 _PAGES_BYTES = 256 << 20  # mapped pages are let go when about so many bytes of them were touched
 _PAGE = 4096
@@ -57,18 +59,22 @@ class SampledScene:
 
 
 def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
-    """Interpolate cells without a value from their neighbours, by normalised 3 x 3 convolutions.
+    """Interpolate cells without a value that lie between others, from their neighbours, in FILL_STEPS rounds.
 
     Args:
         values, known: (P, 1, w, w); a value counts where known is 1.
         inside: (w, w), 1 in the unit disc; nothing is filled outside.
     """
-    kernel = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None]
+    near = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 0.0, 2.0], [1.0, 2.0, 1.0]])
+    across = near * values.new_tensor([-1.0, 0.0, 1.0])
+    kernels = torch.stack((near, across, across.T))[:, None]
     filled, weight = values * known, known
     for _ in range(FILL_STEPS):
-        near = torch.nn.functional.conv2d(weight, kernel, padding=1)
-        mean = torch.nn.functional.conv2d(filled * weight, kernel, padding=1) / near.clamp(min=1)
-        gap = (weight == 0) & (near > 0) & (inside > 0)
+        total, x, y = torch.chunk(torch.nn.functional.conv2d(weight, kernels, padding=1), 3, dim=1)
+        mean = torch.nn.functional.conv2d(filled * weight, kernels[:1], padding=1) / total.clamp(min=1)
+        # Between its neighbours, not beside them: their middle is at most half a cell away.
+        between = (total > 0) & (torch.hypot(x, y) <= 0.5 * total)
+        gap = (weight == 0) & between & (inside > 0)
         filled, weight = torch.where(gap, mean, filled), torch.where(gap, torch.ones_like(weight), weight)
     return DenseMap(filled, known, weight)
 
@@ -174,23 +180,34 @@ class MixedSource:
         )
 
 
-def hold_back(pixel_set: PixelSet, share: float) -> tuple[list[Entry], list[Entry]]:
-    """Entries to train on and entries held for validation: the last scenes, at least one of two or more."""
-    scenes = list(dict.fromkeys(entry.scene for entry in pixel_set.entries))
+def hold_back(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:
+    """Entries to train on and entries held for validation: a share of the scenes, at least one of two or more.
+
+    The lowest by a hash of their names: whether a scene is held does not depend on the others, as far as the
+    share allows.
+    """
+    scenes = sorted(
+        {entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest()
+    )
     count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
-    held = set(scenes[len(scenes) - min(count, len(scenes) - 1) :]) if count else set()
+    held = set(scenes[: min(count, len(scenes) - 1)])
     return (
-        [entry for entry in pixel_set.entries if entry.scene not in held],
-        [entry for entry in pixel_set.entries if entry.scene in held],
+        [entry for entry in entries if entry.scene not in held],
+        [entry for entry in entries if entry.scene in held],
     )
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What a run trains on, and what it is validated on, each with a generator of its own."""
+    """What a run trains on, and what it is validated on, each with a generator of its own.
+
+    sets: SHA-256 of the pixel sets by path; unheld: the sets of which nothing could be held back.
+    """
 
     training: PixelSource
     validation: PixelSource
+    sets: dict[str, str]
+    unheld: tuple[str, ...]
 
 
 def open_sources(
@@ -207,20 +224,36 @@ def open_sources(
     checked = replace(config.pixels, min_lights=count, max_lights=count)
     training: list[PixelSource] = []
     validation: list[PixelSource] = []
-    weights = [weight for weight in config.sources.values() if weight > 0]
-    for name, weight in config.sources.items():
-        if weight == 0:
-            continue
+    used_sources = {name: weight for name, weight in config.sources.items() if weight > 0}
+    sets = {name: open_pixel_set(Path(name)) for name in used_sources if name != GENERATOR}
+    parts = {name: hold_back(pixel_set.entries, config.held_share) for name, pixel_set in sets.items()}
+    # The same shape may stand in two sets, or twice in one: it is not trained on where it is held anywhere.
+    held_shapes = {entry.sha256["normals"] for _, held in parts.values() for entry in held}
+    unheld = []
+    for name in used_sources:
         if name == GENERATOR:
             training.append(PixelGenerator(config.pixels, generator))
             validation.append(PixelGenerator(checked, validation_generator))
             continue
-        pixel_set = open_pixel_set(Path(name))
-        used, held = hold_back(pixel_set, config.held_share)
-        training.append(PixelSetSource(pixel_set, used, config.pixels, generator))
-        validation.append(PixelSetSource(pixel_set, held or used, checked, validation_generator))
-    if len(weights) == 1:
-        return Sources(training[0], validation[0])
+        used, held = parts[name]
+        used = [entry for entry in used if entry.sha256["normals"] not in held_shapes]
+        if not used:
+            raise InputError(
+                "all its scenes are held back for validation, here or in another set",
+                path=name,
+                hint="Name each set once, or set held_share to 0",
+            )
+        if not held:
+            unheld.append(name)
+        training.append(PixelSetSource(sets[name], used, config.pixels, generator))
+        validation.append(PixelSetSource(sets[name], held or used, checked, validation_generator))
+    digests = {name: pixel_set.sha256 for name, pixel_set in sets.items()}
+    if len(training) == 1:
+        return Sources(training[0], validation[0], digests, tuple(unheld))
+    weights = list(used_sources.values())
     return Sources(
-        MixedSource(training, weights, generator), MixedSource(validation, weights, validation_generator)
+        MixedSource(training, weights, generator),
+        MixedSource(validation, weights, validation_generator),
+        digests,
+        tuple(unheld),
     )
