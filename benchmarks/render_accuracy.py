@@ -1,4 +1,4 @@
-"""How far rendered scenes are from Mitsuba 3's, and what rendering costs.
+"""How far rendered scenes are from Mitsuba 3's.
 
 python benchmarks/render_accuracy.py [--size 96] [--samples 512] [--scenes 3] [--first 1000] [--bounces 4]
 

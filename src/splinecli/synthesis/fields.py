@@ -175,7 +175,8 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
 def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
     points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
     # In pieces that stay in the processor's cache.
-    pieces = [field(points[start : start + 32_768]) for start in range(0, len(points), 32_768)]
+    starts = range(0, max(len(points), 1), 32_768)
+    pieces = [field(points[start : start + 32_768]) for start in starts]
     return np.concatenate(pieces).reshape(x.shape).astype(np.float32)
 
 

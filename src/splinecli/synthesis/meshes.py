@@ -46,6 +46,8 @@ def read_mesh(path: str | Path) -> Mesh:
         loaded = trimesh.load_mesh(path, process=True)
         # Whatever splits vertices, such as texture coordinates, would split the smooth normals too.
         loaded.merge_vertices(merge_tex=True, merge_norm=True)
+        if len(loaded.faces) and loaded.is_watertight and loaded.volume < 0:
+            loaded.invert()  # inside out: the camera would see nothing
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
         normals = np.asarray(loaded.vertex_normals) if len(faces) else np.zeros((0, 3))
     except Exception as error:  # readers of two dozen formats raise what they like

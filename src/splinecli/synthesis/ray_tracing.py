@@ -19,6 +19,8 @@ from splinecli.synthesis.meshes import Floats, Mesh
 # Rays start this far above the surface, in the camera's frame of half-width 1: float32 leaves hits uncertain by
 # 1e-7 or so, and a pixel of 128 is 0.016 wide.
 OFFSET = 1e-4
+# Points whose shadows are traced together.
+TRACED_ROWS = 16_384
 
 
 def import_extra(module: str) -> ModuleType:
@@ -102,6 +104,41 @@ class Tracer:
                 )
                 free[rows, light] = blocked < 0
         return free
+
+
+class ShadowCache:
+    """Which lights reach which vertices of the mesh, traced when first asked for."""
+
+    def __init__(self, tracer: Tracer, lights: Floats) -> None:
+        self._tracer, self._lights = tracer, lights
+        vertices = len(tracer.mesh.vertices)
+        # Rows that are never asked for take no memory.
+        self._free = np.zeros((vertices, len(lights)), dtype=bool)
+        self._known = np.zeros(vertices, dtype=bool)
+
+    def lit(self, hits: Hits) -> NDArray[np.bool_]:
+        """Which lights are free of the mesh at the vertices nearest to surface points, (N, F) bool."""
+        nearest = self._nearest(hits)
+        self._trace(nearest)
+        return self._free[nearest]
+
+    def expect(self, hits: Hits) -> None:
+        """Trace for surface points that will be asked for: many together are quicker than few at a time."""
+        self._trace(self._nearest(hits))
+
+    def _nearest(self, hits: Hits) -> NDArray[np.int64]:
+        faces = self._tracer.mesh.faces
+        return np.asarray(faces[hits.triangle, hits.weights.argmax(axis=1)], dtype=np.int64)
+
+    def _trace(self, vertices: NDArray[np.int64]) -> None:
+        new = np.unique(vertices[~self._known[vertices]])
+        mesh = self._tracer.mesh
+        for start in range(0, len(new), TRACED_ROWS):
+            some = new[start : start + TRACED_ROWS]
+            normals = mesh.vertex_normals[some]
+            origins = mesh.vertices[some] + np.float32(OFFSET) * normals
+            self._free[some] = self._tracer.lit(origins, normals @ self._lights.T > 0, self._lights)
+        self._known[new] = True
 
 
 def _packed(vectors: Floats) -> Floats:

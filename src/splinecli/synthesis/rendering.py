@@ -26,8 +26,8 @@ from splinecli.synthesis.material import Material
 from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.mixed_material import MixedMaterial
 from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.ray_tracing import OFFSET, Hits, Tracer
-from splinecli.synthesis.sampling import draw_directions
+from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer
+from splinecli.synthesis.sampling import LOBES, draw_directions
 
 SOFTEST = 0.3
 # Grazing samples are left out: a hair's width of silhouette says nothing of a pixel.
@@ -37,7 +37,6 @@ MOST_WEIGHT = 8.0
 MOST_RADIANCE = 8.0
 # Rows of (points, lights) shaded together: about a megabyte a tensor, which stays in the cache.
 SHADED_ROWS = 512
-TRACED_ROWS = 16_384
 
 Materials = Mapping[str, Material]
 Progress = Callable[[float], None]
@@ -122,30 +121,6 @@ def slice_of(pixels: NDArray[np.int64], samples: int) -> NDArray[np.int64]:
     return (pixels[:, None] * samples + np.arange(samples)).ravel()
 
 
-class ShadowCache:
-    """Which lights reach which vertices of the mesh, traced when first asked for."""
-
-    def __init__(self, tracer: Tracer, lights: Floats) -> None:
-        self._tracer, self._lights = tracer, lights
-        vertices = len(tracer.mesh.vertices)
-        # Rows that are never asked for take no memory.
-        self._free = np.zeros((vertices, len(lights)), dtype=bool)
-        self._known = np.zeros(vertices, dtype=bool)
-
-    def lit(self, hits: Hits) -> Tensor:
-        """Which lights are free of the mesh at the vertices nearest to surface points, (N, F) bool."""
-        mesh = self._tracer.mesh
-        nearest = mesh.faces[hits.triangle, hits.weights.argmax(axis=1)]
-        new = np.unique(nearest[~self._known[nearest]])
-        for start in range(0, len(new), TRACED_ROWS):
-            some = new[start : start + TRACED_ROWS]
-            normals = mesh.vertex_normals[some]
-            origins = mesh.vertices[some] + np.float32(OFFSET) * normals
-            self._free[some] = self._tracer.lit(origins, normals @ self._lights.T > 0, self._lights)
-        self._known[new] = True
-        return torch.from_numpy(self._free[nearest])
-
-
 @dataclass(frozen=True)
 class _Vertices:
     """N points on paths: surface points, unit directions (N, 3) to where the path came from, and its pixel."""
@@ -185,7 +160,9 @@ def render_indirect(
         rows = torch.arange(start, min(start + at_once, pixels))
         ordinal = torch.arange(directions).repeat(len(rows))
         pixel = rows.repeat_interleave(directions)
-        sample = pixel * view.samples_per_pixel + ordinal % view.samples_per_pixel
+        # Every sample gets directions of all lobes.
+        turn = torch.div(ordinal, len(LOBES), rounding_mode="floor")
+        sample = pixel * view.samples_per_pixel + turn % view.samples_per_pixel
         hits = view.samples.take(sample.numpy())
         towards_camera = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(pixel), 3)
         patches = torch.from_numpy(patch_of_face[hits.triangle])
@@ -259,11 +236,12 @@ def _gather(
     radiance: dict[str, Tensor],
 ) -> None:
     """Add to their pixels what all lights make of the vertices."""
+    shadows.expect(vertices.hits)
     for start in range(0, len(vertices.pixel), SHADED_ROWS):
         some = slice(start, start + SHADED_ROWS)
         hits = vertices.hits.take(np.arange(start, min(start + SHADED_ROWS, len(vertices.pixel))))
         normals, views = torch.from_numpy(hits.normal), vertices.views[some]
-        cosines = (normals @ lights.T).clamp(min=0) * shadows.lit(hits)
+        cosines = (normals @ lights.T).clamp(min=0) * torch.from_numpy(shadows.lit(hits))
         n_dot_v = (normals * views).sum(-1, keepdim=True)
         # Half way between opposite directions there is none.
         l_dot_v = (views @ lights.T).clamp(min=-0.9999)

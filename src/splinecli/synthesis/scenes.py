@@ -44,8 +44,8 @@ class SceneConfig:
 
     size: int = 128
     lights: int = 500
-    samples: int = 3
-    directions: int = 64
+    samples: int = 4
+    directions: int = 256
     bounces: int = 4
     measured_share: float = 0.0
 

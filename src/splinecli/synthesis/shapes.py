@@ -26,6 +26,7 @@ from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
 
 # Distance between the samples of the fields; 128 pixels over the frame are 0.0156 apart.
 SPACING = 0.0125
+FEWEST_FACES = 5_000
 
 
 def draw_shape(rng: np.random.Generator) -> tuple[str, Mesh]:
@@ -47,7 +48,7 @@ def draw_shape_of_kind(name: str, rng: np.random.Generator) -> Mesh:
     while True:
         mesh = KINDS[name](rng)
         # A cut now and then leaves nothing or crumbs.
-        if mesh is not None and len(mesh.faces) > 5_000:
+        if mesh is not None and len(mesh.faces) > FEWEST_FACES:
             return mesh
 
 

@@ -1,0 +1,89 @@
+"""Meshes as files give them, and as rendering needs them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splinecli.errors import InputError
+from splinecli.synthesis.meshes import REACH, Mesh, fit_to_frame, read_mesh, split_long_edges
+
+trimesh: Any = pytest.importorskip("trimesh", reason="needs the extra 'render'")
+
+
+def outward_volume(mesh: Mesh) -> float:
+    """The volume that the faces enclose: positive where they are anticlockwise from outside."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def area(mesh: Mesh) -> float:
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(np.linalg.norm(facing, axis=1).sum() / 2)
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj", "stl", "off", "glb"])
+def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"ball.{ending}"
+    trimesh.creation.icosphere(subdivisions=4, radius=17.0).apply_translation((5, -3, 40)).export(path)
+    mesh = read_mesh(path)
+    assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
+    assert np.abs(mesh.vertices).max() == pytest.approx(REACH, abs=1e-3)
+    # Normals interpolated along the edges of a fine ball stay within its facets' own angles.
+    outward = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    assert (outward * mesh.vertex_normals).sum(axis=1).min() > 0.999
+    edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
+    assert np.linalg.norm(edges, axis=2).max() <= 0.03
+
+
+def test_the_wider_side_fits_and_the_shape_is_kept() -> None:
+    box = trimesh.creation.box((4.0, 1.0, 2.0))
+    vertices = box.vertices.astype(np.float32) + np.float32(3)
+    mesh = fit_to_frame(Mesh(vertices, box.faces.astype(np.int32), box.vertex_normals.astype(np.float32)))
+    extent = np.ptp(mesh.vertices, axis=0)
+    np.testing.assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
+    np.testing.assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
+
+
+def test_a_ball_inside_out_is_turned(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.invert()
+    ball.export(tmp_path / "inverted.ply")
+    assert outward_volume(read_mesh(tmp_path / "inverted.ply")) > 0
+
+
+def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = Mesh(
+        box.vertices.astype(np.float32), box.faces.astype(np.int32), box.vertex_normals.astype(np.float32)
+    )
+    fine = split_long_edges(mesh, longest=0.1)
+    assert len(fine.faces) > 600
+    assert area(fine) == pytest.approx(area(mesh), rel=1e-6)
+    assert outward_volume(fine) == pytest.approx(outward_volume(mesh), rel=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(fine.vertex_normals, axis=1), 1, atol=1e-6)
+    # What is fine enough already stays as it is, and the number of faces has its limit.
+    assert len(split_long_edges(mesh, longest=2.0).faces) == len(mesh.faces)
+    assert len(split_long_edges(mesh, longest=0.01, most_faces=5000).faces) <= 5000
+
+
+def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no such mesh file"):
+        read_mesh(tmp_path / "missing.ply")
+    (tmp_path / "broken.ply").write_text("ply, but not really")
+    with pytest.raises(InputError, match=r"broken\.ply: not a mesh that can be read"):
+        read_mesh(tmp_path / "broken.ply")
+    (tmp_path / "notes.txt").write_text("v 0 0 0")
+    with pytest.raises(InputError, match="not a mesh that can be read"):
+        read_mesh(tmp_path / "notes.txt")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    with pytest.raises(InputError, match=r"points\.obj: .*(no faces|not a mesh)"):
+        read_mesh(tmp_path / "points.obj")
+    # A triangle seen from its edge alone, along the viewing direction, has no width in the image.
+    (tmp_path / "needle.obj").write_text("v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n")
+    with pytest.raises(InputError, match="no extent that a camera along -z could see"):
+        read_mesh(tmp_path / "needle.obj")

@@ -1,0 +1,128 @@
+"""Scenes: reproducible one by one, and drawn from the ranges of CyclesPS."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("embreex", reason="needs the extra 'render'")
+
+from splinecli.errors import UsageError
+from splinecli.synthesis.meshes import Mesh
+from splinecli.synthesis.scenes import (
+    CLASSES,
+    MIN_LIGHT_Z,
+    SceneConfig,
+    draw_class,
+    draw_lights,
+    draw_patches,
+    draw_scene,
+    render_scene,
+)
+
+SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
+
+
+def tent() -> Mesh:
+    """Two slopes that meet in a valley along y."""
+    corners = np.array([(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32)
+    faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)], np.int32)
+    slope = np.sqrt(0.5)
+    normals = np.array(
+        [(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2
+    )
+    return Mesh(corners, faces, normals.astype(np.float32))
+
+
+def test_a_scene_depends_on_its_seed_and_index_alone() -> None:
+    rendered = [render_scene(draw_scene(7, index, SMALL, tent()), SMALL) for index in (0, 1, 0)]
+    for name in CLASSES:
+        assert np.array_equal(rendered[0].observations[name], rendered[2].observations[name])
+        assert not np.array_equal(rendered[0].observations[name], rendered[1].observations[name])
+    assert not np.array_equal(rendered[0].light_directions, rendered[1].light_directions)
+    other = render_scene(draw_scene(8, 0, SMALL, tent()), SMALL)
+    assert not np.array_equal(rendered[0].light_directions, other.light_directions)
+
+
+def test_what_is_rendered() -> None:
+    rendered = render_scene(draw_scene(0, 0, SMALL, tent()), SMALL)
+    pixels = rendered.mask.sum()
+    assert rendered.mask.shape == (16, 16)
+    assert pixels == 256  # the slopes fill the frame
+    assert rendered.normals.shape == (pixels, 3)
+    for name in CLASSES:
+        assert rendered.observations[name].shape == (pixels, 24)
+        assert rendered.observations[name].dtype == np.float32
+        assert np.isfinite(rendered.observations[name]).all()
+        assert (rendered.observations[name] >= 0).all()
+    # The slopes light each other: without bounces the valley is darker, and nowhere brighter.
+    direct = SceneConfig(**{**SMALL.__dict__, "bounces": 0})
+    alone = render_scene(draw_scene(0, 0, direct, tent()), direct)
+    for name in CLASSES:
+        added = rendered.observations[name] - alone.observations[name]
+        assert added.min() > -1e-6
+        assert added.mean() > 0.01 * alone.observations[name].mean()
+
+
+def test_lights_cover_the_upper_hemisphere() -> None:
+    lights = draw_lights(500, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(lights, axis=1), 1, atol=1e-5)
+    assert (lights[:, 2] > MIN_LIGHT_Z).all()
+    # Uniform by solid angle: z is uniform over 0..1, and every direction has a light within a few mean distances.
+    assert np.histogram(lights[:, 2], bins=5, range=(0, 1))[0] == pytest.approx(100, abs=15)
+    probes = np.random.default_rng(1).normal(size=(500, 3))
+    probes[:, 2] = np.abs(probes[:, 2])
+    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
+    assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12
+
+
+@pytest.mark.parametrize(
+    ("name", "metallic", "specular", "roughness"),
+    [("diffuse", 0, (0, 1), (0, 1)), ("specular", 0, (0, 4), (0, 1)), ("metallic", 1, (0, 1), (0.3, 0.7))],
+)
+def test_materials_of_the_classes(
+    name: str, metallic: float, specular: tuple[float, float], roughness: tuple[float, float]
+) -> None:
+    material = draw_class(name, 4000, torch.Generator().manual_seed(0))
+    assert (material.metallic == metallic).all()
+    for values, (low, high) in (
+        (material.specular, specular),
+        (material.roughness, roughness),
+        (material.base, (0, 1)),
+    ):
+        assert low <= values.min() and values.max() <= high
+        # The mean of a uniform distribution, to 5 standard errors.
+        assert values.mean().item() == pytest.approx(
+            (low + high) / 2, abs=5 * (high - low) / np.sqrt(12 * 4000)
+        )
+
+
+def test_patches_are_connected_areas_of_about_one_size() -> None:
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(31), np.arange(31)), axis=-1).reshape(-1, 2) / 15 - 1
+    vertices = np.column_stack((grid, np.zeros(len(grid)))).astype(np.float32)
+    corner = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
+    faces = np.concatenate(
+        (np.stack((corner, corner + 1, corner + 32), 1), np.stack((corner, corner + 32, corner + 31), 1))
+    )
+    mesh = Mesh(
+        vertices, faces.astype(np.int32), np.tile(np.array([[0, 0, 1]], np.float32), (len(vertices), 1))
+    )
+    patches = draw_patches(mesh, 20, rng)
+    assert patches.shape == (1800,)
+    assert set(np.unique(patches)) <= set(range(20))
+    centres = vertices[faces].mean(axis=1)
+    for patch in np.unique(patches):
+        here = centres[patches == patch]
+        # Voronoi cells are convex: their middle belongs to them, or to the face next to it.
+        middle = np.linalg.norm(centres - here.mean(axis=0), axis=1).argsort()[:6]
+        assert (patches[middle] == patch).any()
+
+
+@pytest.mark.parametrize("name", ["size", "lights", "samples", "directions", "bounces"])
+def test_settings_out_of_range(name: str) -> None:
+    with pytest.raises(UsageError, match=f"{name} is -1"):
+        SceneConfig(**{name: -1})
+    with pytest.raises(UsageError, match="measured_share is 2"):
+        SceneConfig(measured_share=2)

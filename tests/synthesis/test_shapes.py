@@ -1,0 +1,133 @@
+"""Procedural shapes: sound surfaces, true normals, hollows, and fields against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splinecli.synthesis import fields
+from splinecli.synthesis.meshes import REACH, Floats, Mesh
+from splinecli.synthesis.shapes import KINDS, draw_rotation, draw_shape, draw_shape_of_kind
+
+pytest.importorskip("skimage", reason="needs the extra 'render'")
+
+
+def points(count: int = 2000, seed: int = 0) -> Floats:
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
+
+
+def volume(mesh: Mesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        fields.ellipsoid(np.full(3, 0.5, np.float32)),
+        fields.box(np.array((0.5, 0.3, 0.7), np.float32), 0.1),
+        fields.torus(0.5, 0.2),
+        fields.capsule(0.4, 0.2),
+    ],
+)
+def test_solids_are_true_distances(field: fields.Field) -> None:
+    at = points()
+    slope = np.linalg.norm(fields.gradient(field, at), axis=1)
+    # But on the creases of the box's inside and on axes, which few points are near, distance grows at unit rate.
+    assert np.abs(slope - 1).mean() < 0.01
+    # And a step along it by the distance meets the surface.
+    foot = at - field(at)[:, None] * fields.gradient(field, at)
+    outside = field(at) > 0.01
+    assert np.abs(field(foot))[outside].max() < 2e-3
+
+
+def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
+    first, second = points(seed=1)[:, 0], points(seed=2)[:, 0]
+    union = fields.smooth_union(first, second, 0.1)
+    apart = np.abs(first - second) > 0.1
+    np.testing.assert_array_equal(union[apart], np.minimum(first, second)[apart])
+    below = np.minimum(first, second) - union
+    assert below.min() >= -1e-7
+    assert below.max() == pytest.approx(0.025, abs=1e-3)  # a quarter of the blend, where both are alike
+    cut = fields.smooth_cut(first, second, 0.1)
+    np.testing.assert_allclose(
+        cut[np.abs(first + second) > 0.1], np.maximum(first, -second)[np.abs(first + second) > 0.1]
+    )
+
+
+def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
+    mesh = fields.triangulate(fields.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
+    assert mesh is not None
+    assert np.abs(fields.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
+    ring = mesh.vertices * (1, 1, 0)
+    centre = 0.6 * ring / np.linalg.norm(ring, axis=1, keepdims=True)
+    expected = (mesh.vertices - centre) / 0.25
+    assert (expected * mesh.vertex_normals).sum(axis=1).min() > 0.9999
+    # Anticlockwise from outside, closed, and of the volume 2 pi^2 R r^2.
+    assert volume(mesh) == pytest.approx(2 * np.pi**2 * 0.6 * 0.25**2, rel=0.01)
+
+
+def test_crumbs_and_the_empty_field_are_dropped() -> None:
+    def two_balls(at: Floats) -> Floats:
+        large = np.linalg.norm(at, axis=1) - np.float32(0.5)
+        small = np.linalg.norm(at - np.float32(0.8), axis=1) - np.float32(0.1)
+        return np.minimum(large, small)
+
+    mesh = fields.triangulate(two_balls, (1.0, 1.0, 1.0), 0.04)
+    assert mesh is not None
+    assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.51
+    assert fields.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
+
+
+def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = fields.waves(np.random.default_rng(0), 1.0)
+
+    def lumps(at: Floats) -> Floats:
+        return np.linalg.norm(at, axis=1) - np.float32(0.6) - np.float32(0.05) * noise(at)
+
+    sparse = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
+    monkeypatch.setattr(fields, "COARSE", 1)
+    dense = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
+    assert sparse is not None and dense is not None
+    assert len(sparse.faces) == len(dense.faces)
+    np.testing.assert_allclose(volume(sparse), volume(dense), rtol=1e-5)
+
+
+def test_rotations_are_rotations() -> None:
+    rotation = draw_rotation(np.random.default_rng(0)).astype(np.float64)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(rotation) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A coarser field, for speed.
+    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.025)
+    mesh = draw_shape_of_kind(kind, np.random.default_rng(5))
+    assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
+    assert mesh.faces.min() == 0 and mesh.faces.max() == len(mesh.vertices) - 1
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
+    assert volume(mesh) > 0
+    reach = np.abs(mesh.vertices[:, :2]).max()
+    # A relief goes beyond the frame, so that no pixel sees its edge.
+    assert reach > 1 if kind == "relief" else reach == pytest.approx(REACH, abs=1e-4)
+    corners = mesh.vertices[mesh.faces]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    agreement = (facing * mesh.vertex_normals[mesh.faces].mean(axis=1)).sum(axis=1)
+    # Facets turn away from the field's normals in creases alone.
+    assert np.quantile(agreement, 0.1) > 0.9
+    # A convex body lies on one side of all its tangent planes; of these surfaces a good part lies outside some.
+    rng = np.random.default_rng(0)
+    here, there = (rng.integers(len(mesh.vertices), size=4000) for _ in range(2))
+    above = ((mesh.vertices[there] - mesh.vertices[here]) * mesh.vertex_normals[here]).sum(axis=1) > 0.02
+    assert above.mean() > 0.03
+
+
+def test_the_same_generator_draws_the_same_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
+    (kind, one), (same, other) = (draw_shape(np.random.default_rng(3)) for _ in range(2))
+    assert kind == same
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    np.testing.assert_array_equal(one.faces, other.faces)
