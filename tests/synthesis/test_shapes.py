@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splinecli.synthesis import fields
+from splinecli.synthesis import fields, shapes
 from splinecli.synthesis.meshes import REACH, Floats, Mesh
 from splinecli.synthesis.shapes import KINDS, draw_rotation, draw_shape, draw_shape_of_kind
 
@@ -131,3 +131,14 @@ def test_the_same_generator_draws_the_same_shape(monkeypatch: pytest.MonkeyPatch
     assert kind == same
     np.testing.assert_array_equal(one.vertices, other.vertices)
     np.testing.assert_array_equal(one.faces, other.faces)
+
+
+def test_evenly_spread_places_give_each_kind_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shapes, "draw_shape_of_kind", lambda name, rng: name)
+    drawn = [draw_shape(np.random.default_rng(0), (place + 0.5) / 100)[0] for place in range(100)]
+    assert {kind: drawn.count(kind) for kind in KINDS} == {
+        "carved": 40,
+        "rough": 20,
+        "relief": 15,
+        "vessel": 25,
+    }

@@ -113,7 +113,9 @@ def draw_scene(
         drawn = draw_measured(patches, generator) if draw_measured is not None and measured else None
         materials[name] = draw_class(name, patches, generator) if drawn is None else drawn
     # The shape comes last: what was drawn before does not depend on how much it draws.
-    shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng)
+    # Multiples of the golden ratio: even a set of a few scenes has several kinds.
+    place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
+    shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng, place)
     patch_of_face = draw_patches(mesh, patches, rng)
     return Scene(f"{index:05d}", shape, mesh, lights, materials, patch_of_face, render_seed)
 
