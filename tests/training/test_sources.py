@@ -406,14 +406,14 @@ def test_arrays_are_let_go_without_changing_what_is_drawn(
     pixel_set = make_set()
     kept = source_of(pixel_set)
     expected = [kept.draw(50) for _ in range(6)]
-    assert set(kept._arrays) == {0, 1, 2}
-    assert kept._touched > 300 * 2 * 4096
-    # After 60 pixels, of two pages and a row each.
-    monkeypatch.setattr(sources, "_PAGES_BYTES", 60 * 2 * 4096)
+    assert set(kept._observations) == {0, 1, 2}
+    assert kept._touched > 300 * 65_536
+    # After 60 pixels, of what is mapped around each row.
+    monkeypatch.setattr(sources, "_MAPPED_BYTES", 60 * 65_536)
     freed = source_of(pixel_set)
     open_after = []
     for wanted in expected:
         assert_same(freed.draw(50), wanted)
-        open_after.append(len(freed._arrays))
+        open_after.append(len(freed._observations))
     assert open_after == [3, 0, 3, 0, 3, 0]
     assert freed._touched == 0

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import InputError
@@ -18,13 +19,13 @@ from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, joi
 from splinecli.synthesis.lights import draw_light_counts
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.pixel_sets import Entry, Pixels, PixelSet, open_pixel_set
+from splinecli.training.pixel_sets import Entry, PixelSet, open_pixel_set
 
 FILL_STEPS = 3
 """Gaps of a dense map are interpolated up to so many cells from a light."""
 
-_PAGES_BYTES = 256 << 20  # mapped pages are let go when about so many bytes of them were touched
-_PAGE = 4096
+_MAPPED_BYTES = 128 << 20  # mapped pages are let go when about so many bytes of them were touched
+_AROUND_BYTES = 64 << 10  # what the system maps around a page that is touched
 
 
 class PixelSource(Protocol):
@@ -99,7 +100,8 @@ class PixelSetSource:
         self.config = config
         self.generator = generator
         self._ends = torch.tensor([entry.n_pixels for entry in entries]).cumsum(0)
-        self._arrays: dict[int, Pixels] = {}
+        self._observations: dict[int, NDArray[np.floating]] = {}
+        self._small: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._touched = 0
 
     def draw(self, pixels: int) -> PixelBatch:
@@ -138,24 +140,29 @@ class PixelSetSource:
         known = np.zeros((pixels, lights), np.bool_)
         normals = np.empty((pixels, 3), np.float32)
         for index in present:
-            entry, arrays = self.entries[index], self._mapped(index)
+            entry = self.entries[index]
+            observations, entry_normals, entry_directions = self._mapped(index)
             here = (which == index).numpy()
             rows = (flat[which == index] - (self._ends[index] - entry.n_pixels)).numpy()
-            radiance[here, : entry.n_lights] = arrays.observations[rows]
-            directions[here, : entry.n_lights] = arrays.light_directions
+            radiance[here, : entry.n_lights] = observations[rows]
+            directions[here, : entry.n_lights] = entry_directions
             known[here, : entry.n_lights] = True
-            normals[here] = arrays.normals[rows]
-            self._touched += len(rows) * (2 * _PAGE + arrays.observations[0].nbytes)
-        if self._touched > _PAGES_BYTES:
-            self._arrays, self._touched = {}, 0
+            normals[here] = entry_normals[rows]
+            self._touched += len(rows) * (_AROUND_BYTES + observations[0].nbytes)
+        if self._touched > _MAPPED_BYTES:
+            self._observations, self._touched = {}, 0
         return SampledScene(
             *(torch.from_numpy(array).to(device) for array in (normals, radiance, directions, known))
         )
 
-    def _mapped(self, index: int) -> Pixels:
-        if index not in self._arrays:
-            self._arrays[index] = self.pixel_set.load(self.entries[index])
-        return self._arrays[index]
+    def _mapped(self, index: int) -> tuple[NDArray[np.floating], NDArray[np.float32], NDArray[np.float32]]:
+        """Observations, which stay on disk, normals and light directions, which are small."""
+        if index not in self._observations:
+            pixels = self.pixel_set.load(self.entries[index])
+            self._observations[index] = pixels.observations
+            if index not in self._small:
+                self._small[index] = np.array(pixels.normals), np.array(pixels.light_directions)
+        return self._observations[index], *self._small[index]
 
 
 class MixedSource:
