@@ -73,4 +73,11 @@ def _mend_streams() -> None:
 def run() -> None:
     """The console script. SIGTERM, which job schedulers send, ends as cleanly as Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.exit(main())
+    code = main()
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        # PyTorch's communication threads now and then abort a process of torchrun that ends by itself, after all
+        # is done; torchrun would take that for a failure.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)

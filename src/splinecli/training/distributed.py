@@ -100,14 +100,16 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(device)
     if not dist.is_initialized():
-        store, rank, count = next(rendezvous("env://"))
-        if os.environ.get("LOCAL_WORLD_SIZE") == str(count):
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        attempt = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+        if attempt and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
             # torchrun keeps its store over a restart: the addresses of processes that are gone still stand in
             # it. Only on one machine do all processes agree on the number of the attempt.
-            attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+            store, rank, count = next(rendezvous("env://"))
             store = PrefixStore(f"splinecli attempt {attempt}", store)
-        backend = "nccl" if device.type == "cuda" else "gloo"
-        dist.init_process_group(backend, store=store, rank=rank, world_size=count)
+            dist.init_process_group(backend, store=store, rank=rank, world_size=count)
+        else:
+            dist.init_process_group(backend)
     return Workers(dist.get_rank(), dist.get_world_size()), device
 
 
