@@ -66,15 +66,15 @@ def prepare(
     if not sources and not scenes and not mesh:
         raise UsageError("nothing to prepare", hint="Name a SOURCE, or ask for --scenes N or --mesh FILE")
     check_writable(output)
-    for source in sources or []:
-        find_captures(source)  # a wrong one is refused before anything is made
+    # Wrong ones are refused before anything is made.
+    folders = [folder for source in sources or [] for folder in find_captures(source)]
     plan = _plan(scenes, mesh or [], seed, size, lights, measured, measured_share)
     talk = Talk(quiet=quiet)
     skipped: list[dict[str, str]] = []
     with held_folder(output):
         writer = PixelSetWriter(output)
-        captures, scene_names = name_captures(sources or [], writer), plan.names()
-        with talk.progress("preparing", len(captures) + len(scene_names)) as advance:
+        captures = name_captures(folders, writer)
+        with talk.progress("preparing", len(captures) + len(plan.names)) as advance:
             for name, folder in captures.items():
                 try:
                     add_capture(writer, name, folder)
@@ -83,7 +83,7 @@ def prepare(
                     skipped.append({"source": str(folder), "reason": str(error)})
                     print(f"splinecli: {error}", file=sys.stderr)
                 advance(1)
-            for position in range(len(scene_names)):
+            for position in range(len(plan.names)):
                 done = _Share(advance)
                 for name in add_scene(writer, plan, position, done.reach):
                     talk.say(writer.describe(name))

@@ -143,8 +143,7 @@ def _configure(
 def _sources(sets: list[Path], generator_weight: float | None) -> dict[str, float]:
     from splinecli.training.config import GENERATOR
 
-    # Absolute, so that a run can be taken up from another folder.
-    weights = {str(path.absolute()): 1.0 for path in sets}
+    weights = {str(path): 1.0 for path in sets}
     share = generator_weight if generator_weight is not None else 0.0 if sets else 1.0
     return {**weights, GENERATOR: share} if share else weights
 

@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from splinecli.errors import ModelError
-from splinecli.files import write_bytes
+from splinecli.files import file_sha256, write_bytes
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 
@@ -113,7 +113,7 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
         if not torch.isfinite(tensor).all():
             raise ModelError(f"tensor {key!r} holds values that are not finite", path=path)
     network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return LoadedNetwork(network, name or path.stem, hashlib.sha256(path.read_bytes()).hexdigest())
+    return LoadedNetwork(network, name or path.stem, file_sha256(path))
 
 
 def shipped_names() -> list[str]:

@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import InputError, OutputError
-from splinecli.files import LOCK, check_writable, current_umask, refusals_as_output_errors, write_text
+from splinecli.files import (
+    LOCK,
+    check_writable,
+    current_umask,
+    file_sha256,
+    refusals_as_output_errors,
+    write_text,
+)
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"
@@ -134,7 +141,7 @@ class PixelSetWriter:
             work.mkdir()
             for array in ARRAYS:
                 np.save(work / f"{array}.npy", getattr(pixels, array), allow_pickle=False)
-            checksums = {array: _sha256(work / f"{array}.npy") for array in ARRAYS}
+            checksums = {array: file_sha256(work / f"{array}.npy") for array in ARRAYS}
             work.chmod(0o777 & ~current_umask())
             if folder.exists():  # of a run that was killed between this rename and its manifest
                 shutil.rmtree(folder)
@@ -181,7 +188,7 @@ def open_pixel_set(folder: Path) -> PixelSet:
     for entry in pixel_set.entries:
         for array, expected in entry.sha256.items():
             path = folder / entry.name / f"{array}.npy"
-            found = _sha256(path) if path.is_file() else "no such file"
+            found = file_sha256(path) if path.is_file() else "no such file"
             if found != expected:
                 raise InputError(
                     f"does not match the manifest: found {found[:16]}, expected SHA-256 {expected[:16]}...",
@@ -250,8 +257,3 @@ def _entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
     if not complete:
         raise InputError("an entry is incomplete (a checksum is missing)", path=folder / MANIFEST)
     return entries
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

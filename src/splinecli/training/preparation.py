@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -12,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture import CaptureFiles, capture_name, find_captures, open_capture
+from splinecli.capture import CaptureFiles, capture_name, open_capture
 from splinecli.errors import InputError
+from splinecli.files import file_sha256
 from splinecli.synthesis.measured import MeasuredLibrary
 from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.meshes import read_mesh
@@ -26,27 +28,27 @@ RENDERER = 1
 _MESH_INDICES = 1_000_000
 
 
-def name_captures(sources: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
-    """The captures in folders of captures, datasets and CyclesPS trees, by the name of their entries.
+def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
+    """The folders of captures by the name of their entries; one that is there twice counts once.
 
     A capture keeps the name that it has in the set; a new one gets its own, with a number where that is taken.
-
-    Raises:
-        InputError: a source holds no capture.
     """
-    # A folder that is named twice counts once: its pixels must not be held back and trained on.
-    folders = {folder.resolve(): folder for source in sources for folder in find_captures(source)}
     captures: dict[str, Path] = {}
-    for folder in folders.values():
-        name = plain = capture_name(folder)
-        count = 1
-        while name in captures or (
-            name in writer and writer.recipe_of(name).get("source") != str(folder.resolve())
-        ):
-            count += 1
-            name = f"{plain}-{count}"
-        captures[name] = folder
+    # A capture's pixels must not be both held back and trained on.
+    for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
+
+        def is_taken(name: str, source: str = str(resolved)) -> bool:
+            others = name in writer and writer.recipe_of(name).get("source") != source
+            return name in captures or others
+
+        captures[_number(capture_name(folder), is_taken)] = folder
     return captures
+
+
+def _number(name: str, is_taken: Callable[[str], bool]) -> str:
+    """The name, with the first number from 2 that makes it free where it is taken."""
+    numbered = (f"{name}-{count}" for count in itertools.count(2))
+    return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
 
 
 def _fingerprint(files: CaptureFiles) -> str:
@@ -111,32 +113,27 @@ class ScenePlan:
         """The measured materials. Raises InputError."""
         return None if self.measured_materials is None else read_measured(self.measured_materials)
 
-    def names(self) -> list[str]:
+    @cached_property
+    def names(self) -> tuple[str, ...]:
         """The scenes' names: of the meshes after their files, numbered where two are called the same."""
         names: list[str] = []
         for path in self.meshes:
-            name, count = path.stem, 1
-            while name in names:
-                count += 1
-                name = f"{path.stem}-{count}"
-            names.append(name)
-        return [*names, *(f"scene{index:04}" for index in range(self.count))]
+            names.append(_number(path.stem, names.__contains__))
+        return (*names, *(f"scene{index:04}" for index in range(self.count)))
+
+    @cached_property
+    def _materials_sha256(self) -> str | None:
+        return None if self.measured_materials is None else file_sha256(self.measured_materials)
 
     def recipe(self, position: int) -> dict[str, Any]:
         """What decides the content of a scene."""
-        materials = self.measured_materials
-        mesh = self.meshes[position] if position < len(self.meshes) else None
         return {
             "renderer": RENDERER,
             **asdict(self.config),
             "seed": self.seed,
-            "mesh": None if mesh is None else _sha256(mesh),
-            "measured_materials": None if materials is None else _sha256(materials),
+            "mesh": file_sha256(self.meshes[position]) if position < len(self.meshes) else None,
+            "measured_materials": self._materials_sha256,
         }
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def add_scene(
@@ -152,7 +149,7 @@ def add_scene(
         OutputError: an entry cannot be written, or is there in another way.
         UsageError: the packages of the extra `render` are missing.
     """
-    scene_name, recipe = plan.names()[position], plan.recipe(position)
+    scene_name, recipe = plan.names[position], plan.recipe(position)
     names = {kind: f"{scene_name}-{kind}" for kind in CLASSES}
     if all(writer.holds(name, recipe) for name in names.values()):
         return list(names.values())
