@@ -17,7 +17,7 @@ import time
 import torch
 
 from splinecli.devices import choose_precision
-from splinecli.methods.spline_net import Precision, SplineNetEstimator
+from splinecli.methods.networks import NetworkEstimator, Precision
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork, resolve_weights
@@ -29,7 +29,7 @@ def pixels_per_second(loaded: LoadedNetwork, precision: Precision, pixels: int, 
     config = PixelGeneratorConfig(min_lights=10, max_lights=10)
     batch = PixelGenerator(config, torch.Generator().manual_seed(0)).draw(pixels)
     observations, lights = batch.observations.numpy(), batch.light_directions[0].double().numpy()
-    estimator = SplineNetEstimator(loaded, precision=precision)
+    estimator = NetworkEstimator("spline-net", loaded, precision=precision)
     seconds = []
     for _ in range(repeats + 1):
         started = time.perf_counter()

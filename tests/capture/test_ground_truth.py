@@ -12,6 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from splinecli.capture import read_normals
+from splinecli.capture.ground_truth import read_ground_truth
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, encode_picture, unit
 
@@ -139,6 +140,20 @@ def test_damaged_and_unknown_files(tmp_path: Path, normals: NDArray[np.float64])
     (tmp_path / "a.exr").touch()
     with pytest.raises(InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png or \.tif'):
         read_normals(tmp_path / "a.exr", SHAPE, MASK)
+
+
+def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    # As in the normal.txt of DiLiGenT's Harvest: the rows alone, the vectors are right.
+    path = write(tmp_path / "normal.txt", normals[::-1])
+    read, upside_down = read_ground_truth(path, SHAPE, MASK)
+    assert upside_down
+    np.testing.assert_allclose(read, normals, atol=2e-7)
+    assert not read_ground_truth(write(path, normals), SHAPE, MASK)[1]
+    # A mask that is its own mirror image tells nothing.
+    full = np.ones(SHAPE, bool)
+    np.testing.assert_allclose(
+        read_normals(write(path, normals[::-1]), SHAPE, full), normals[::-1], atol=2e-7
+    )
 
 
 def test_nothing_is_unpickled(tmp_path: Path) -> None:

@@ -94,6 +94,14 @@ def test_refusals(dataset, run, golden):
         (2, [dataset, "--n-lights", 4, "--draws", "draws.txt"]),
         (3, [dataset, "--draws", "draws.txt"]),
         (2, [dataset, "--method", "ls", "--n-lights", 9]),
+        (2, [dataset, "--method", "ls", "--skip-first", "shaded"]),
+        (2, [dataset, "--method", "ls", "--skip-first", "=3"]),
+        (2, [dataset, "--method", "ls", "--n-lights", 4, "--skip-first", "cow=3"]),
+        (2, [dataset, "--method", "ls", "--n-lights", "all", "--skip-first", 6]),
+        (2, [dataset, "--method", "ls", "--pixel", "3,4"]),
+        (2, [dataset, "--method", "ls", "--pixel", "3", "--figures"]),
+        (2, [dataset, "--jobs", 0]),
+        (4, [dataset, "--method", "cnn-ps", "--weights", "spline-net", "--n-lights", 4]),
     ):
         result = run("evaluate", *arguments)
         assert (result.code, result.out) == (code, ""), arguments
@@ -108,3 +116,79 @@ def test_a_wide_table_is_turned_and_never_cut(make_capture, run, golden):
     result = run("evaluate", "data", "--method", "ls", "--n-lights", "all")
     golden("evaluate_wide.txt", result.out)
     assert "capture_number_8[red]" in result.out
+
+
+def test_every_file_is_there_and_goes_on(dataset, run):
+    arguments = ["evaluate", dataset, "--method", "ls", "--method", "iw12", "--n-lights", 4, "--n-lights", 5]
+    first = run(*arguments, "--trials", 2, "--json")
+    assert first.code == 0
+    names = [
+        "lights.png",
+        "report.html",
+        "results.csv",
+        "results.json",
+        "table.md",
+        "table.tex",
+        "trials.jsonl",
+    ]
+    assert sorted(path.name for path in Path("evaluation").iterdir() if path.name != ".lock") == names
+    assert "iw12" in Path("evaluation/report.html").read_text()
+    kept = Path("evaluation/trials.jsonl").read_text()
+    assert len(kept.splitlines()) == 2 * 2 * 2 * 2
+    more = json.loads(run(*arguments, "--trials", 3, "--json").out)
+    assert Path("evaluation/trials.jsonl").read_text().startswith(kept)
+    assert len(Path("evaluation/trials.jsonl").read_text().splitlines()) == 2 * 2 * 2 * 3
+    for before, after in zip(json.loads(first.out)["results"], more["results"], strict=True):
+        assert after["maes_deg"][:2] == before["maes_deg"]
+    # Fewer light counts make no plot, and leave none behind.
+    assert run(*arguments[:-2], "--trials", 3).code == 0
+    assert not Path("evaluation/lights.png").exists()
+    assert run(*arguments, "--trials", 3, "--overwrite", "--jobs", 1).code == 0
+    assert len(Path("evaluation/trials.jsonl").read_text().splitlines()) == 2 * 2 * 2 * 3
+
+
+def test_figures(dataset, run):
+    arguments = [
+        "--n-lights",
+        4,
+        "--trials",
+        1,
+        "--max-pixels",
+        30,
+        "--figures",
+        "--pixel",
+        "9,10",
+        "--pixel",
+        "12,5",
+    ]
+    result = run("evaluate", dataset, "--method", "ls", "--method", "spline-net", *arguments)
+    assert result.code == 0
+    names = [f"{name}{suffix}.png" for name in ("matte", "shaded") for suffix in ("", "_observation_maps")]
+    assert sorted(path.name for path in Path("evaluation/figures").iterdir()) == sorted(names)
+    maps = cv2.imread("evaluation/figures/shaded.png")
+    assert maps.shape[1] > maps.shape[0]
+    assert Path("evaluation/report.html").read_text().count("data:image/png") == 4
+    outside = run("evaluate", dataset, "--method", "spline-net", *arguments[:-1], "0,0")
+    assert outside.code == 2
+    assert "row 0, column 0 of matte has no ground truth" in outside.err
+
+
+def test_images_left_out_are_noted(dataset, run):
+    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--skip-first", "shaded=2")
+    assert result.err == "splinecli: note: shaded: the first 2 images are left out.\n"
+    document = json.loads(Path("evaluation/results.json").read_text())
+    assert document["protocol"]["skip_first"] == {"shaded": 2}
+    assert document["notes"] == ["shaded: the first 2 images are left out."]
+    # Light 1 was the shadowed one.
+    assert all(result["mae_deg"] < 1e-3 for result in document["results"])
+
+
+def test_all_methods_by_one_word(dataset, run):
+    document = json.loads(
+        run(
+            "evaluate", dataset / "matte", "--method", "all", "--n-lights", "all", "--max-pixels", 9, "--json"
+        ).out
+    )
+    from splinecli.methods import method_names
+
+    assert [result["method"] for result in document["results"]] == method_names()

@@ -113,7 +113,7 @@ def test_network_on_a_matte_sphere(capture, run):
 def test_three_lights_are_warned_about(capture, run):
     result = run("infer", capture, "--light-indices", "1,2,3")
     assert result.code == 0
-    assert "trained with 4 lights and more" in result.err
+    assert "trained with 4 to 96 lights, not 3" in result.err
     assert any("trained with 4" in text for text in read_report(Path("out/sphere"))["warnings"])
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from splinecli.capture import read_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.draws import draw_lights
-from splinecli.evaluation.protocol import Progress, Protocol, evaluate
+from splinecli.evaluation.protocol import Protocol, TrialStore, evaluate, evaluate_all
 from splinecli.methods import make_estimator
 
 WriteDome = Callable[..., Path]
@@ -25,7 +26,7 @@ N_PIXELS = 100
 class Fake:
     """Gives the folder's truth, turned by the next of the angles; remembers what it saw."""
 
-    weights, device, precision = None, "cpu", "float64"
+    weights, device, precision, fingerprint = None, "cpu", "float64", "fake"
 
     def __init__(self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake") -> None:
         self.name = name
@@ -52,9 +53,10 @@ class Constant(Fake):
     """Gives one vector for every pixel, whatever it sees."""
 
     def __init__(self, vector: Sequence[float]) -> None:
-        self.name, self._vector = "constant", vector
+        self.name, self._vector, self.lights = "constant", vector, []
 
     def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+        self.lights.append(lights)
         return np.tile(self._vector, (len(observations), 1))
 
 
@@ -233,18 +235,120 @@ def test_normals_that_are_none_are_not_scored(write_dome: WriteDome, vector: Seq
 
 def test_progress(write_dome: WriteDome) -> None:
     folders = [write_dome("a"), write_dome("b")]
-    seen: list[Progress] = []
-    protocol = Protocol(n_lights=7, trials=2, seed=0)
-    evaluate(folders, [make_estimator("ls")], protocol, on_progress=seen.append)
-    draws = draw_lights(read_capture(folders[0]).light_directions, 7, trials=2, seed=0)
-    n_read = len(set().union(*draws))
-    expected = [
-        Progress(name, number, 2, method, done + 1, total)
-        for number, name in ((1, "a"), (2, "b"))
-        for method, total in ((None, n_read), ("ls", 2))
-        for done in range(total)
-    ]
-    assert seen == expected
+    seen: list[tuple[int, int]] = []
+    protocols = [Protocol(n_lights=7, trials=2), Protocol()]
+    evaluate_all(
+        folders, [make_estimator("ls")], protocols, on_progress=lambda done, total: seen.append((done, total))
+    )
+    assert [total for _, total in seen] == [6] * len(seen)
+    done = [done for done, _ in seen]
+    assert done == sorted(done)
+    assert done[-1] == 6
+
+
+@pytest.mark.parametrize("jobs", [2, 5])
+def test_trials_at_a_time_change_nothing(write_dome: WriteDome, jobs: int) -> None:
+    folders = [write_dome("a"), write_dome("b", n_lights=9)]
+    estimators = [make_estimator("ls"), make_estimator("iw12")]
+    protocols = [Protocol(4, trials=5, light_noise_deg=noise) for noise in (0, 3)]
+    one_by_one = evaluate_all(folders, estimators, protocols)
+    together = evaluate_all(folders, estimators, protocols, jobs=jobs)
+    for before, after in zip(one_by_one, together, strict=True):
+        assert [(r.method, r.capture) for r in before.results] == [
+            (r.method, r.capture) for r in after.results
+        ]
+        np.testing.assert_allclose(
+            [r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5
+        )
+
+
+def test_an_error_in_one_of_several_trials_ends_the_evaluation(write_dome: WriteDome) -> None:
+    with pytest.raises(SplinecliError, match="not unit vectors"):
+        evaluate_all([write_dome()], [Constant((0, 0, 0))], [Protocol(4, trials=9)], jobs=3)
+
+
+def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder, path = write_dome(), tmp_path / "trials.jsonl"
+    first = Fake(folder, angles_deg=(1, 2))
+    evaluate_all([folder], [first], [Protocol(4, trials=2)], store=TrialStore(path))
+    lines = path.read_text().splitlines(keepends=True)
+    # Killed while it wrote the second line.
+    path.write_text(lines[0] + lines[1][: len(lines[1]) // 2])
+    again = Fake(folder, angles_deg=(5, 6, 7))
+    evaluation = evaluate_all([folder], [again], [Protocol(4, trials=4)], store=TrialStore(path))[0]
+    assert evaluation.results[0].maes_deg == pytest.approx((1, 5, 6, 7), abs=1e-4)
+    assert len(again.lights) == 3
+    # Nothing is left to do, and nothing of the first run's was lost.
+    idle = Fake(folder, angles_deg=(90,))
+    evaluation = evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path))[0]
+    assert evaluation.results[0].maes_deg == pytest.approx((1, 5, 6, 7), abs=1e-4)
+    assert idle.lights == []
+    fresh = evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path, fresh=True))[0]
+    assert fresh.results[0].mae_deg == pytest.approx(90, abs=1e-4)
+    assert len(path.read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize("change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw"])
+def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_path: Path, change: str) -> None:
+    folder, path = write_dome(), tmp_path / "trials.jsonl"
+    settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
+    evaluate_all([folder], [Constant((0, 0, 1))], [Protocol(**settings)], store=TrialStore(path))
+    fake = Constant((0, 0, 1))
+    if change == "photograph":
+        image = cv2.imread(str(folder / "003.png"), cv2.IMREAD_UNCHANGED)
+        assert cv2.imwrite(str(folder / "003.png"), image[::-1].copy())
+    elif change == "lights":
+        lights = folder / "light_directions.txt"
+        lights.write_text(lights.read_text() + "\n")
+    elif change == "method":
+        fake.fingerprint = "other weights"
+    else:
+        name = {"seed": "seed", "pixels": "max_pixels", "noise": "light_noise_deg", "draw": "n_lights"}[
+            change
+        ]
+        settings[name] = 5
+    evaluate_all([folder], [fake], [Protocol(**settings)], store=TrialStore(path))
+    assert fake.lights
+
+
+def test_first_images_are_left_out(write_dome: WriteDome) -> None:
+    folders = [write_dome("bearPNG"), write_dome("other")]
+    fake = Fake(folders[0])
+    evaluation = evaluate(folders, [fake], Protocol(skip_first={"bearPNG": 3}))
+    assert [len(lights) for lights in fake.lights] == [5, 8]
+    np.testing.assert_array_equal(fake.observations[0], read_capture(folders[0]).observations[:, 3:])
+    assert [result.n_lights for result in evaluation.results] == [5, 8]
+    assert evaluation.notes == ("bearPNG: the first 3 images are left out.",)
+    every = Fake(folders[0])
+    evaluate(folders, [every], Protocol(skip_first={"*": 4, "other": 1}))
+    assert [len(lights) for lights in every.lights] == [4, 7]
+    with pytest.raises(
+        UsageError, match="no capture named 'cow' to skip images of; there are bearPNG, other"
+    ):
+        evaluate(folders, [fake], Protocol(skip_first={"cow": 1}))
+
+
+def test_draws_keep_to_the_images_that_are_not_left_out(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder = write_dome(n_lights=9)
+    fake = Fake(folder)
+    evaluate([folder], [fake], Protocol(4, trials=20, skip_first={"*": 3}))
+    lights = read_capture(folder).light_directions
+    seen = {tuple(light) for draw in fake.lights for light in draw}
+    assert seen == {tuple(light) for light in lights[3:]}
+    (tmp_path / "draws.txt").write_text("3 4 5\n2 4 5\n")
+    with pytest.raises(InputError, match=r"draws\.txt:2: found light index 2; the first 3 images"):
+        evaluate([folder], [fake], Protocol(draws_file=tmp_path / "draws.txt", skip_first={"*": 3}))
+
+
+def test_what_is_particular_is_noted(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder, path = write_dome("bearPNG", without_truth=4), tmp_path / "trials.jsonl"
+    expected = (
+        "bearPNG: the first 20 images are known to be damaged and are used; --skip-first bearPNG=20 leaves them out.",
+        "bearPNG: 4 of 100 pixels in the mask have no ground-truth normal and are not scored.",
+    )
+    for _ in range(2):  # the second time all trials are there already
+        evaluation = evaluate_all([folder], [make_estimator("ls")], [Protocol(4)], store=TrialStore(path))[0]
+        assert evaluation.notes == expected
 
 
 @pytest.mark.parametrize(

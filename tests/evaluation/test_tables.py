@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 from splinecli import __version__
 from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
-from splinecli.evaluation.tables import best_cells, markdown, results_csv, results_document, table_rows
+from splinecli.evaluation.tables import (
+    best_cells,
+    latex,
+    markdown,
+    protocol_in_words,
+    results_csv,
+    results_document,
+    table_rows,
+)
 
 TEN = Evaluation(
     Protocol(n_lights=10, trials=2, seed=7, max_pixels=500),
@@ -89,6 +98,8 @@ def test_csv() -> None:
 
 
 def test_json_of_one() -> None:
+    # The comparison by hand: differences 0.75 and 1.75, t = 1.25 / 0.5 = 2.5 with one degree of freedom, where t's
+    # distribution is Cauchy's: p = 1 - 2 atan(2.5) / pi = 0.242, and 0.5 tan(0.95 pi / 2) = 6.3531.
     one = replace(TEN, results=TEN.results[:2])
     assert json.dumps(results_document([one]), indent=1) == JSON.replace("VERSION", __version__)
 
@@ -101,7 +112,8 @@ JSON = """\
   "seed": 7,
   "draws": null,
   "light_noise_deg": 0.0,
-  "max_pixels": 500
+  "max_pixels": 500,
+  "skip_first": {}
  },
  "results": [
   {
@@ -112,7 +124,11 @@ JSON = """\
    "mae_deg": 4.5,
    "std_deg": 0.5,
    "trials": 2,
-   "seconds": 0.0013
+   "seconds": 0.0013,
+   "maes_deg": [
+    4.0,
+    5.0
+   ]
   },
   {
    "method": "spline-net",
@@ -122,19 +138,60 @@ JSON = """\
    "mae_deg": 3.25,
    "std_deg": 0.0,
    "trials": 2,
-   "seconds": 1.5
+   "seconds": 1.5,
+   "maes_deg": [
+    3.25,
+    3.25
+   ]
   }
  ],
  "averages": {
   "ls": 4.5,
   "spline-net": 3.25
  },
+ "comparisons": [
+  {
+   "first": "ls",
+   "second": "spline-net",
+   "capture": "ball",
+   "n_lights": 10,
+   "light_noise_deg": 0.0,
+   "trials": 2,
+   "difference_deg": 1.25,
+   "std_deg": 0.5,
+   "interval_deg": [
+    -5.1031,
+    7.6031
+   ],
+   "p_value": 0.242,
+   "p_holm": 0.242,
+   "differs": false
+  },
+  {
+   "first": "ls",
+   "second": "spline-net",
+   "capture": "average",
+   "n_lights": 10,
+   "light_noise_deg": 0.0,
+   "trials": 2,
+   "difference_deg": 1.25,
+   "std_deg": 0.5,
+   "interval_deg": [
+    -5.1031,
+    7.6031
+   ],
+   "p_value": 0.242,
+   "p_holm": 0.242,
+   "differs": false
+  }
+ ],
  "skipped": [
   {
    "capture": "bear",
    "reason": "bear: no images."
   }
  ],
+ "notes": [],
  "version": "VERSION"
 }"""
 
@@ -148,6 +205,15 @@ def test_json_of_two() -> None:
     }
     assert [record["n_lights"] for record in document["results"]] == [10, 10, 10, 10, 96, 96, 50, 50]
     assert document["skipped"] == [{"capture": "bear", "reason": "bear: no images."}]  # once
+    comparisons = [(c["capture"], c["n_lights"], c["differs"]) for c in document["comparisons"]]
+    assert comparisons == [
+        ("ball", 10, False),
+        ("cat", 10, False),
+        ("average", 10, False),
+        ("ball", "all", None),
+        ("cat", "all", None),
+        ("average", "all", None),
+    ]
 
 
 def test_light_noise_tells_evaluations_apart() -> None:
@@ -163,3 +229,58 @@ def test_light_noise_tells_evaluations_apart() -> None:
 def test_the_draws_file_is_named() -> None:
     drawn = replace(TEN, protocol=replace(TEN.protocol, draws_file=Path("some/where/draws.txt")))
     assert results_document([drawn])["protocol"]["draws"] == "draws.txt"
+
+
+def test_latex_of_one() -> None:
+    assert latex([TEN]) == LATEX.replace(
+        "PROTOCOL", "10 lights, 2 random draws, seed 7, at most 500 pixels of each capture"
+    )
+
+
+LATEX = r"""% Needs \usepackage{booktabs} in the preamble.
+\begin{table*}
+  \centering
+  \caption{Mean angular error in degrees: PROTOCOL. The best of each column in bold.}
+  \begin{tabular}{lrrr}
+    \toprule
+    method & ball & cat & average \\
+    \midrule
+    ls & 4.50 & \textbf{9.00} & 6.75 \\
+    spline-net & \textbf{3.25} & \textbf{9.00} & \textbf{6.13} \\
+    \bottomrule
+  \end{tabular}
+\end{table*}
+"""
+
+
+def test_latex_of_two() -> None:
+    text = latex([TEN, ALL])
+    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 2
+    assert "degrees: all lights, seed 7" in text
+    assert r"ls & \textbf{4.00} & 8.50 & 6.25 \\" in text
+
+
+def test_latex_of_many_captures_is_set_small() -> None:
+    many = [replace(TEN.results[0], capture=f"object {i}") for i in range(10)]
+    assert r"\footnotesize\setlength{\tabcolsep}{2pt}" in latex([replace(TEN, results=tuple(many))])
+
+
+def test_latex_escapes_names() -> None:
+    odd = replace(TEN.results[0], method=r"a_b&50%", capture=r"#1 $x$ {y} \z ~^ <|>")
+    drawn = replace(TEN.protocol, draws_file=Path("my_draws.txt"))
+    text = latex([replace(TEN, protocol=drawn, results=(odd,))])
+    assert r"a\_b\&50\% & 4.50 & 4.50 \\" in text
+    escaped = r"\#1 \$x\$ \{y\} \textbackslash{}z \textasciitilde{}\textasciicircum{}"
+    assert rf"method & {escaped} \textless{{}}\textbar{{}}\textgreater{{}} & average \\" in text
+    assert r"the 2 draws of my\_draws.txt, seed 7" in text
+    assert "bold" not in text  # one method is no best
+    unescaped = re.sub(r"\\[{}]", "", text)
+    assert unescaped.count("{") == unescaped.count("}")
+
+
+def test_protocols_in_words() -> None:
+    all_lights = ALL.protocol
+    assert protocol_in_words(replace(TEN.protocol, max_pixels=None)) == "10 lights, 2 random draws, seed 7"
+    assert protocol_in_words(replace(all_lights, max_pixels=None, seed=0)) == "all lights, seed 0"
+    noisy = replace(all_lights, light_noise_deg=2.5, trials=1, max_pixels=None)
+    assert protocol_in_words(noisy) == "all lights, light noise of 2.5 degrees, 1 trial, seed 7"

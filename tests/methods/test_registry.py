@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,36 +19,45 @@ from splinecli.networks.weights import save_weights
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 
 
-@pytest.fixture
-def weights(tmp_path: Path) -> str:
+def save_tiny(path: Path, **settings: Any) -> str:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16))
-    save_weights(network, tmp_path / "tiny.safetensors")
-    return str(tmp_path / "tiny.safetensors")
+        network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16, **settings))
+    save_weights(network, path)
+    return str(path)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> str:
+    return save_tiny(tmp_path / "tiny.safetensors")
 
 
 def test_unknown_method() -> None:
-    with pytest.raises(UsageError, match="no method named 'l1'; expected one of spline-net, ls"):
-        make_estimator("l1")
+    with pytest.raises(UsageError, match="no method named 'l2'; expected one of spline-net, cnn-ps, ls"):
+        make_estimator("l2")
 
 
 def test_the_default_is_one_of_them() -> None:
     assert DEFAULT_METHOD in method_names()
 
 
-def test_every_method_says_what_it_is_and_estimates(weights: str) -> None:
+def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
     truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
     observations = (truth @ LIGHTS.T * 0.5).astype(np.float32)
+    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
+    fingerprints = set()
     for name in method_names():
-        estimator = make_estimator(name, MethodOptions(weights=weights, device="cpu", precision="float32"))
+        file = alone if name == "cnn-ps" else weights
+        estimator = make_estimator(name, MethodOptions(weights=file, device="cpu", precision="float32"))
         assert estimator.name == name
         assert estimator.device == "cpu"
+        fingerprints.add(estimator.fingerprint)
         # A matte pixel without shadow is easy for all of them; the network starts from the Lambertian fit.
         normals = estimator.estimate(observations, LIGHTS)
         assert normals.shape == (3, 3)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
         np.testing.assert_allclose(normals, truth, atol=0.01)
+    assert len(fingerprints) == len(method_names())
 
 
 def test_options_reach_the_network(weights: str) -> None:
@@ -58,6 +69,34 @@ def test_options_reach_the_network(weights: str) -> None:
     assert len(estimator.weights["sha256"]) == 64
     assert vars(estimator)["batch_size"] == 7
     assert len(vars(estimator)["_views"]) == 4
+
+
+def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
+    options = MethodOptions(weights=weights, device="cpu", precision="float32")
+    others = (replace(options, rotations=3), replace(options, precision="bfloat16"))
+    fingerprints = {make_estimator("spline-net", o).fingerprint for o in (options, *others)}
+    assert len(fingerprints) == 3
+    same = make_estimator("spline-net", replace(options, batch_size=3))
+    assert same.fingerprint in fingerprints
+
+
+def test_cnn_ps_averages_ten_rotations(tmp_path: Path) -> None:
+    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
+    assert make_estimator("cnn-ps", MethodOptions(weights=alone)).fingerprint.endswith("10 views")
+    one = make_estimator("cnn-ps", MethodOptions(weights=alone, rotations=1))
+    assert one.fingerprint.endswith("1 views")
+
+
+def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
+    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
+    with pytest.raises(
+        ModelError, match=r"'tiny' hold both networks of spline-net, so .* Take --method spline-net"
+    ):
+        make_estimator("cnn-ps", MethodOptions(weights=weights))
+    with pytest.raises(
+        ModelError, match=r"'alone' hold the one network of cnn-ps, so .* Take --method cnn-ps"
+    ):
+        make_estimator("spline-net", MethodOptions(weights=alone))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +113,5 @@ def test_options_that_cannot_be(options: MethodOptions, error: type[Exception]) 
 
 @pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
 def test_counts_from_one(options: MethodOptions, weights: str) -> None:
-    from dataclasses import replace
-
     with pytest.raises(UsageError, match="whole numbers from 1"):
         make_estimator("spline-net", replace(options, weights=weights))

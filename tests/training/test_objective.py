@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.spline_net import SplineNet, to_pixel_frame
 from splinecli.observation_map import cell_directions, sparse_map
 from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.synthesis.pixels import PixelGenerator
@@ -19,7 +19,7 @@ from splinecli.training import objective
 from splinecli.training.config import TrainingConfig, preset
 from splinecli.training.loop import Trainer
 from splinecli.training.losses import asymmetric_loss, asymmetries, symmetric_loss
-from splinecli.training.objective import Part, compute_losses, part_of_step, truth_in_frame
+from splinecli.training.objective import Part, compute_losses, dense_truth_in_frame, part_of_step
 
 CPU = torch.device("cpu")
 SILENT = {"angle_weight": 0.0, "map_weight": 0.0, "masked_weight": 0.0}
@@ -144,7 +144,8 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     with torch.no_grad():
         found = compute_losses(network, batch, config, part=part)
         views = network.look(batch.observations, batch.light_directions, batch.valid)
-        dense_truth, normal_truth = truth_in_frame(batch, views, size=32)
+        dense_truth = dense_truth_in_frame(batch, views, size=32)
+        normal_truth = to_pixel_frame(batch.scene.normals, views)
         dense = network.interpolate(views)
         normals = network.estimate(views, dense)
         cells = cell_directions(32)[1].sum()
@@ -216,7 +217,8 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     views = network.look(observations, lights)._replace(
         cosine=torch.zeros(40), sine=torch.ones(40), mirrored=mirror
     )
-    dense, normals = truth_in_frame(seen, views, size=32)
+    dense = dense_truth_in_frame(seen, views, size=32)
+    normals = to_pixel_frame(seen.scene.normals, views)
     turned = torch.stack((-lights[:, 1], lights[:, 0], lights[:, 2]), dim=1)
     expected_normals = torch.stack(
         (-seen.scene.normals[:, 1], *seen.scene.normals[:, [0, 2]].unbind(1)), dim=1
@@ -240,7 +242,8 @@ def test_truth_and_views_share_any_turn(tiny: TrainingConfig) -> None:
     batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(5)
     turn_deg = torch.tensor([0.0, 10.0, -35.0, 90.0, 200.0])
     views = network.look(batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg)
-    dense, normals = truth_in_frame(batch, views, size=16)
+    dense = dense_truth_in_frame(batch, views, size=16)
+    normals = to_pixel_frame(batch.scene.normals, views)
     azimuth = torch.atan2(batch.scene.normals[:, 1], batch.scene.normals[:, 0])
     turned = azimuth + torch.atan2(views.sine, views.cosine)
     torch.testing.assert_close(torch.cos(torch.atan2(normals[:, 1], normals[:, 0]) - turned), torch.ones(5))
@@ -253,3 +256,22 @@ def test_all_terms_of_the_paper_s_preset_are_finite(tiny: TrainingConfig) -> Non
     few = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(2)
     losses = compute_losses(network, few, preset("paper"), part="li_net")
     assert all(torch.isfinite(loss) for loss in losses)
+
+
+def test_without_li_net_the_angle_is_all(tiny: TrainingConfig, batch: PixelBatch) -> None:
+    # CNN-PS: no dense map is drawn or judged, and NE-Net learns from the angle alone.
+    torch.manual_seed(0)
+    network = SplineNet(NetworkConfig(size="paper", interpolates=False))
+    losses = compute_losses(network, batch, preset("cnn-ps"))
+    assert torch.equal(losses.total, losses.angle)
+    assert all(torch.isnan(term) for term in losses[2:])
+    losses.total.backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in network.parameters())
+
+
+def test_without_li_net_the_special_losses_act_on_ne_net(batch: PixelBatch) -> None:
+    torch.manual_seed(0)
+    network = SplineNet(NetworkConfig(size="paper", interpolates=False)).eval()
+    losses = compute_losses(network, batch, preset("cnn-ps", symmetric_weight=0.01))
+    assert torch.isnan(losses.on_map)
+    torch.testing.assert_close(losses.total, losses.angle + 0.01 * losses.symmetric)

@@ -18,6 +18,11 @@ from splinecli.normals import decode_picture
 
 StrPath = str | os.PathLike[str]
 
+UPSIDE_DOWN = "The rows of the ground truth are in the wrong order; it was turned over."
+"""The warning of a capture whose ground truth was."""
+
+_CLEARLY_BETTER = 0.02  # of the mask's pixels
+
 _MAT_KEY = "Normal_gt"
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 # Not .mat: MATLAB stores whole numbers, such as those of a plane's normals, as bytes whatever their type.
@@ -27,6 +32,13 @@ _BLOCK = 1 << 20
 
 
 def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The normal map of read_ground_truth."""
+    return read_ground_truth(path, shape, mask)[0]
+
+
+def read_ground_truth(
+    path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], bool]:
     """A normal map (H, W, 3) float32: unit vectors, zero outside the mask and where there is no ground truth.
 
     Frame: x right, y up, z to the camera. The file is one of
@@ -36,7 +48,11 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
     - .txt: H*W rows of x y z in row-major order;
     - .png or .tif: n = 2 v / full range - 1, black or mid-gray for no ground truth; floating-point TIFF as it is.
 
-    Vectors are normalised; zero and non-finite ones are no ground truth.
+    Vectors are normalised; zero and non-finite ones are no ground truth. A map whose rows are in the wrong order,
+    as in the normal.txt of DiLiGenT's Harvest, is turned over: it leaves more of the mask empty than upside down.
+
+    Returns:
+        The map, and whether it was turned over.
 
     Args:
         path: the file.
@@ -71,6 +87,9 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
     is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
     if stored.dtype.kind not in "fiu":
         raise InputError(f"found ground truth of type {stored.dtype}, expected real numbers", path=path)
+    upside_down = not is_picture and _is_upside_down(stored, mask)
+    if upside_down:
+        stored = stored[::-1]
     normals = np.zeros((*shape, 3), np.float32)
     rows, columns = np.nonzero(mask)
     for start in range(0, len(rows), _BLOCK):
@@ -78,7 +97,14 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
         normals[place] = decode_picture(stored[place]) if is_picture else _unit_or_zero(stored[place])
     if not normals.any():
         raise InputError("found no normal inside the mask, expected at least one", path=path)
-    return normals
+    return normals, upside_down
+
+
+def _is_upside_down(stored: NDArray[Any], mask: NDArray[np.bool_]) -> bool:
+    """Whether vectors (H, W, 3) fill the mask clearly better when their rows are taken from the bottom up."""
+    filled = (stored != 0).any(axis=2)
+    as_it_is, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
+    return bool(turned - as_it_is > _CLEARLY_BETTER * np.count_nonzero(mask))
 
 
 def _unit_or_zero(stored: NDArray[Any]) -> NDArray[np.float64]:

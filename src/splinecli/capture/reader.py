@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.capture_files import CaptureFiles
 from splinecli.capture.decoding import decode_image
-from splinecli.capture.ground_truth import read_normals
+from splinecli.capture.ground_truth import UPSIDE_DOWN, read_ground_truth
 from splinecli.capture.images import read_boundary, read_mask, to_linear
 from splinecli.capture.layout import StrPath, find_capture_files
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
@@ -69,9 +69,11 @@ class CaptureSource:
         first_path = self.files.images[indices[0]]
         first = decode_image(first_path)
         mask = self._read_mask(first.shape[:2], first_path)
-        ground_truth = None
+        ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
-            ground_truth = read_normals(self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask)
+            ground_truth, upside_down = read_ground_truth(
+                self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
+            )
         observations = np.empty((np.count_nonzero(mask), len(indices)), np.float32)
         n_saturated, n_8_bit = 0, 0
         stored: NDArray[Any] | None = first
@@ -100,7 +102,10 @@ class CaptureSource:
             light_indices=indices,
             mask=mask,
             ground_truth=ground_truth,
-            warnings=_warnings(n_saturated / observations.size, n_black / len(observations), n_8_bit),
+            warnings=(
+                *_warnings(n_saturated / observations.size, n_black / len(observations), n_8_bit),
+                *((UPSIDE_DOWN,) if upside_down else ()),
+            ),
         )
 
     def _read_mask(self, shape: tuple[int, ...], image: Path) -> NDArray[np.bool_]:

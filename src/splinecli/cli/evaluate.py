@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,12 +23,17 @@ from splinecli.cli.options import (
     RotationsOption,
     SeedOption,
     WeightsOption,
+    parse_indices,
 )
 from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from splinecli.evaluation.records import Evaluation, Progress
+    from splinecli.evaluation.capture_figures import CaptureFigure
+    from splinecli.evaluation.records import Evaluation
+    from splinecli.methods import Estimator
+
+TRIALS, LIGHTS_PLOT, LIGHT_NOISE_PLOT = "trials.jsonl", "lights.png", "light_noise.png"
 
 
 def evaluate(
@@ -37,13 +43,13 @@ def evaluate(
     ],
     method: Annotated[
         list[str] | None,
-        typer.Option(metavar="M", help="Method to score; may be repeated. [default: spline-net]"),
+        typer.Option(metavar="M", help="Method to score, or all; may be repeated. [default: spline-net]"),
     ] = None,
     weights: WeightsOption = None,
     n_lights: Annotated[
         list[str] | None, typer.Option(metavar="K|all", help="Lights a draw; may be repeated. [default: 10]")
     ] = None,
-    trials: Annotated[int, typer.Option(metavar="T", min=1, help="Random draws of the lights.")] = 20,
+    trials: Annotated[int, typer.Option(metavar="T", min=1, help="Random draws of the lights.")] = 100,
     seed: SeedOption = 0,
     draws: Annotated[
         Path | None,
@@ -58,39 +64,68 @@ def evaluate(
     max_pixels: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Score a random part of each capture's pixels.")
     ] = None,
-    rotations: RotationsOption = 1,
+    skip_first: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[CAPTURE=]N",
+            help="Leave out the first N images of a capture, or of every one; may be repeated.",
+        ),
+    ] = None,
+    rotations: RotationsOption = None,
     batch_size: BatchSizeOption = None,
     device: DeviceOption = Device.auto,
     precision: PrecisionOption = Precision.auto,
+    jobs: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Trials at a time. [default: the cores; 1 on a GPU]"),
+    ] = None,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Also draw every method's maps of each capture's first draw.")
+    ] = False,
+    pixel: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROW,COLUMN", help="With --figures: show this pixel's observation maps; may be repeated."
+        ),
+    ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")
     ] = Path("evaluation"),
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Compute again what OUT already holds.")
+    ] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """Score methods on captures with ground truth: mean angular error over random draws of K lights.
 
-    All methods see the same draws. Writes OUT/results.json, results.csv and table.md, and prints the table. A capture
-    that cannot be scored is named and passed over; the exit code is then 3.
+    All methods see the same draws. Writes OUT/results.json, results.csv, table.md, table.tex and report.html, with
+    plots where several K or SIGMA are given, and prints the table. Finished trials are kept in OUT/trials.jsonl as they
+    come: the same command, or one that asks for more, goes on from there. A capture that cannot be scored is named and
+    passed over; the exit code is then 3.
     """
     from splinecli.capture import find_captures
-    from splinecli.evaluation.protocol import evaluate as score
+    from splinecli.evaluation.protocol import TrialStore, evaluate_all
     from splinecli.evaluation.records import Protocol
-    from splinecli.evaluation.tables import markdown, results_csv, results_document
-    from splinecli.files import check_writable, write_text
-    from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, make_estimator
+    from splinecli.files import check_writable, held_folder
+    from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, make_estimator, method_names
 
     if draws is not None and n_lights:
         raise UsageError("--draws and --n-lights exclude each other", hint="The draws say how many lights")
+    if pixel and not figures:
+        raise UsageError("--pixel chooses what --figures shows", hint="Add --figures")
+    pixels = [_pixel(text) for text in pixel or []]
     counts: list[int | None] = (
         [None] if draws is not None else [_light_count(text) for text in dict.fromkeys(n_lights or ["10"])]
     )
+    skipped = dict(_skip(text) for text in skip_first or [])
     protocols = [
-        Protocol(count, trials, seed, draws, light_noise_deg=noise, max_pixels=max_pixels)
+        Protocol(count, trials, seed, draws, light_noise_deg=noise, max_pixels=max_pixels, skip_first=skipped)
         for count in counts
         for noise in dict.fromkeys(light_noise_deg or [0.0])
     ]
-    methods = list(dict.fromkeys(method or [DEFAULT_METHOD]))
+    asked = method or [DEFAULT_METHOD]
+    methods = list(dict.fromkeys(name for text in asked for name in _names(text, method_names())))
     for name in methods:
         check_method(name)
     captures = [capture for dataset in datasets for capture in find_captures(dataset)]
@@ -98,24 +133,108 @@ def evaluate(
     _check_counts(captures, counts)
     options = MethodOptions(weights, rotations, batch_size, device.value, precision.value)
     estimators = [make_estimator(name, options) for name in methods]
+    on_gpu = any(estimator.device.startswith("cuda") for estimator in estimators)
     talk = Talk(quiet=quiet)
-    evaluations = []
-    with talk.progress("evaluating", len(protocols)) as advance:
-        for protocol in protocols:
-            evaluations.append(score(captures, estimators, protocol, on_progress=_follow(advance, methods)))
-    document = results_document(evaluations)
-    text = json.dumps(document, indent=2) + "\n"
-    write_text(output / "results.csv", results_csv(evaluations))
-    write_text(output / "table.md", markdown(evaluations))
-    write_text(output / "results.json", text)
-    for skipped in document["skipped"]:
-        print(f"splinecli: {skipped['capture']} was passed over: {skipped['reason']}", file=sys.stderr)
+    with held_folder(output):
+        store = TrialStore(output / TRIALS, fresh=overwrite)
+        with talk.progress("evaluating", 1.0) as advance:
+            evaluations = evaluate_all(
+                captures,
+                estimators,
+                protocols,
+                store=store,
+                jobs=jobs or (1 if on_gpu else _cores()),
+                on_progress=_follow(advance),
+            )
+        drawn = _draw_figures(captures, estimators, evaluations, pixels, talk) if figures else []
+        document = _write_results(output, evaluations, drawn)
+    for entry in document["skipped"]:
+        print(f"splinecli: {entry['capture']} was passed over: {entry['reason']}", file=sys.stderr)
+    for note in document["notes"]:
+        talk.say(f"splinecli: note: {note}")
     if as_json:
-        print(text, end="")
+        print(json.dumps(document, indent=2))
     elif not quiet:
         for evaluation in evaluations:
             _print_table(evaluation, with_title=len(evaluations) > 1)
     return InputError.exit_code if document["skipped"] else 0
+
+
+def _write_results(output: Path, evaluations: list[Evaluation], drawn: list[CaptureFigure]) -> dict[str, Any]:
+    """Write all that `evaluate` leaves, and remove plots of an earlier call; returns results.json's content."""
+    from splinecli.evaluation.curves import light_noise_curves, lights_curves
+    from splinecli.evaluation.report import html_report
+    from splinecli.evaluation.tables import latex, markdown, results_csv, results_document
+    from splinecli.files import refusals_as_output_errors, write_bytes, write_text
+
+    plots: dict[str, tuple[str, bytes] | None] = {LIGHTS_PLOT: None, LIGHT_NOISE_PLOT: None}
+    if len({evaluation.protocol.n_lights for evaluation in evaluations}) > 1:
+        plots[LIGHTS_PLOT] = ("Error against the number of lights.", lights_curves(evaluations))
+    if len({evaluation.protocol.light_noise_deg for evaluation in evaluations}) > 1:
+        plots[LIGHT_NOISE_PLOT] = ("Error against the light noise.", light_noise_curves(evaluations))
+    document = results_document(evaluations)
+    shown = [*(plot for plot in plots.values() if plot), *((f.caption, f.png) for f in drawn)]
+    report = html_report(evaluations, shown, document["notes"])
+    write_text(output / "results.csv", results_csv(evaluations))
+    write_text(output / "table.md", markdown(evaluations))
+    write_text(output / "table.tex", latex(evaluations))
+    for name, plot in plots.items():
+        if plot:
+            write_bytes(output / name, plot[1])
+        else:
+            with refusals_as_output_errors(output / name):
+                (output / name).unlink(missing_ok=True)
+    for figure in drawn:
+        write_bytes(output / "figures" / f"{figure.stem}.png", figure.png)
+    write_text(output / "report.html", report)
+    write_text(output / "results.json", json.dumps(document, indent=2) + "\n")
+    return document
+
+
+def _draw_figures(
+    captures: list[Path],
+    estimators: list[Estimator],
+    evaluations: list[Evaluation],
+    pixels: list[tuple[int, int]],
+    talk: Talk,
+) -> list[CaptureFigure]:
+    """Of the captures that were scored, under the first protocol."""
+    from splinecli.evaluation.capture_figures import capture_figures
+    from splinecli.evaluation.protocol import distinct_names
+
+    first = evaluations[0]
+    named = {name: folder for folder, name in distinct_names(captures).items() if name in first.captures}
+    drawn = []
+    with talk.progress("drawing", len(named)) as advance:
+        for name, folder in named.items():
+            drawn += capture_figures(folder, name, estimators, first.protocol, pixels)
+            advance(1)
+    return drawn
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _names(text: str, known: list[str]) -> list[str]:
+    return known if text == "all" else [text]
+
+
+def _skip(text: str) -> tuple[str, int]:
+    """("bearPNG", 20) of "bearPNG=20", ("*", 20) of "20". Raises UsageError."""
+    name, equals, count = text.rpartition("=")
+    if not count.isdecimal() or bool(name) != bool(equals):
+        raise UsageError(
+            f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20"
+        )
+    return name or "*", int(count)
+
+
+def _pixel(text: str) -> tuple[int, int]:
+    indices = parse_indices(text, "--pixel")
+    if len(indices) != 2:
+        raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
+    return indices[0], indices[1]
 
 
 def _light_count(text: str) -> int | None:
@@ -128,18 +247,14 @@ def _light_count(text: str) -> int | None:
         raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
 
 
-def _follow(advance: Callable[[float], None], methods: list[str]) -> Callable[[Progress], None]:
-    """A callback that advances a bar by 1 over all captures and methods; reading counts for nothing."""
+def _follow(advance: Callable[..., None]) -> Callable[[int, int], None]:
+    """A callback that moves a bar of length 1 with the trials."""
     shown = 0.0
 
-    def follow(progress: Progress) -> None:
+    def follow(done: int, total: int) -> None:
         nonlocal shown
-        if progress.method is None:
-            return
-        within = (methods.index(progress.method) + progress.done / progress.total) / len(methods)
-        now = (progress.number - 1 + within) / progress.n_captures
-        advance(now - shown)
-        shown = now
+        advance(done / total - shown, f"trial {done} of {total}")
+        shown = done / total
 
     return follow
 

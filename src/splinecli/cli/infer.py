@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
     from splinecli.methods import Estimator, MethodOptions
 
-FEWEST_TRAINED_LIGHTS = 4
-
 
 class NormalConvention(StrEnum):
     """Which way green points in the picture."""
@@ -66,7 +64,10 @@ def infer(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Results go to OUT/<capture name>/.")
     ] = Path("out"),
-    method: Annotated[str, typer.Option(metavar="METHOD", help="spline-net or ls.")] = "spline-net",
+    method: Annotated[
+        str,
+        typer.Option(metavar="METHOD", help="spline-net, cnn-ps, ls, ls-trimmed, l1, iw12, st14 or ia14."),
+    ] = "spline-net",
     weights: WeightsOption = None,
     n_lights: Annotated[
         int | None, typer.Option(metavar="K", help="Use K lights drawn at random. [default: all]")
@@ -75,7 +76,7 @@ def infer(
     light_indices: Annotated[
         str | None, typer.Option(metavar="I,J,...", help="Use these lights, counted from 0.")
     ] = None,
-    rotations: RotationsOption = 1,
+    rotations: RotationsOption = None,
     batch_size: BatchSizeOption = None,
     device: DeviceOption = Device.auto,
     precision: PrecisionOption = Precision.auto,
@@ -190,8 +191,7 @@ class _Job:
         with self.talk.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
             estimate = estimate_normals(capture, estimator, progress=advance)
         warnings = [*capture.warnings]
-        if capture.n_lights < FEWEST_TRAINED_LIGHTS and estimator.weights is not None:
-            warnings.append(f"The network was trained with {FEWEST_TRAINED_LIGHTS} lights and more, not 3.")
+        warnings += _warn_of_untrained(estimator.weights, capture.n_lights)
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
         report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
@@ -204,6 +204,19 @@ class _Job:
         from splinecli.evaluation.draws import draw_lights
 
         return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
+
+
+def _warn_of_untrained(weights: dict[str, str] | None, n_lights: int) -> list[str]:
+    """A warning where shipped weights have not been trained with so many lights."""
+    if weights is None:
+        return []
+    from splinecli.networks.weights import manifest
+
+    fewest, most = manifest().get(weights["name"], {}).get("lights", (n_lights, n_lights))
+    if fewest <= n_lights <= most:
+        return []
+    trained = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    return [f"The weights {weights['name']} were trained with {trained} lights, not {n_lights}."]
 
 
 def _refuse_same_names(captures: list[Path]) -> None:

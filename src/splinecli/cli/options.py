@@ -33,9 +33,12 @@ WeightsOption = Annotated[
     ),
 ]
 RotationsOption = Annotated[
-    int,
+    int | None,
     typer.Option(
-        "--rotations", metavar="R", min=1, help="Views of each pixel to average: slower, a little better."
+        "--rotations",
+        metavar="R",
+        min=1,
+        help="Views of each pixel that a network averages. [default: 1; cnn-ps: 10]",
     ),
 ]
 DeviceOption = Annotated[

@@ -25,7 +25,7 @@ def train(
         list[Path] | None, typer.Argument(metavar="SET", help="Pixel sets made by 'splinecli prepare'.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="compact or paper. [default: compact]")
+        str | None, typer.Option(metavar="NAME", help="compact, paper or cnn-ps. [default: compact]")
     ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings (TOML, or a run's config.json).")
@@ -164,7 +164,5 @@ def _light_counts(text: str) -> dict[str, int]:
 
 def _losses(metrics: Metrics) -> str:
     checked = "" if metrics.validation_deg is None else f", {metrics.validation_deg:.2f} deg in validation"
-    return (
-        f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f}, map {metrics.map_error:.3f},"
-        f" {metrics.angle_deg:.2f} deg{checked}"
-    )
+    on_map = "" if metrics.map_error is None else f" map {metrics.map_error:.3f},"
+    return f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f},{on_map} {metrics.angle_deg:.2f} deg{checked}"

@@ -82,14 +82,23 @@ class DrawsFile:
     def n_lights(self) -> int:
         return len(self.draws[0])
 
-    def check_against(self, light_directions: NDArray[np.float64]) -> None:
-        """Raise InputError, with the line, where a draw does not fit a capture under these lights (F, 3)."""
+    def check_against(self, light_directions: NDArray[np.float64], *, skipped: int = 0) -> None:
+        """Raise InputError, with the line, where a draw does not fit a capture under these lights (F, 3).
+
+        skipped: lights at the start that no draw may name.
+        """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
             if max(draw) >= available:
                 raise InputError(
                     f"found light index {max(draw)}, expected 0 to {available - 1}:"
                     f" the capture has {available} lights",
+                    path=self.path,
+                    line=line,
+                )
+            if min(draw) < skipped:
+                raise InputError(
+                    f"found light index {min(draw)}; the first {skipped} images are to be skipped",
                     path=self.path,
                     line=line,
                 )

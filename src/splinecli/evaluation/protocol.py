@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,22 +17,34 @@ from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.draws import NOISE_STREAM, Draw, DrawsFile, draw_lights, read_draws
 from splinecli.evaluation.light_noise import tilt_lights
-from splinecli.evaluation.records import Evaluation, OnProgress, Progress, Protocol, Result, Skipped
+from splinecli.evaluation.quirks import describe_quirks
+from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.scored_pixels import keep_scored_pixels
-from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.evaluation.trials import Score, Trial, TrialStore, plan_trials
+from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 
-__all__ = ["Evaluation", "Progress", "Protocol", "Result", "Skipped", "evaluate"]
+__all__ = ["Evaluation", "Protocol", "Result", "Skipped", "TrialStore", "evaluate", "evaluate_all"]
+
+OnProgress = Callable[[int, int], object]
+"""Told the trials that are done and those there are, after each."""
 
 
-def evaluate(
+def evaluate(captures: Sequence[Path], estimators: Sequence[Estimator], protocol: Protocol) -> Evaluation:
+    """evaluate_all for one protocol."""
+    return evaluate_all(captures, estimators, [protocol])[0]
+
+
+def evaluate_all(
     captures: Sequence[Path],
     estimators: Sequence[Estimator],
-    protocol: Protocol,
+    protocols: Sequence[Protocol],
     *,
+    store: TrialStore | None = None,
+    jobs: int = 1,
     on_progress: OnProgress | None = None,
-) -> Evaluation:
-    """Score every estimator on every capture.
+) -> list[Evaluation]:
+    """Score every estimator on every capture under every protocol.
 
     Captures are called by their names (capture_name), or where two are equal by their folders' paths, with so
     many parent folders as tell them apart; one given twice counts once. One that cannot be read, or has no
@@ -39,101 +53,195 @@ def evaluate(
     Args:
         captures: folders.
         estimators: methods with different names.
+        protocols: at least one.
+        store: where finished trials are found and kept.
+        jobs: trials at a time, each on its share of the cores.
 
     Raises:
-        UsageError: there are no captures or estimators, two estimators share a name, or n_lights is not what
-            the draws file holds.
+        UsageError: there are no captures or estimators, two estimators share a name, n_lights is not what
+            the draws file holds, or skip_first names a capture that is not there.
         InputError: the draws file is wrong, or no capture could be scored. A single capture's own error is
             raised as it is, be it a UsageError.
         SplinecliError: a method gave normals that are not unit vectors.
+        OutputError: the store cannot be written.
     """
     if not captures or not estimators:
         raise UsageError("nothing to score, expected at least one capture and one method")
     for method, count in Counter(estimator.name for estimator in estimators).items():
         if count > 1:
             raise UsageError(f"method {method} comes twice", hint="Name each method once")
-    protocol, draws_file = _read_draws_file(protocol)
-    folders = list({folder.resolve(): folder for folder in captures}.values())
-    results: list[Result] = []
-    failures: dict[str, SplinecliError] = {}
-    for number, (folder, name) in enumerate(zip(folders, _distinct_names(folders), strict=True), start=1):
-        report = partial(_report, on_progress, name, number, len(folders))
+    tasks = [_Task(*_read_draws_file(protocol)) for protocol in protocols]
+    names_by_folder = distinct_names(captures)
+    names = list(names_by_folder.values())
+    for protocol in protocols:
+        for name in set(protocol.skip_first) - {"*", *names}:
+            raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
+    store = TrialStore() if store is None else store
+    jobs_by_capture = [
+        _CaptureJob.plan(folder, name, estimators, tasks) for folder, name in names_by_folder.items()
+    ]
+    _run([job for job in jobs_by_capture if job is not None], store, jobs, on_progress)
+    return [task.evaluation(names, store) for task in tasks]
+
+
+@dataclass
+class _Task:
+    """A protocol and what becomes of it: the trials of each capture and method, and the captures that failed."""
+
+    protocol: Protocol
+    draws_file: DrawsFile | None
+    trials: dict[tuple[str, str], list[Trial]] = field(default_factory=dict)
+    failures: dict[str, SplinecliError] = field(default_factory=dict)
+    notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def fail(self, capture: str, error: SplinecliError) -> None:
+        self.failures[capture] = error
+        self.trials = {key: trials for key, trials in self.trials.items() if key[0] != capture}
+
+    def evaluation(self, captures: Sequence[str], store: TrialStore) -> Evaluation:
+        """In the captures' order. Raises the failures' error where all of them failed."""
+        results = []
+        for (capture, method), trials in self.trials.items():
+            scores = [score for trial in trials if (score := store.find(trial)) is not None]
+            seconds = math.fsum(score.seconds for score in scores) / len(scores)
+            maes_deg = tuple(score.mae_deg for score in scores)
+            results.append(Result(method, capture, len(trials[0].lights), maes_deg, seconds))
+        if not results:
+            raise _nothing_scored([self.failures[name] for name in captures])
+        skipped = (Skipped(name, str(self.failures[name])) for name in captures if name in self.failures)
+        notes = (note for name in captures for note in self.notes.get(name, ()))
+        return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes))
+
+
+@dataclass
+class _CaptureJob:
+    """One capture and the trials wanted of it, under all protocols."""
+
+    name: str
+    source: CaptureSource
+    tasks: list[_Task]
+    units: list[tuple[Trial, Estimator]]
+
+    @classmethod
+    def plan(
+        cls, folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[_Task]
+    ) -> _CaptureJob | None:
+        """None where no protocol can score the capture; its reasons are with the tasks."""
         try:
-            results += _score_capture(folder, name, estimators, protocol, draws_file, report)
+            source = open_capture(folder)
         except (InputError, UsageError) as error:
-            failures[name] = error
-    if not results:
-        raise _nothing_scored(list(failures.values()))
-    return Evaluation(
-        protocol, tuple(results), tuple(Skipped(name, str(error)) for name, error in failures.items())
-    )
+            for task in tasks:
+                task.fail(name, error)
+            return None
+        job = cls(name, source, [], [])
+        for task in tasks:
+            try:
+                draws = _draws_for(source, name, task.protocol, task.draws_file)
+            except (InputError, UsageError) as error:
+                task.fail(name, error)
+                continue
+            job.tasks.append(task)
+            by_method = [plan_trials(name, source.files, e, draws, task.protocol) for e in estimators]
+            for estimator, trials in zip(estimators, by_method, strict=True):
+                task.trials[name, estimator.name] = trials
+            # Trial by trial, not method by method: the time left can then be told from the time gone.
+            job.units += [
+                (trial, estimator)
+                for same_draw in zip(*by_method, strict=True)
+                for trial, estimator in zip(same_draw, estimators, strict=True)
+            ]
+        return job if job.tasks else None
+
+    def read(self, units: Sequence[tuple[Trial, Estimator]]) -> Capture:
+        """The capture under the lights of these trials, without the pixels that are not scored."""
+        lights = sorted(set().union(*(trial.lights for trial, _ in units)))
+        capture = self.source.read(lights)
+        for task in self.tasks:
+            task.notes[self.name] = describe_quirks(capture, self.name, task.protocol)
+        # All protocols of an evaluation score the same pixels.
+        protocol = self.tasks[0].protocol
+        return keep_scored_pixels(capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
 
 
-_Report = Callable[[str | None, int, int], None]
-
-
-def _report(
-    on_progress: OnProgress | None,
-    capture: str,
-    number: int,
-    n_captures: int,
-    method: str | None,
-    done: int,
-    total: int,
+def _run(
+    jobs_by_capture: Sequence[_CaptureJob], store: TrialStore, jobs: int, on_progress: OnProgress | None
 ) -> None:
-    if on_progress is not None:
-        on_progress(Progress(capture, number, n_captures, method, done, total))
+    """Score the trials that the store does not have."""
+    missing = [[unit for unit in job.units if store.find(unit[0]) is None] for job in jobs_by_capture]
+    total, done = sum(map(len, missing)), 0
+
+    def finish(running: set[Future[None]], at_most: int) -> set[Future[None]]:
+        """Wait until no more than so many run; what they raised comes to light here."""
+        nonlocal done
+        while len(running) > at_most:
+            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                future.result()
+            done += len(finished)
+            if on_progress is not None:
+                on_progress(done, total)
+        return running
+
+    with _share_cores(jobs), ThreadPoolExecutor(jobs) as workers:
+        running: set[Future[None]] = set()
+        try:
+            for job, units in zip(jobs_by_capture, missing, strict=True):
+                try:
+                    # Also where nothing is missing: what is particular about a capture shows when it is read.
+                    capture = job.read(units or job.units[:1])
+                except (InputError, UsageError) as error:
+                    for task in job.tasks:
+                        task.fail(job.name, error)
+                    done += len(units)
+                    continue
+                for trial, estimator in units:
+                    running.add(workers.submit(_score, capture, trial, estimator, store))
+                    running = finish(running, jobs)  # one waits, so that no core does
+                del capture
+            finish(running, 0)
+        except BaseException:
+            workers.shutdown(cancel_futures=True)
+            raise
 
 
-def _score_capture(
-    folder: Path,
-    name: str,
-    estimators: Sequence[Estimator],
-    protocol: Protocol,
-    draws_file: DrawsFile | None,
-    report: _Report,
-) -> list[Result]:
-    source = open_capture(folder)
-    draws = _draws_for(source, protocol, draws_file)
-    capture = _read_lights(source, sorted(set().union(*draws)), report)
-    capture = keep_scored_pixels(capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
-    return [_score_method(capture, name, estimator, draws, protocol, report) for estimator in estimators]
+@contextmanager
+def _share_cores(jobs: int) -> Iterator[None]:
+    """Let PyTorch, where a method has loaded it, compute each of `jobs` trials at a time on a share of the cores."""
+    torch = sys.modules.get("torch")
+    if torch is None or jobs == 1:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, before // jobs))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
-def _score_method(
-    capture: Capture,
-    name: str,
-    estimator: Estimator,
-    draws: Sequence[Draw],
-    protocol: Protocol,
-    report: _Report,
-) -> Result:
-    method = estimator.name
-    maes_deg, seconds = [], []
-    for trial, draw in enumerate(draws):
-        estimate = estimate_normals(_see_trial(capture, draw, trial, protocol), estimator)
-        maes_deg.append(_mae_deg(estimate))
-        seconds.append(estimate.seconds)
-        report(method, trial + 1, len(draws))
-    return Result(method, name, len(draws[0]), tuple(maes_deg), math.fsum(seconds) / len(seconds))
+def _score(capture: Capture, trial: Trial, estimator: Estimator, store: TrialStore) -> None:
+    estimate = estimate_normals(see_trial(capture, trial), estimator)
+    assert estimate.errors is not None  # keep_scored_pixels made sure of the ground truth
+    store.add(trial, Score(estimate.errors.mean, estimate.seconds))
 
 
-def _see_trial(capture: Capture, draw: Draw, trial: int, protocol: Protocol) -> Capture:
-    """The capture under the draw's lights, their directions as the trial's noise leaves them."""
+def see_trial(capture: Capture, trial: Trial) -> Capture:
+    """The capture under the trial's lights, their directions as its noise leaves them."""
     position = {light: place for place, light in enumerate(capture.light_indices)}
-    seen = capture.choose_lights([position[light] for light in draw])
-    if protocol.light_noise_deg == 0:
+    seen = capture.choose_lights([position[light] for light in trial.lights])
+    if trial.light_noise_deg == 0:
         return seen
-    generator = np.random.default_rng([NOISE_STREAM, protocol.seed, trial])
+    generator = np.random.default_rng([NOISE_STREAM, trial.seed, trial.number])
     return replace(
-        seen, light_directions=tilt_lights(seen.light_directions, protocol.light_noise_deg, generator)
+        seen, light_directions=tilt_lights(seen.light_directions, trial.light_noise_deg, generator)
     )
 
 
-def _mae_deg(estimate: NormalEstimate) -> float:
-    mask = estimate.capture.mask
-    assert estimate.error_map_deg is not None  # keep_scored_pixels made sure of the ground truth
-    return float(estimate.error_map_deg[mask].mean(dtype=np.float64))
+def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
+    """The first trial of a capture, whatever the method. Raises as evaluate_all does."""
+    protocol, draws_file = _read_draws_file(protocol)
+    draw = _draws_for(source, name, protocol, draws_file)[0]
+    return Trial(name, "", 0, draw, protocol.light_noise_deg, protocol.seed, protocol.max_pixels, "")
 
 
 def _read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
@@ -148,45 +256,39 @@ def _read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 
-def _draws_for(source: CaptureSource, protocol: Protocol, draws_file: DrawsFile | None) -> Sequence[Draw]:
+def _draws_for(
+    source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None
+) -> list[Draw]:
     if source.files.ground_truth is None:  # known before the images are read
         raise InputError(
             "no ground truth, so nothing to score against",
             path=source.files.folder,
             hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
         )
+    skipped = protocol.skipped_lights(name)
     if draws_file is not None:
-        draws_file.check_against(source.light_directions)
-        return draws_file.draws
+        draws_file.check_against(source.light_directions, skipped=skipped)
+        return list(draws_file.draws)
     draws = draw_lights(
-        source.light_directions, protocol.n_lights, trials=protocol.trials, seed=protocol.seed
+        source.light_directions[skipped:], protocol.n_lights, trials=protocol.trials, seed=protocol.seed
     )
+    draws = [tuple(light + skipped for light in draw) for draw in draws]
     # All lights are one draw, but their noise differs from trial to trial.
     return draws * protocol.trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
 
 
-def _read_lights(source: CaptureSource, lights: Sequence[int], report: _Report) -> Capture:
-    done = 0
-
-    def progress() -> None:
-        nonlocal done
-        done += 1
-        report(None, done, len(lights))
-
-    return source.read(lights, progress)
-
-
-def _distinct_names(folders: Sequence[Path]) -> list[str]:
-    """The captures' names, or the last parts of the folders' paths, as many for all as tell them apart."""
+def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
+    """Folders, each once, with the captures' names, or where two are equal with the last parts of all paths."""
+    folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]
-    if len(set(names)) == len(names):
-        return names
-    # As capture_name has it: a link keeps its name.
-    parts = [(f.resolve() if ".." in f.parts else f.absolute()).parts for f in folders]
-    depth = 1
-    while len({path[-depth:] for path in parts}) < len(parts):
-        depth += 1
-    return ["/".join(path[-depth:]) for path in parts]
+    if len(set(names)) < len(names):
+        # As capture_name has it: a link keeps its name.
+        parts = [(f.resolve() if ".." in f.parts else f.absolute()).parts for f in folders]
+        depth = 1
+        while len({path[-depth:] for path in parts}) < len(parts):
+            depth += 1
+        names = ["/".join(path[-depth:]) for path in parts]
+    return dict(zip(folders, names, strict=True))
 
 
 def _nothing_scored(failures: list[SplinecliError]) -> SplinecliError:

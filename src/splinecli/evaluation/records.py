@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,8 @@ class Protocol:
         draws_file: take the draws from there instead; see read_draws.
         light_noise_deg: the light directions are turned by angles from N(0, this) in each trial.
         max_pixels: score a random part of each capture's pixels; None for all that have ground truth.
+        skip_first: the first images of captures to leave out, by the captures' names; "*" for all others. The
+            first 20 of DiLiGenT's Bear are damaged.
 
     Raises:
         UsageError: a value is out of its range.
@@ -36,6 +38,7 @@ class Protocol:
     draws_file: Path | None = None
     light_noise_deg: float = 0.0
     max_pixels: int | None = None
+    skip_first: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
@@ -45,6 +48,13 @@ class Protocol:
             )
         if self.max_pixels is not None and self.max_pixels < 1:
             raise UsageError(f"at most {self.max_pixels} pixels to score, expected at least 1")
+        for name, count in self.skip_first.items():
+            if count < 0:
+                raise UsageError(f"{count} images of {name} to skip, expected a number from 0")
+
+    def skipped_lights(self, capture: str) -> int:
+        """How many of a capture's first lights are left out."""
+        return self.skip_first.get(capture, self.skip_first.get("*", 0))
 
 
 @dataclass(frozen=True)
@@ -87,11 +97,13 @@ class Evaluation:
     """What evaluate found: a result for each capture and method, captures in the order given, then methods.
 
     protocol: as asked for; with a draws file, n_lights and trials are the file's.
+    notes: sentences on what is particular about the captures and how it was dealt with.
     """
 
     protocol: Protocol
     results: tuple[Result, ...]
     skipped: tuple[Skipped, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -108,21 +120,3 @@ class Evaluation:
             method: math.fsum(r.mae_deg for r in self.results if r.method == method) / len(self.captures)
             for method in self.methods
         }
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far an evaluation is: at `capture`, number `number` (from 1) of `n_captures`.
-
-    method: the one at work, or None while images are read. done of total: images read, or trials estimated.
-    """
-
-    capture: str
-    number: int
-    n_captures: int
-    method: str | None
-    done: int
-    total: int
-
-
-OnProgress = Callable[[Progress], object]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Literal
 
 from splinecli.errors import UsageError
@@ -18,11 +19,11 @@ DEFAULT_METHOD = "spline-net"
 class MethodOptions:
     """What a user may choose about a method; each method takes what means something to it.
 
-    weights: a shipped name or a file, None for the method's own; batch_size: None for the method's own.
+    weights: a shipped name or a file; None there, as for rotations and batch_size, for the method's own.
     """
 
     weights: str | None = None
-    rotations: int = 1
+    rotations: int | None = None
     batch_size: int | None = None
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -31,7 +32,7 @@ class MethodOptions:
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
     """An estimator ready to run. Raises UsageError (unknown name or device), ModelError (weights)."""
     check_method(name)
-    return _METHODS[name](options)
+    return _METHODS[name](name, options)
 
 
 def check_method(name: str) -> None:
@@ -45,28 +46,59 @@ def method_names() -> list[str]:
     return list(_METHODS)
 
 
-def _least_squares(_: MethodOptions) -> Estimator:
+def _least_squares(*_: object) -> Estimator:
     from splinecli.methods.least_squares import LeastSquares
 
     return LeastSquares()
 
 
-def _spline_net(options: MethodOptions) -> Estimator:
-    from splinecli.devices import choose_device, choose_precision
-    from splinecli.methods.spline_net import SplineNetEstimator
-    from splinecli.networks.weights import resolve_weights
+@dataclass(frozen=True)
+class _Solver:
+    """Where a BatchedEstimator's `solve` lies, how many pixels it takes at a time, and in which precision."""
 
-    device = choose_device(options.device)
-    return SplineNetEstimator(
-        resolve_weights(options.weights or "spline-net"),
-        device=device,
-        precision=choose_precision(options.precision, device),
-        rotations=options.rotations,
-        **({} if options.batch_size is None else {"batch_size": options.batch_size}),
-    )
+    module: str
+    batch_size: int
+    precision: str = "float64"
+
+    def __call__(self, name: str, options: MethodOptions) -> Estimator:
+        from splinecli.devices import choose_device
+        from splinecli.methods.batched import BatchedEstimator
+
+        solve = import_module(f"splinecli.methods.{self.module}").solve
+        size = self.batch_size if options.batch_size is None else options.batch_size
+        return BatchedEstimator(name, solve, str(choose_device(options.device)), size, self.precision)
 
 
-_METHODS: dict[str, Callable[[MethodOptions], Estimator]] = {
-    "spline-net": _spline_net,
+@dataclass(frozen=True)
+class _Network:
+    """The views that a network averages and the pixels it takes at a time, unless the user says otherwise."""
+
+    rotations: int
+    batch_size: int
+
+    def __call__(self, name: str, options: MethodOptions) -> Estimator:
+        from splinecli.devices import choose_device, choose_precision
+        from splinecli.methods.networks import NetworkEstimator
+        from splinecli.networks.weights import resolve_weights
+
+        device = choose_device(options.device)
+        return NetworkEstimator(
+            name,
+            resolve_weights(options.weights or name),
+            device=device,
+            precision=choose_precision(options.precision, device),
+            rotations=self.rotations if options.rotations is None else options.rotations,
+            batch_size=self.batch_size if options.batch_size is None else options.batch_size,
+        )
+
+
+_METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
+    "spline-net": _Network(rotations=1, batch_size=1024),
+    "cnn-ps": _Network(rotations=10, batch_size=512),
     "ls": _least_squares,
+    "ls-trimmed": _Solver("trimmed_least_squares", 8192),
+    "l1": _Solver("least_absolute", 8192),
+    "iw12": _Solver("iw12", 8192),
+    "st14": _Solver("st14", 1024),
+    "ia14": _Solver("ia14", 1024),
 }

@@ -13,6 +13,7 @@ class Estimator(Protocol):
 
     name: the method's name in the registry; weights: name and SHA-256 of the weights it uses, or None.
     device and precision: what it computes on and in, for the report.
+    fingerprint: name, weights and settings in one text, so that equal ones give equal normals, but for rounding.
     """
 
     @property
@@ -23,6 +24,8 @@ class Estimator(Protocol):
     def device(self) -> str: ...
     @property
     def precision(self) -> str: ...
+    @property
+    def fingerprint(self) -> str: ...
 
     def estimate(
         self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]

@@ -23,6 +23,7 @@ class LeastSquares:
     weights: None = None
     device: str = "cpu"
     precision: str = "float64"
+    fingerprint: str = "ls"
 
     def estimate(
         self, observations: NDArray[np.floating], light_directions: NDArray[np.float64]

@@ -8,17 +8,18 @@ from typing import Any, Literal, get_args
 from splinecli.errors import ModelError
 from splinecli.observation_map import MAP_SIZE, Grid
 
-_CHOICES = {"size": ("paper", "compact"), "grid": get_args(Grid)}
+_CHOICES = {"size": ("paper", "compact"), "grid": get_args(Grid), "interpolates": (True, False)}
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """A SPLINE-Net.
+    """A SPLINE-Net, or a CNN-PS.
 
     Attributes:
         size: "paper", the layers of the authors' networks; "compact", made for laptop cores.
         map_size: cells along a side of the observation map.
         grid: how lights fall on its cells; "cnn-ps" for the authors' own weights, of the paper size alone.
+        interpolates: whether there is a LI-Net. Without it NE-Net reads the sparse map alone, which is CNN-PS.
         width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's
             hidden features of the compact size; the paper size has fixed layers and ignores them.
     """
@@ -30,6 +31,7 @@ class NetworkConfig:
     ne_blocks: int = 3
     head_width: int = 256
     grid: Grid = "even"
+    interpolates: bool = True
 
     @property
     def is_canonical(self) -> bool:

@@ -57,6 +57,7 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
             shape or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
+    assert network.li_net is not None  # this configuration interpolates
     tensors = _flip_rows(_read_li_net(li_net_file, network.li_net), "li_net.")
     ne_net = _read_ne_net(ne_net_file, network.ne_net)
     side = network.config.map_size // 2

@@ -63,14 +63,15 @@ class SplineNet(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.li_net: nn.Module
+        self.li_net: nn.Module | None = None
         self.ne_net: nn.Module
+        width, size, maps = config.width, config.map_size, int(config.interpolates)
         if config.size == "paper":
-            self.li_net = PaperLINet()
-            self.ne_net = PaperNENet(2, config.map_size)
+            self.li_net = PaperLINet() if config.interpolates else None
+            self.ne_net = PaperNENet(1 + maps, size)
         else:
-            self.li_net = CompactLINet(4, config.width, config.li_blocks, config.map_size)
-            self.ne_net = CompactNENet(5, config.width, config.ne_blocks, config.head_width, config.map_size)
+            self.li_net = CompactLINet(4, width, config.li_blocks, size) if config.interpolates else None
+            self.ne_net = CompactNENet(4 + maps, width, config.ne_blocks, config.head_width, size)
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)
@@ -129,8 +130,10 @@ class SplineNet(nn.Module):
             mirror,
         )
 
-    def interpolate(self, views: Views) -> Tensor:
-        """LI-Net: the dense maps (P, 1, w, w) of what was seen, zero outside the unit disc."""
+    def interpolate(self, views: Views) -> Tensor | None:
+        """LI-Net: the dense maps (P, 1, w, w) of what was seen, zero outside the unit disc; None without one."""
+        if self.li_net is None:
+            return None
         if self.config.size == "paper":
             dense: Tensor = self.li_net(views.sparse)
         else:
@@ -138,22 +141,14 @@ class SplineNet(nn.Module):
             dense = views.lambertian_map + self.li_net(inputs)
         return dense * self.inside
 
-    def estimate(self, views: Views, dense: Tensor) -> Tensor:
+    def estimate(self, views: Views, dense: Tensor | None) -> Tensor:
         """NE-Net: unit normals (P, 3) in the pixels' frames."""
+        interpolated = [] if dense is None else [dense.to(views.sparse.dtype)]
         if self.config.size == "paper":
-            raw: Tensor = self.ne_net(torch.cat((views.sparse, dense), dim=1))
+            raw: Tensor = self.ne_net(torch.cat((views.sparse, *interpolated), dim=1))
         else:
-            inputs = torch.cat(
-                (
-                    views.sparse,
-                    views.holds,
-                    views.residual,
-                    views.lambertian_map,
-                    dense.to(views.sparse.dtype),
-                ),
-                dim=1,
-            )
-            raw = views.lambertian_normals + self.ne_net(inputs)
+            seen = (views.sparse, views.holds, views.residual, views.lambertian_map)
+            raw = views.lambertian_normals + self.ne_net(torch.cat((*seen, *interpolated), dim=1))
         return nn.functional.normalize(raw.float(), dim=-1)
 
     def forward(

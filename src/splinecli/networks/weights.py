@@ -121,9 +121,9 @@ def shipped_names() -> list[str]:
     return sorted(manifest())
 
 
-def manifest() -> dict[str, dict[str, str]]:
-    """name -> {file, sha256, method, description} of the shipped weights."""
-    entries: dict[str, dict[str, str]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
+def manifest() -> dict[str, dict[str, Any]]:
+    """name -> {file, sha256, method, description, lights: [fewest, most] in training} of the shipped weights."""
+    entries: dict[str, dict[str, Any]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
     return entries
 
 

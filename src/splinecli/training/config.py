@@ -90,6 +90,10 @@ class TrainingConfig:
             raise ModelError(
                 f"network setting 'grid' is {self.network.grid!r}; training knows true maps on the grid 'even' alone"
             )
+        if self.updates == "alternating" and not self.network.interpolates:
+            raise ModelError(
+                "training setting 'updates' is 'alternating'; without a LI-Net there is nothing to alternate with"
+            )
         if not sum(self.sources.values()) > 0:
             raise ModelError("training setting 'sources' gives no source a weight above 0")
 
@@ -187,6 +191,12 @@ PRESETS = {
         symmetric_weight=2e-2,
         asymmetric_weight=2e-5,
         li_net_norm="sum",
+    ),
+    # CNN-PS (Ikehata, ECCV 2018) for ten lights: its own layers on the sparse map alone.
+    "cnn-ps": TrainingConfig(
+        network=NetworkConfig(size="paper", interpolates=False),
+        pixels=PixelGeneratorConfig(min_lights=10, max_lights=10, usual_lights=10),
+        learning_rate=1e-3,
     ),
 }
 

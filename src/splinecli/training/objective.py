@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from splinecli.networks.spline_net import SplineNet, Views
+from splinecli.networks.spline_net import SplineNet, Views, to_pixel_frame
 from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig
@@ -66,19 +66,26 @@ def compute_losses(
     views = network.look(
         batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg, mirror=mirrored
     )
-    dense_truth, normal_truth = truth_in_frame(batch, views, size=network.config.map_size)
+    normal_truth = to_pixel_frame(batch.scene.normals, views)
+    with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
+    # Half of the work of a batch; CNN-PS has no use for it.
+    dense_truth = dense_truth_in_frame(batch, views, size=network.config.map_size) if with_maps else None
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     with _fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
             dense = network.interpolate(views)
         normals = network.estimate(views, dense)
-    dense = dense.float()
     angle = angular_loss(normals, normal_truth)
-    on_map = map_loss(dense, dense_truth.values, dense_truth.known)
-    masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, views.holds)
-    symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
+    on_map = masked = angle.new_full((), torch.nan)
+    if dense is not None and dense_truth is not None:
+        dense = dense.float()
+        on_map = map_loss(dense, dense_truth.values, dense_truth.known)
+        masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, views.holds)
+    symmetric = asymmetric = angle.new_full((), torch.nan)
+    if dense_truth is not None and (config.symmetric_weight or config.asymmetric_weight):
+        symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
     total = config.angle_weight * angle
-    if part != "ne_net":
+    if part != "ne_net" and dense is not None and dense_truth is not None:
         against = (dense, dense_truth.values, dense_truth.known)
         total = total + config.map_weight * map_loss(*against, config.li_net_norm)
         total = total + config.masked_weight * masked_map_loss(*against, views.holds, config.li_net_norm)
@@ -90,22 +97,20 @@ def compute_losses(
 
 
 def _special(
-    dense: Tensor,
+    dense: Tensor | None,
     normals: Tensor,
     dense_truth: DenseMap,
     normal_truth: Tensor,
     config: TrainingConfig,
     part: Part,
 ) -> tuple[Tensor, Tensor]:
-    if not (config.symmetric_weight or config.asymmetric_weight):
-        return dense.new_full((), torch.nan), dense.new_full((), torch.nan)
-    cells = cell_directions(dense.shape[-1])[1].sum()
+    cells = cell_directions(dense_truth.values.shape[-1])[1].sum()
     terms = []
-    if part != "ne_net":
+    if part != "ne_net" and dense is not None:
         terms.append((dense, normal_truth, config.li_net_norm))
     if part != "li_net":
         terms.append((dense_truth.values, normals, config.ne_net_norm))
-    symmetric = asymmetric = dense.new_zeros(())
+    symmetric = asymmetric = normals.new_zeros(())
     for maps, axes, norm in terms:
         fine, coarse = asymmetries(maps, axes, dense_truth.filled)
         share = 1 / cells if norm == "mean" else 1
@@ -116,15 +121,12 @@ def _special(
     return symmetric, asymmetric
 
 
-def truth_in_frame(batch: PixelBatch, views: Views, *, size: int) -> tuple[DenseMap, Tensor]:
-    """In the pixels' frames: D_gt at the sparse map's scale, cut at 1; normals (P, 3)."""
-    scene = batch.scene.rotate(views.cosine, views.sine)
-    dense, normals = scene.dense_truth(size), scene.normals
+def dense_truth_in_frame(batch: PixelBatch, views: Views, *, size: int) -> DenseMap:
+    """D_gt in the pixels' frames, at the sparse map's scale, cut at 1."""
+    dense = batch.scene.rotate(views.cosine, views.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / views.scale)[..., None, None]).clamp(max=1)
     dense = DenseMap(values, dense.known, dense.filled)
-    if views.mirrored:
-        dense, normals = dense.flip_y(), normals * normals.new_tensor((1.0, -1.0, 1.0))
-    return dense, normals
+    return dense.flip_y() if views.mirrored else dense
 
 
 @contextmanager

@@ -30,7 +30,8 @@ class Metrics:
 
     loss, symmetric and asymmetric are those of LI-Net and of NE-Net together, where they are updated in turn.
 
-    None for what was not computed: the special losses where their weights are 0, validation between saves.
+    None for what was not computed: the map errors where there is no LI-Net, the special losses where their weights
+    are 0, validation between saves.
     """
 
     step: int
@@ -39,8 +40,8 @@ class Metrics:
     learning_rate: float
     loss: float
     angle_deg: float
-    map_error: float
-    masked_map_error: float
+    map_error: float | None
+    masked_map_error: float | None
     symmetric: float | None = None
     asymmetric: float | None = None
     validation_deg: float | None = None
@@ -118,16 +119,22 @@ def curves_figure(rows: list[Metrics]) -> Figure:
     )
     angle.set_title("mean angular error (deg)")
     for name, label in (("map_error", "all cells"), ("masked_map_error", "cells with a light")):
-        maps.plot(steps, [getattr(row, name) for row in rows], label=label)
+        known = [(row.step, value) for row in rows if (value := getattr(row, name)) is not None]
+        if known:
+            maps.plot(*zip(*known, strict=True), label=label)
     maps.set_title("mean error of the dense map")
+    maps.set_visible(bool(maps.lines))
     for axes in (loss, angle, maps):
+        if not axes.lines:
+            continue
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)
         values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
         if (values > 0).all() and values.max() > 20 * values.min():
             axes.set_yscale("log")
     angle.legend()
-    maps.legend()
+    if maps.lines:
+        maps.legend()
     return figure
 
 
@@ -135,11 +142,14 @@ def maps_figure(maps: SampleMaps) -> Figure:
     """Sparse map, LI-Net's dense map and the true one, a column for each pixel, after the paper's figure 3."""
     from matplotlib.figure import Figure
 
+    shown = {"sparse map": maps.sparse}
+    if maps.dense is not None:
+        shown["LI-Net's dense map"] = maps.dense
+    shown["true map, gaps filled"] = maps.truth
     count = len(maps.sparse)
-    figure = Figure(figsize=(1.6 * count + 0.8, 5.4), layout="constrained")
-    axes = figure.subplots(3, count, squeeze=False)
-    names = ("sparse map", "LI-Net's dense map", "true map, gaps filled")
-    for name, row, cells in zip(names, axes, (maps.sparse, maps.dense, maps.truth), strict=True):
+    figure = Figure(figsize=(1.6 * count + 0.8, 1.8 * len(shown)), layout="constrained")
+    axes = figure.subplots(len(shown), count, squeeze=False)
+    for (name, cells), row in zip(shown.items(), axes, strict=True):
         row[0].set_ylabel(name)
         for axis, values in zip(row, cells, strict=True):
             image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")

@@ -14,7 +14,7 @@ from splinecli.networks.spline_net import SplineNet, Views, to_pixel_frame
 from splinecli.normals import angle_between_deg
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.training.losses import angular_loss
-from splinecli.training.objective import truth_in_frame
+from splinecli.training.objective import dense_truth_in_frame
 
 SHOWN_PIXELS = 8
 
@@ -26,10 +26,13 @@ def validation_deg(network: SplineNet, batch: PixelBatch, *, bfloat16: bool = Fa
 
 
 class SampleMaps(NamedTuple):
-    """Maps of N pixels, each (N, w, w), NaN where there is nothing, and the errors of their normals (N,)."""
+    """Maps of N pixels, each (N, w, w), NaN where there is nothing, and the errors of their normals (N,).
+
+    dense: None for a network without a LI-Net.
+    """
 
     sparse: NDArray[np.float32]
-    dense: NDArray[np.float32]
+    dense: NDArray[np.float32] | None
     truth: NDArray[np.float32]
     error_deg: NDArray[np.float32]
 
@@ -38,7 +41,8 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
     """What the networks see, guess and should have guessed of some pixels of a batch, spread evenly over it."""
     step = max(1, len(batch.observations) // SHOWN_PIXELS)
     views, dense, normals = _estimate(network, batch)
-    truth, normal_truth = truth_in_frame(batch, views, size=network.config.map_size)
+    truth = dense_truth_in_frame(batch, views, size=network.config.map_size)
+    normal_truth = to_pixel_frame(batch.scene.normals, views)
 
     def picture(values: Tensor, known: Tensor) -> NDArray[np.float32]:
         values = values.float().masked_fill(known == 0, torch.nan)
@@ -48,7 +52,7 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
     error_deg = angle_between_deg(normals.cpu().numpy(), normal_truth.cpu().numpy())
     return SampleMaps(
         picture(views.sparse, views.holds),
-        picture(dense, network.inside.expand_as(dense)),
+        None if dense is None else picture(dense, network.inside.expand_as(dense)),
         picture(truth.values, truth.filled),
         error_deg[::step][:SHOWN_PIXELS].astype(np.float32),
     )
@@ -57,7 +61,7 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
 @torch.no_grad()
 def _estimate(
     network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
-) -> tuple[Views, Tensor, Tensor]:
+) -> tuple[Views, Tensor | None, Tensor]:
     """What the networks see, LI-Net's dense maps and NE-Net's normals, in the pixels' frames."""
     network.eval()
     views = network.look(batch.observations, batch.light_directions, batch.valid)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from splinecli.methods.spline_net import SplineNetEstimator, views
+from splinecli.methods.networks import NetworkEstimator, views
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
@@ -34,21 +36,27 @@ def pixels(count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     return observations, lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
 
+def estimator(loaded: LoadedNetwork, **options: Any) -> NetworkEstimator:
+    return NetworkEstimator("spline-net", loaded, **options)
+
+
 @pytest.mark.parametrize("config", [COMPACT, PAPER])
 def test_batches_do_not_change_the_result(config: NetworkConfig) -> None:
     observations, lights = pixels(20)
-    whole = SplineNetEstimator(random_network(config), precision="float32").estimate(observations, lights)
+    whole = estimator(random_network(config), precision="float32").estimate(observations, lights)
     assert whole.dtype == np.float32
     for batch_size in (1, 7):
-        parts = SplineNetEstimator(random_network(config), precision="float32", batch_size=batch_size)
+        parts = NetworkEstimator(
+            "spline-net", random_network(config), precision="float32", batch_size=batch_size
+        )
         np.testing.assert_allclose(parts.estimate(observations, lights), whole, atol=3e-6)
     assert whole.std(axis=0).max() > 1e-3  # the pixels are not all alike
 
 
 def test_bfloat16_costs_little() -> None:
     observations, lights = pixels(50)
-    exact = SplineNetEstimator(random_network(COMPACT), precision="float32").estimate(observations, lights)
-    coarse = SplineNetEstimator(random_network(COMPACT), precision="bfloat16").estimate(observations, lights)
+    exact = estimator(random_network(COMPACT), precision="float32").estimate(observations, lights)
+    coarse = estimator(random_network(COMPACT), precision="bfloat16").estimate(observations, lights)
     error = angle_between_deg(coarse, exact)
     # 8 bits of mantissa on the correction alone, not on the fit.
     assert 0 < error.max() < 1
@@ -56,10 +64,10 @@ def test_bfloat16_costs_little() -> None:
 
 def test_dark_pixels_face_the_camera_and_darken_no_others() -> None:
     observations, lights = pixels(6)
-    estimator = SplineNetEstimator(random_network(COMPACT), precision="float32", rotations=3)
-    expected = estimator.estimate(observations, lights)
+    network = estimator(random_network(COMPACT), precision="float32", rotations=3)
+    expected = network.estimate(observations, lights)
     observations[2] = 0
-    estimate = estimator.estimate(observations, lights)
+    estimate = network.estimate(observations, lights)
     np.testing.assert_array_equal(estimate[2], (0, 0, 1))
     others = [0, 1, 3, 4, 5]
     np.testing.assert_allclose(estimate[others], expected[others], atol=1e-5)
@@ -67,8 +75,8 @@ def test_dark_pixels_face_the_camera_and_darken_no_others() -> None:
 
 def test_no_pixels() -> None:
     _, lights = pixels(1)
-    estimator = SplineNetEstimator(random_network(COMPACT), precision="float32")
-    assert estimator.estimate(np.empty((0, 10), np.float32), lights).shape == (0, 3)
+    network = estimator(random_network(COMPACT), precision="float32")
+    assert network.estimate(np.empty((0, 10), np.float32), lights).shape == (0, 3)
 
 
 def test_views_of_a_network_without_canonical_azimuth_divide_the_circle() -> None:
@@ -93,10 +101,12 @@ def test_four_views_of_the_paper_network_make_it_fourfold_symmetric() -> None:
     observations, lights = pixels(4)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     for rotations, symmetric in ((4, True), (1, False)):
-        estimator = SplineNetEstimator(random_network(PAPER), precision="float32", rotations=rotations)
+        network = NetworkEstimator(
+            "spline-net", random_network(PAPER), precision="float32", rotations=rotations
+        )
         here, there = (
-            estimator.estimate(observations, lights),
-            estimator.estimate(observations, lights @ quarter.T),
+            network.estimate(observations, lights),
+            network.estimate(observations, lights @ quarter.T),
         )
         assert np.allclose(there, here @ quarter.T, atol=1e-4) == symmetric
 
@@ -104,14 +114,16 @@ def test_four_views_of_the_paper_network_make_it_fourfold_symmetric() -> None:
 def test_two_views_of_a_canonical_network_make_it_mirror_symmetric() -> None:
     observations, lights = pixels(10)
     for rotations, symmetric in ((2, True), (1, False)):
-        estimator = SplineNetEstimator(random_network(COMPACT), precision="float32", rotations=rotations)
+        network = NetworkEstimator(
+            "spline-net", random_network(COMPACT), precision="float32", rotations=rotations
+        )
         here, there = (
-            estimator.estimate(observations, lights),
-            estimator.estimate(observations, lights * (1, -1, 1)),
+            network.estimate(observations, lights),
+            network.estimate(observations, lights * (1, -1, 1)),
         )
         assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
 
 
 def test_several_views_give_unit_vectors() -> None:
-    estimator = SplineNetEstimator(random_network(COMPACT), precision="float32", rotations=5)
-    np.testing.assert_allclose(np.linalg.norm(estimator.estimate(*pixels(30)), axis=1), 1, rtol=1e-5)
+    network = estimator(random_network(COMPACT), precision="float32", rotations=5)
+    np.testing.assert_allclose(np.linalg.norm(network.estimate(*pixels(30)), axis=1), 1, rtol=1e-5)

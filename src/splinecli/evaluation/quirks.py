@@ -1,0 +1,34 @@
+"""What is particular about a capture and how the evaluation dealt with it, in sentences for the report."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splinecli.capture import Capture
+from splinecli.capture.ground_truth import UPSIDE_DOWN
+from splinecli.evaluation.records import Protocol
+
+DAMAGED_IMAGES = {"bearPNG": 20}
+"""DiLiGenT's Bear: its first 20 images are corrupted, as the benchmark's users found."""
+
+
+def describe_quirks(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
+    """Sentences on a capture, whole as it was read; none for one without peculiarities."""
+    notes = []
+    skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
+    if skipped:
+        notes.append(f"{name}: the first {skipped} images are left out.")
+    elif damaged:
+        notes.append(
+            f"{name}: the first {damaged} images are known to be damaged and are used;"
+            f" --skip-first {name}={damaged} leaves them out."
+        )
+    notes += [f"{name}: {warning}" for warning in capture.warnings if warning == UPSIDE_DOWN]
+    if capture.ground_truth is not None:
+        without = capture.n_pixels - int(np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1)))
+        if without:
+            notes.append(
+                f"{name}: {without} of {capture.n_pixels} pixels in the mask have no ground-truth normal"
+                " and are not scored."
+            )
+    return tuple(notes)

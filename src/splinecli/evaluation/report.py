@@ -1,0 +1,205 @@
+"""An evaluation as one HTML file that holds everything it shows: to be mailed, printed, or opened years later."""
+
+from __future__ import annotations
+
+import base64
+import struct
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from splinecli import __version__
+from splinecli.evaluation.records import Evaluation
+from splinecli.evaluation.statistics import (
+    AVERAGE,
+    SIGNIFICANCE,
+    Comparison,
+    compare,
+    in_words,
+    p_in_words,
+    trial_averages,
+)
+from splinecli.evaluation.tables import best_cells, heading, lights_in_words, table_rows
+
+_TEMPLATE = resources.files("splinecli") / "assets" / "report.html"
+_MOST_SENTENCES = 3  # of three methods; the pairs of more are read faster in a matrix
+_MINUS = "\N{MINUS SIGN}"
+
+
+Mark = Literal["", "star", "best"]
+
+
+class Cell(NamedTuple):
+    """A table's cell: its text, a smaller remark, and a mark: a star, or for the best a star and a colour."""
+
+    text: str
+    remark: str = ""
+    mark: Mark = ""
+
+
+Table = list[list[Cell]]
+"""A header row, then rows whose first cell is a header."""
+
+
+def html_report(
+    evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]
+) -> str:
+    """The report of one evaluation, or of several of the same methods under other lights or light noises.
+
+    Args:
+        figures: captions, which are the images' alternative texts too, and PNG.
+        notes: sentences about the captures and the run.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = environment.from_string(_TEMPLATE.read_text("utf-8"))
+    first = evaluations[0]
+    return (
+        template.render(
+            title=f"{_count(len(first.methods), 'method')} on {_count(len(first.captures), 'capture')}",
+            protocol=_protocol(evaluations),
+            notes=notes,
+            skipped=list(dict.fromkeys((s.capture, s.reason) for e in evaluations for s in e.skipped)),
+            summary=_summary(evaluations) if len(evaluations) > 1 else None,
+            several_methods=len(first.methods) > 1,
+            sections=[_section(evaluation) for evaluation in evaluations],
+            figures=[_figure(caption, png) for caption, png in figures],
+            significance=SIGNIFICANCE,
+            version=__version__,
+        ).rstrip()
+        + "\n"
+    )
+
+
+def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
+    first = evaluations[0].protocol
+    lights = dict.fromkeys(lights_in_words(e.protocol) for e in evaluations)
+    noises = dict.fromkeys(f"{e.protocol.light_noise_deg:g}" for e in evaluations)
+    drawn = "at random from the seed" if first.draws_file is None else f"those of {first.draws_file.name}"
+    trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
+    left_out = ", ".join(
+        f"the first {count} of {'every other capture' if name == '*' else name}"
+        for name, count in first.skip_first.items()
+    )
+    everything = "all that have ground truth"
+    at_most = f"at most {first.max_pixels} of each capture, at random"
+    return [
+        ("Methods", ", ".join(evaluations[0].methods)),
+        ("Captures", ", ".join(dict.fromkeys(c for e in evaluations for c in e.captures))),
+        ("Lights", ", ".join(lights)),
+        ("Trials", " or ".join(map(str, trials))),
+        ("Draws of lights", f"{drawn}, the same for all methods"),
+        ("Seed", str(first.seed)),
+        ("Light noise", "none" if list(noises) == ["0"] else f"{', '.join(noises)} degrees"),
+        *([("Images left out", left_out)] if left_out else []),
+        ("Pixels scored", everything if first.max_pixels is None else at_most),
+        ("splinecli", __version__),
+    ]
+
+
+def _section(evaluation: Evaluation) -> dict[str, Any]:
+    comparisons = compare(evaluation)
+    average = [c for c in comparisons if c.capture == AVERAGE]
+    return {
+        "heading": heading(evaluation.protocol),
+        "errors": _error_table(evaluation),
+        "seconds": _seconds_table(evaluation),
+        "sentences": [in_words(c) for c in average] if len(average) <= _MOST_SENTENCES else [],
+        "matrix": _matrix(evaluation.methods, average) if len(average) > _MOST_SENTENCES else None,
+        "pairs": [_pair_row(c) for c in comparisons],
+    }
+
+
+def _summary(evaluations: Sequence[Evaluation]) -> Table:
+    """Methods by evaluations: the last column of each evaluation's table."""
+    columns = [[row[-1] for row in _error_table(evaluation)] for evaluation in evaluations]
+    columns = [
+        [Cell(heading(evaluation.protocol)), *column[1:]]
+        for evaluation, column in zip(evaluations, columns, strict=True)
+    ]
+    methods = [Cell(name) for name in ("method", *evaluations[0].methods)]
+    return [list(row) for row in zip(methods, *columns, strict=True)]
+
+
+def _error_table(evaluation: Evaluation) -> Table:
+    """Methods by captures and the average: MAE, its standard deviation over the trials, the best marked."""
+    header, *rows = table_rows(evaluation)
+    best = best_cells([header, *rows])
+    maes_deg = {(r.method, r.capture): r.maes_deg for r in evaluation.results}
+    maes_deg |= {(method, AVERAGE): trial_averages(evaluation, method) for method in evaluation.methods}
+    body = [
+        [
+            Cell(method),
+            *(
+                Cell(value, _plus_minus(maes_deg[method, header[c]]), "best" if (r, c) in best else "")
+                for c, value in enumerate(values, start=1)
+            ),
+        ]
+        for r, (method, *values) in enumerate(rows, start=1)
+    ]
+    return [[Cell(name) for name in header], *body]
+
+
+def _seconds_table(evaluation: Evaluation) -> Table:
+    """Methods by captures: seconds a trial."""
+    seconds = {(r.method, r.capture): r.seconds for r in evaluation.results}
+    body = [
+        [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]
+        for method in evaluation.methods
+    ]
+    return [[Cell("method"), *(Cell(capture) for capture in evaluation.captures)], *body]
+
+
+def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
+    """MAE of the row's method minus that of the column's; marked where they differ beyond the spread."""
+    cells = {}
+    for c in comparisons:
+        for row, column, difference_deg in (
+            (c.first, c.second, c.difference_deg),
+            (c.second, c.first, -c.difference_deg),
+        ):
+            mark: Mark = "" if not c.differs else "best" if difference_deg < 0 else "star"
+            cells[row, column] = Cell(_signed(difference_deg), mark=mark)
+    body = [[Cell(row), *(cells.get((row, column), Cell("")) for column in methods)] for row in methods]
+    return [[Cell("method"), *(Cell(method) for method in methods)], *body]
+
+
+def _pair_row(comparison: Comparison) -> dict[str, str]:
+    c = comparison
+    if c.interval_deg is None or c.p_holm is None:
+        interval = p_value = "not tested"
+    else:
+        interval = " to ".join(map(_signed, c.interval_deg))
+        p_value = p_in_words(c.p_holm)
+    verdict = {None: "", True: f"{c.first if c.difference_deg < 0 else c.second} is better", False: "no"}
+    return {
+        "capture": c.capture,
+        "pair": f"{c.first} {_MINUS} {c.second}",
+        "difference": _signed(c.difference_deg),
+        "interval": interval,
+        "p": p_value,
+        "differs": verdict[c.differs],
+    }
+
+
+def _figure(caption: str, png: bytes) -> dict[str, Any]:
+    width, height = struct.unpack(">II", png[16:24])  # of the IHDR chunk, always the first
+    data = base64.b64encode(png).decode("ascii")
+    return {"caption": caption, "data": data, "width": width, "height": height, "wide": width > 2 * height}
+
+
+def _signed(value_deg: float) -> str:
+    return f"{value_deg:+.2f}".replace("-", _MINUS)
+
+
+def _plus_minus(maes_deg: Sequence[float]) -> str:
+    return f"± {np.std(maes_deg):.2f}" if len(maes_deg) > 1 else ""
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,0 +1,64 @@
+"""Methods that are a function of a batch of pixels, in torch: batches, devices, and the scale of the intensities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splinecli.errors import UsageError
+from splinecli.observation_map import map_scale
+
+Solve = Callable[[Tensor, Tensor], Tensor]
+"""(observations (P, F) with a largest value of 1 each, light directions (F, 3)) -> normals (P, 3), of any length.
+
+All observations are finite and none is negative. A zero vector says that the pixel has no normal.
+"""
+
+
+@dataclass(frozen=True)
+class BatchedEstimator:
+    """A method as an estimator: `solve` on batches of pixels.
+
+    Args:
+        name: the method's name in the registry.
+        solve: see Solve. Every pixel is divided by its largest observation first: thresholds and priors then mean
+            the same for dark and bright pixels, and scaling the images changes nothing.
+        batch_size: pixels at a time.
+        precision: of the computation, "float32" or "float64".
+    """
+
+    name: str
+    solve: Solve
+    device: str
+    batch_size: int
+    precision: str = "float64"
+    weights: None = None
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise UsageError("batch size is a whole number from 1")
+
+    @property
+    def fingerprint(self) -> str:
+        return f"{self.name} {self.precision}"
+
+    @torch.inference_mode()
+    def estimate(
+        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
+        dtype = getattr(torch, self.precision)
+        lights = torch.as_tensor(light_directions, dtype=dtype, device=self.device)
+        normals = np.empty((len(observations), 3), np.float32)
+        for start in range(0, len(observations), self.batch_size):
+            batch = torch.as_tensor(observations[start : start + self.batch_size])
+            batch = batch.to(self.device, dtype).clamp(min=0)
+            found = torch.nn.functional.normalize(self.solve(batch / map_scale(batch), lights), dim=-1)
+            found[~found.any(dim=1)] = found.new_tensor((0.0, 0.0, 1.0))
+            normals[start : start + self.batch_size] = found.cpu().numpy()
+        return normals

@@ -1,0 +1,143 @@
+"""SPLINE-Net and CNN-PS as estimators: batches, devices, precision, the average over several views of a pixel."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splinecli.errors import ModelError, UsageError
+from splinecli.networks.weights import LoadedNetwork
+from splinecli.observation_map import rotate_about_view_axis, sparse_map
+
+Precision = Literal["float32", "bfloat16"]
+
+VIEW_SPAN_DEG = 20.0
+"""Canonical networks know turns of up to 15 degrees either way; their views stay well inside."""
+
+
+class NetworkEstimator:
+    """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
+
+    Args:
+        name: the method's name in the registry.
+        loaded: the network with its name and checksum.
+        rotations: R, the number of views averaged. A network without a canonical azimuth sees the lights
+            turned by 360 k / R degrees about the view axis, as CNN-PS does. For one with a canonical azimuth
+            such turns change nothing; its views are mirror images and small turns across 20 degrees, which
+            move the lights over the borders of the cells.
+        batch_size: pixels at a time; memory grows with it (about 0.25 MB a pixel).
+
+    Raises:
+        ModelError: the weights are the other method's.
+        UsageError: rotations or batch_size is below 1.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        loaded: LoadedNetwork,
+        *,
+        device: torch.device | str = "cpu",
+        precision: Precision = "bfloat16",
+        rotations: int = 1,
+        batch_size: int = 1024,
+    ) -> None:
+        interpolates = loaded.network.config.interpolates
+        if interpolates != (name == "spline-net"):
+            kind = "both networks of spline-net" if interpolates else "the one network of cnn-ps"
+            raise ModelError(
+                f"the weights {loaded.name!r} hold {kind}, so the method {name} cannot use them",
+                hint=f"Take --method {'spline-net' if interpolates else 'cnn-ps'}, or other weights",
+            )
+        if rotations < 1 or batch_size < 1:
+            raise UsageError("rotations and batch size are whole numbers from 1")
+        self.name = name
+        self.weights = {"name": loaded.name, "sha256": loaded.sha256}
+        self.device = str(device)
+        self.precision = str(precision)
+        self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
+        self.batch_size = batch_size
+        self.network = loaded.network.to(device)
+        self._views = views(rotations, canonical=loaded.network.config.is_canonical)
+
+    @torch.inference_mode()
+    def estimate(
+        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
+        lights = torch.as_tensor(light_directions, dtype=torch.float32, device=self.device)
+        normals = np.empty((len(observations), 3), np.float32)
+        for start in range(0, len(observations), self.batch_size):
+            batch = torch.as_tensor(observations[start : start + self.batch_size]).to(
+                self.device, torch.float32
+            )
+            with torch.autocast(
+                lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
+            ):
+                total = sum(
+                    (
+                        self.network(batch, lights, turn_deg=turn, mirror=mirror)
+                        for turn, mirror in self._views
+                    ),
+                    start=torch.zeros((), device=lights.device),
+                )
+            unit = torch.nn.functional.normalize(total, dim=-1)
+            unit[batch.amax(dim=1) <= 0] = unit.new_tensor((0.0, 0.0, 1.0))
+            normals[start : start + self.batch_size] = unit.cpu().numpy()
+        return normals
+
+    @torch.inference_mode()
+    def maps(
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        all_observations: NDArray[np.float32],
+        all_directions: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """What the network sees and interpolates of pixels, and what they show under all of the capture's lights.
+
+        Args:
+            observations, all_observations: (P, F) and (P, F') of the same pixels.
+            light_directions, all_directions: (F, 3) and (F', 3).
+
+        Returns:
+            Sparse maps, LI-Net's dense maps, and sparse maps of all lights, each (P, w, w) in the pixels' frames, as
+            shares of the largest of the F observations; NaN in cells that hold nothing.
+        """
+        device, network = self.device, self.network
+        views = network.look(
+            torch.as_tensor(observations, dtype=torch.float32, device=device),
+            torch.as_tensor(light_directions, dtype=torch.float32, device=device),
+        )
+        dense = network.interpolate(views)
+        assert dense is not None, "CNN-PS has no dense maps"
+        turned = rotate_about_view_axis(
+            torch.as_tensor(all_directions, dtype=torch.float32, device=device).expand(
+                len(observations), -1, 3
+            ),
+            views.cosine[:, None],
+            views.sine[:, None],
+        )
+        values = torch.as_tensor(all_observations, dtype=torch.float32, device=device) / views.scale
+        config = network.config
+        every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
+
+        def known(values: Tensor, holds: Tensor) -> NDArray[np.float32]:
+            return np.asarray(values.masked_fill(holds == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
+
+        inside = network.inside.expand_as(dense)
+        return known(views.sparse, views.holds), known(dense, inside), known(every.values, every.holds)
+
+
+def views(rotations: int, *, canonical: bool) -> list[tuple[float, bool]]:
+    """The (turn in degrees, mirrored) of each of R views."""
+    if not canonical:
+        return [(360.0 * k / rotations, False) for k in range(rotations)]
+    turns = (rotations + 1) // 2
+    span = VIEW_SPAN_DEG if turns > 1 else 0.0
+    step = span / max(turns - 1, 1)
+    return [(step * (k // 2) - span / 2, k % 2 == 1) for k in range(rotations)]

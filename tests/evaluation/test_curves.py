@@ -1,0 +1,98 @@
+"""Plots decode, have the size their panels need, and carry each method's colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.evaluation.curves import light_noise_curves, lights_curves
+from splinecli.evaluation.plotting import method_looks
+from splinecli.evaluation.records import Evaluation, Protocol, Result
+from splinecli.methods import method_names
+
+METHODS = ("ls", "spline-net")
+
+
+def evaluation_of(
+    captures: list[str], n_lights: int | None = 10, light_noise_deg: float = 0.0, *, all_lights: int = 96
+) -> Evaluation:
+    level = 20 / (n_lights or all_lights) + light_noise_deg
+    return Evaluation(
+        Protocol(n_lights, 3, light_noise_deg=light_noise_deg),
+        tuple(
+            Result(method, capture, n_lights or all_lights, (m + level, m + level + 0.5, m + level + 1), 1.0)
+            for capture in captures
+            for m, method in enumerate(METHODS, start=3)
+        ),
+    )
+
+
+def decode(png: bytes) -> NDArray[np.uint8]:
+    """RGB (H, W, 3)."""
+    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
+    rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return float((np.abs(picture.astype(int) - rgb).max(axis=2) <= 2).mean())
+
+
+@pytest.mark.parametrize(
+    ("captures", "across", "down"),
+    [
+        (["ball"], 1, 1),
+        (["ball", "cat"], 3, 1),
+        (list("abc"), 2, 2),
+        (list("abcd"), 3, 2),
+        (list("abcde"), 1, 1),
+    ],
+)
+def test_a_panel_for_each_capture_and_the_average(captures: list[str], across: int, down: int) -> None:
+    picture = decode(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
+    assert picture.shape == (540 * down + 80, 640 * across, 3)
+    assert (picture[0] == 255).all()
+
+
+def test_each_method_has_its_colour_in_both_plots() -> None:
+    looks = method_looks(METHODS)
+    for png in (
+        lights_curves([evaluation_of(["ball"], k) for k in (4, 10, 32)]),
+        light_noise_curves([evaluation_of(["ball"], 10, noise) for noise in (0, 2, 4)]),
+    ):
+        for method in METHODS:
+            assert share_of(looks[method].colour, decode(png)) > 0.002  # a line 3 pixels thick
+
+
+def test_looks_are_fixed_and_all_different() -> None:
+    everyone = method_looks(method_names())
+    assert len({look.colour for look in everyone.values()}) == len(everyone)
+    assert len({look.marker for look in everyone.values()}) == len(everyone)
+    assert method_looks(["ls"])["ls"] == everyone["ls"]
+    assert method_looks(["new", "ls"])["ls"] == everyone["ls"]
+
+
+def test_captures_that_not_all_have_are_left_out() -> None:
+    fewer = evaluation_of(["ball"], 50)
+    both = evaluation_of(["ball", "cat"], 10)
+    assert lights_curves([both, fewer]) == lights_curves([evaluation_of(["ball"], 10), fewer])
+
+
+@pytest.mark.parametrize("draw", [lights_curves, light_noise_curves])
+def test_lights_and_noise_may_both_differ(draw: Callable[[Sequence[Evaluation]], bytes]) -> None:
+    evaluations = [evaluation_of(["ball"], k, noise) for k in (5, 10, None) for noise in (0, 2.5)]
+    ink = (decode(draw(evaluations)) < 255).sum()
+    assert ink > (decode(draw(evaluations[::2])) < 255).sum()
+
+
+def test_odd_names_one_point_and_one_trial_are_drawn() -> None:
+    odd = Evaluation(Protocol(10), (Result("_m$x$", "a$b_{c$ 猫", 10, (3.0,), 1.0),))
+    assert decode(lights_curves([odd])).std() > 0
+    assert decode(light_noise_curves([odd])).std() > 0
+
+
+def test_the_same_counts_twice_are_drawn() -> None:
+    decode(lights_curves([evaluation_of(["ball"], 96), evaluation_of(["ball"], None)]))

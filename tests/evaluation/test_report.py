@@ -1,0 +1,176 @@
+"""The report parses, stands alone, says what it was given, and takes names for text."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli import __version__
+from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
+from splinecli.evaluation.report import html_report
+
+PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
+WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Text and attributes by tag; fails where an end tag closes nothing or another tag."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: dict[str, list[str]] = {}
+        self.feed(html)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if data.strip() and self.open:
+            self.text.setdefault(self.open[-1], []).append(" ".join(data.split()))
+
+    def all_of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def evaluation_of(
+    methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10
+) -> Evaluation:
+    generator = np.random.default_rng(3)
+    return Evaluation(
+        Protocol(n_lights, trials, seed=7, max_pixels=500),
+        tuple(
+            Result(method, capture, n_lights or 96, tuple(5 + m + generator.normal(0, 0.1, trials)), 0.25)
+            for capture in captures
+            for m, method in enumerate(methods)
+        ),
+        (Skipped("bear", "bear: no images."),),
+    )
+
+
+def test_one_evaluation() -> None:
+    page = Page(
+        html_report([evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."])
+    )
+    assert page.text["h1"] == ["Photometric stereo: 2 methods on 2 captures"]
+    protocol = dict(zip(page.text["dt"], page.text["dd"], strict=True))
+    assert protocol == {
+        "Methods": "ls, iw12",
+        "Captures": "ball, cat",
+        "Lights": "10 lights",
+        "Trials": "4",
+        "Draws of lights": "at random from the seed, the same for all methods",
+        "Seed": "7",
+        "Light noise": "none",
+        "Pixels scored": "at most 500 of each capture, at random",
+        "splinecli": __version__,
+    }
+    assert {"Notes", "Captures passed over", "Results with 10 lights", "Figures"} <= set(page.text["h2"])
+    assert {"Ball is round.", ": bear: no images."} <= set(page.text["li"])
+    assert any(words.startswith("ls is better than iw12 by") for words in page.text["li"])
+    assert page.text["figcaption"] == ["A plot"]
+    assert page.text["small"][0].startswith("± 0.")
+    best = [attributes for attributes in page.all_of("td") if attributes.get("class") == "best"]
+    assert len(best) == 3  # the first method on both captures and the average
+
+
+def test_several_evaluations_begin_with_their_averages() -> None:
+    evaluations = [evaluation_of(["ls", "iw12"], ["ball"], n_lights=k) for k in (4, 10)]
+    evaluations.append(evaluation_of(["ls", "iw12"], ["ball"], trials=1, n_lights=None))
+    page = Page(html_report(evaluations, [], []))
+    headings = page.text["h2"]
+    assert headings[-4:] == [
+        "Averages over the captures",
+        *(f"Results with {k} lights" for k in (4, 10, "all")),
+    ]
+    assert "Notes" not in headings
+    assert "Figures" not in headings
+    assert "4 or 1" in page.text["dd"]  # trials
+    assert any("one trial: not tested" in words for words in page.text["li"])
+    assert page.text["li"].count(": bear: no images.") == 1
+
+
+def test_images_left_out_are_told() -> None:
+    evaluation = evaluation_of(["ls"], ["bear", "cat"])
+    protocol = replace(evaluation.protocol, skip_first={"bear": 20, "*": 1})
+    page = Page(html_report([replace(evaluation, protocol=protocol)], [], []))
+    assert "the first 20 of bear, the first 1 of every other capture" in page.text["dd"]
+
+
+def test_many_methods_have_a_matrix() -> None:
+    methods = [f"m{i}" for i in range(5)]
+    page = Page(html_report([evaluation_of(methods, ["ball"])], [], []))
+    assert any(words.startswith("Average MAE of the row’s method") for words in page.text["span"])
+    assert not any("is better than" in words for words in page.text["li"])
+    # Every pair twice in the matrix, and on one capture and the average in the list.
+    assert sum("−1." in words or "−0.9" in words for words in page.text["td"]) >= 4
+
+
+def test_one_method_on_one_capture() -> None:
+    html = html_report([evaluation_of(["ls"], ["ball"], trials=1)], [], [])
+    page = Page(html)
+    assert page.text["h1"] == ["Photometric stereo: 1 method on 1 capture"]
+    assert "h3" in page.text
+    assert "Do the methods differ?" not in page.text["h3"]
+    assert "small" not in page.text  # no spread
+    assert "best of each column" not in html
+
+
+def test_it_stands_alone() -> None:
+    html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG), ("B", WIDE_PNG)], [])
+    page = Page(html)
+    assert not page.all_of("script")
+    assert not page.all_of("link")
+    assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import|https?:""", html)
+    images = page.all_of("img")
+    for image, png in zip(images, (PNG, WIDE_PNG), strict=True):
+        source = image["src"]
+        assert source
+        assert base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True) == png
+    assert [(i["alt"], i["width"], i["height"], i.get("class")) for i in images] == [
+        ("A", "40", "30", None),
+        ("B", "400", "30", "wide"),
+    ]
+
+
+@pytest.mark.parametrize("name", ["<b>&", '"><script>alert(1)</script>', "{{ 7 * 7 }}", "a'b"])
+def test_names_are_text(name: str) -> None:
+    evaluation = evaluation_of([name, "ls"], [name + "1", "ball"])
+    evaluation = replace(evaluation, skipped=(Skipped(name, name),))
+    page = Page(html_report([evaluation], [(name, PNG)], [name]))
+    assert name in page.text["th"]
+    assert name in page.text["strong"]
+    assert name in page.text["figcaption"]
+    assert page.all_of("img")[0]["alt"] == name
+    assert not page.all_of("b")
+    assert not page.all_of("script")
+
+
+def test_it_can_be_read_by_all() -> None:
+    html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG)], [])
+    page = Page(html)
+    assert page.all_of("html") == [{"lang": "en"}]
+    assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in page.all_of("meta")
+    assert html.startswith("<!DOCTYPE html>")
+    assert "prefers-color-scheme: dark" in html
+    assert "@media print" in html
+    assert all(th.get("scope") in ("row", "col") for th in page.all_of("th"))
+    levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch("h[1-6]", tag)]
+    assert levels[0] == 1
+    assert all(after - before <= 1 for before, after in pairwise(levels))

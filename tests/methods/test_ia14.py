@@ -1,0 +1,187 @@
+"""IA14, against a library for quadratic programmes and on scenes whose inverse is such a polynomial."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+import pytest
+import quadprog
+import torch
+from numpy.typing import NDArray
+
+from splinecli.methods import MethodOptions, make_estimator
+from splinecli.methods.ia14 import fit, solve
+from splinecli.normals import angle_between_deg
+
+Array = NDArray[np.float64]
+ON_CPU = MethodOptions(device="cpu")
+
+
+def directions(count: int, limit_deg: float, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
+    zenith = np.arccos(rng.uniform(np.cos(np.radians(limit_deg)), 1, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def bernstein(x: Array, degree: int) -> Array:
+    return np.stack([comb(degree, i) * x**i * (1 - x) ** (degree - i) for i in range(degree + 1)], axis=-1)
+
+
+def rendered(normals: Array, lights: Array, seed: int) -> Array:
+    """Diffuse and a Blinn-Phong highlight of random strength and width, with attached shadows; largest 1."""
+    rng = np.random.default_rng(seed)
+    strength, exponent = rng.uniform(0, 2, (len(normals), 1)), rng.uniform(5, 80, (len(normals), 1))
+    half = lights + np.array((0, 0, 1))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    shading = (normals @ lights.T).clip(0)
+    observations: Array = shading * (1 + strength * (normals @ half.T).clip(0) ** exponent)
+    return observations / observations.max(axis=1, keepdims=True)
+
+
+def test_lambertian_is_exact() -> None:
+    for count in (4, 10, 96):
+        truth, lights = directions(300, 70, 0), directions(count, 60, 1)
+        observations = (truth @ lights.T).clip(0)
+        truth = truth[(observations > 0).sum(axis=1) >= 4]
+        observations = (truth @ lights.T).clip(0) * 7
+        # What is left is float32 and, for lights nearly in a plane, the ridge.
+        found = make_estimator("ia14", ON_CPU).estimate(observations.astype(np.float32), lights)
+        assert np.median(angle_between_deg(found, truth)) < 1e-4
+        assert angle_between_deg(found, truth).max() < 0.02
+
+
+def inverted(normals: Array, lights: Array, coefficients: Array) -> Array:
+    """The observations (P, F) at which g is n.l, by halving; 0 in attached shadow."""
+    shading = (normals @ lights.T).clip(0)
+    weights = np.einsum("pik,fk->pfi", coefficients, bernstein(lights[:, 2], 4))
+    low, high = np.zeros_like(shading), np.ones_like(shading)
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = (bernstein(middle, 2) * weights).sum(axis=-1) < shading
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.where(shading > 0, high, 0)
+
+
+def monotone_coefficients(count: int, seed: int) -> Array:
+    """(P, 3, 5): zero at the observation 0, from 1.1 to 2.2 at the observation 1."""
+    rng = np.random.default_rng(seed)
+    last = rng.uniform(1.1, 2.2, (count, 5))
+    return np.stack((np.zeros((count, 5)), last * rng.uniform(0.2, 0.95, (count, 5)), last), axis=1)
+
+
+def test_exact_where_the_inverse_is_such_a_polynomial() -> None:
+    truth, lights = directions(200, 50, 2), directions(96, 60, 3)
+    observations = inverted(truth, lights, monotone_coefficients(200, 4))
+    found = solve(torch.as_tensor(observations), torch.as_tensor(lights), prior_weight=1e-9).numpy()
+    assert angle_between_deg(found, truth).max() < 0.01
+    # The prior draws towards Lambert's law, which costs little with many lights.
+    found = solve(torch.as_tensor(observations), torch.as_tensor(lights)).numpy()
+    assert angle_between_deg(found, truth).mean() < 0.3
+
+
+def objective_of(
+    intensities: Array, lights: Array, prior_weight: float
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """The whole programme of one pixel, over x = (n, c_10 .. c_24): no variable eliminated, no increments.
+
+    Returns H with the objective x'Hx / 2, the mean of g as a row m'x, the monotonicity as C x >= 0, and which
+    lights are used.
+    """
+    floor = min(0.25 * intensities.mean(), np.sort(intensities)[-3])
+    used = (intensities >= floor) & (intensities > 0)
+    x, directions_used = intensities[used], lights[used]
+    products = bernstein(x, 2)[:, 1:, None] * bernstein(directions_used[:, 2], 4)[:, None, :]
+    g = np.concatenate((np.zeros((len(x), 3)), products.reshape(len(x), 10)), axis=1)
+    normal = np.concatenate((directions_used, np.zeros((len(x), 10))), axis=1)
+    steps = np.kron([[1, 0], [-1, 1]], np.eye(5))
+    monotone = np.concatenate((np.zeros((10, 3)), steps), axis=1)
+    unitless = 2 * x.mean() * monotone
+    centred = unitless - unitless.mean(axis=0)
+    hessian = 2 * ((normal - g).T @ (normal - g) + prior_weight * centred.T @ centred / 10)
+    return hessian, g.mean(axis=0), monotone, used
+
+
+@pytest.mark.parametrize("count", [10, 96])
+@pytest.mark.parametrize("kind", ["random", "rendered"])
+def test_optimum_is_the_librarys(kind: str, count: int) -> None:
+    lights = directions(count, 60, 5)
+    truth = directions(100, 60, 6)
+    if kind == "random":
+        observations = np.random.default_rng(7).uniform(size=(100, count))
+        observations /= observations.max(axis=1, keepdims=True)
+    else:
+        observations = rendered(truth, lights, 7)
+    normals, increments = fit(torch.as_tensor(observations), torch.as_tensor(lights))
+    for intensities, n, d in zip(observations, normals.numpy(), increments.numpy(), strict=True):
+        hessian, mean, monotone, used = objective_of(intensities, lights, prior_weight=0.01)
+        # On the constraint mean'x = 1 the added term is constant; the library asks for a definite hessian.
+        definite = hessian + np.outer(mean, mean) + 1e-10 * np.eye(13)
+        constraints = np.concatenate((mean[None], monotone)).T
+        bounds = np.array([1.0] + [0.0] * 10)
+        expected = quadprog.solve_qp(definite, np.zeros(13), constraints, bounds, 1)[0]
+        c = np.cumsum(d / (2 * intensities[used].mean()), axis=0)
+        found = np.concatenate((n, c.ravel()))
+        assert mean @ found == pytest.approx(1, rel=1e-12)
+        assert (monotone @ found).min() > -1e-12
+        optimum = expected @ hessian @ expected
+        assert found @ hessian @ found == pytest.approx(optimum, rel=1e-6, abs=1e-9)
+        assert angle_between_deg(n[None], expected[None, :3]).item() < 0.01
+
+
+def test_better_than_least_squares_under_highlights() -> None:
+    truth, lights = directions(300, 60, 8), directions(96, 60, 9)
+    observations = rendered(truth, lights, 10).astype(np.float32)
+    error = {
+        name: angle_between_deg(make_estimator(name, ON_CPU).estimate(observations, lights), truth).mean()
+        for name in ("ls", "ia14")
+    }
+    assert error["ia14"] < error["ls"] / 2
+
+
+def test_order_of_lights_and_scale_do_not_matter() -> None:
+    lights = directions(12, 60, 11)
+    observations = rendered(directions(200, 60, 12), lights, 13).astype(np.float32)
+    estimator = make_estimator("ia14", ON_CPU)
+    found = estimator.estimate(observations, lights)
+    order = np.random.default_rng(14).permutation(12)
+    for other in (
+        estimator.estimate(observations[:, order], lights[order]),
+        estimator.estimate(observations * 1234.5, lights),
+    ):
+        # float32 observations, and ten increments that twelve lights determine only by the prior.
+        assert angle_between_deg(found, other).max() < 1e-3
+
+
+def test_turning_the_scene_about_the_view_turns_the_normals() -> None:
+    lights = directions(12, 60, 15)
+    observations = torch.as_tensor(rendered(directions(200, 60, 16), lights, 17))
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    found = solve(observations, torch.as_tensor(lights)).numpy()
+    turned = solve(observations, torch.as_tensor(lights @ turn.T)).numpy()
+    assert angle_between_deg(turned, found @ turn.T).max() < 1e-5
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10])
+def test_few_usable_observations_give_finite_normals(count: int) -> None:
+    lights = directions(count, 60, 18)
+    observations = np.zeros((4, count), np.float32)
+    observations[1, 0] = 1
+    observations[2, :2] = 0.5
+    observations[3] = 1
+    found = make_estimator("ia14", ON_CPU).estimate(observations, lights)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
+    np.testing.assert_array_equal(found[0], (0, 0, 1))
+    # The one light seen is all that is known.
+    assert angle_between_deg(found[1:2], lights[:1]).item() < 1e-2
+    if count >= 3:
+        _, increments = fit(torch.as_tensor(observations), torch.as_tensor(lights))
+        assert increments.isfinite().all()
+        assert (increments >= 0).all()
+
+
+def test_no_pixels() -> None:
+    assert solve(torch.zeros(0, 5), torch.as_tensor(directions(5, 60, 0))).shape == (0, 3)

@@ -1,0 +1,146 @@
+"""ST14, on scenes that obey its model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from splinecli.methods import MethodOptions, make_estimator
+from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.st14 import coefficient_count, kept_count, solve
+from splinecli.normals import angle_between_deg
+
+Array = NDArray[np.float64]
+
+
+def directions(count: int, limit_deg: float, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
+    zenith = np.radians(limit_deg) * np.sqrt(rng.uniform(0, 1, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def half_cosines(normals: Array, lights: Array) -> tuple[Array, Array]:
+    """n.h (P, F) and l.h (F,)."""
+    bisectors = lights + np.array((0, 0, 1))
+    bisectors /= np.linalg.norm(bisectors, axis=1, keepdims=True)
+    return normals @ bisectors.T, (lights * bisectors).sum(axis=1)
+
+
+def bipolynomial(normals: Array, lights: Array) -> Array:
+    """Observations (P, F) under nine random coefficients a pixel, as the model's definition has it."""
+    half, difference = half_cosines(normals, lights)
+    coefficients = np.random.default_rng(5).uniform(-0.3, 0.3, (len(normals), 3, 3))
+    coefficients[:, 0, 0] = 1
+    powers = np.arange(3)
+    reflectance: Array = np.einsum(
+        "pab,pfa,fb->pf",
+        coefficients,
+        (1 - half[..., None]) ** powers,
+        (1 - difference[..., None]) ** powers,
+    )
+    return reflectance * (normals @ lights.T)
+
+
+def estimate(observations: Array, lights: Array) -> Array:
+    estimator = make_estimator("st14", MethodOptions(device="cpu"))
+    return estimator.estimate(observations.astype(np.float32), lights).astype(np.float64)
+
+
+def solved(observations: Array, lights: Array) -> Array:
+    scaled = observations / observations.max(axis=1, keepdims=True)
+    normals: Array = solve(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
+    return normals
+
+
+# All lights are within 38 degrees of the camera, all normals within 50: nothing is shadowed.
+TRUTH = directions(300, 50, 0)
+LIGHTS = directions(96, 38, 1)
+OBSERVATIONS = bipolynomial(TRUTH, LIGHTS)
+
+
+def with_highlights(observations: Array, untouched: int) -> Array:
+    """All but the lowest of a pixel's observations up to six times as bright."""
+    rank = observations.argsort(axis=1).argsort(axis=1)
+    gain = np.random.default_rng(7).uniform(0, 5, observations.shape)
+    return observations * (1 + gain * (rank >= untouched))
+
+
+def test_exact_under_its_model() -> None:
+    assert OBSERVATIONS.min() > 0
+    # The prior weighs no more than the noise it is left with, which is rounding.
+    assert angle_between_deg(solved(OBSERVATIONS, LIGHTS), TRUTH).max() < 0.005
+    assert angle_between_deg(estimate(OBSERVATIONS, LIGHTS), TRUTH).max() < 0.02
+
+
+def test_highlights_in_the_brightest_observations_change_nothing() -> None:
+    bright = with_highlights(OBSERVATIONS, untouched=60)
+    assert angle_between_deg(LeastSquares().estimate(bright, LIGHTS), TRUTH).mean() > 20
+    # They raise the threshold of shadows, so fewer observations are kept than without them.
+    assert angle_between_deg(estimate(bright, LIGHTS), TRUTH).max() < 0.1
+
+
+@pytest.mark.parametrize(("count", "cast"), [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
+def test_exact_on_lambertian_scenes_with_shadows(count: int, cast: float) -> None:
+    lights, truth = directions(count, 70, 3), directions(300, 60, 4)
+    observations = np.maximum(truth @ lights.T, 0)
+    assert (observations == 0).any()
+    # Fewer than four may be three in one plane.
+    reached = (observations > 0).sum(axis=1) >= 4
+    # Cast shadows are seldom quite black.
+    observations[np.random.default_rng(2).uniform(size=observations.shape) < cast] *= 0.05
+    assert angle_between_deg(estimate(observations, lights), truth)[reached].max() < 0.001
+
+
+@pytest.mark.parametrize(("count", "untouched"), [(10, 8), (96, 60)])
+def test_noise_and_highlights_cost_less_than_in_least_squares(count: int, untouched: int) -> None:
+    lights = directions(count, 38, 3)
+    noise = np.random.default_rng(6).normal(1, 0.01, (len(TRUTH), count))
+    observations = with_highlights(bipolynomial(TRUTH, lights) * noise, untouched)
+    error = angle_between_deg(estimate(observations, lights), TRUTH).mean()
+    assert error < 0.25 * angle_between_deg(LeastSquares().estimate(observations, lights), TRUTH).mean()
+
+
+def test_order_of_lights_and_scale_of_images_change_nothing() -> None:
+    noisy = OBSERVATIONS * np.random.default_rng(6).normal(1, 0.01, OBSERVATIONS.shape)
+    for count in (10, 96):
+        lights, observations = LIGHTS[:count], noisy[:, :count]
+        order = np.random.default_rng(0).permutation(count)
+        other = estimate(3.7 * observations[:, order], lights[order])
+        # Rounding of 6e-8, by the condition of the fit.
+        assert angle_between_deg(other, estimate(observations, lights)).max() < 0.001
+
+
+@pytest.mark.parametrize("count", [1, 3, 10])
+def test_too_few_observations_give_a_finite_normal(count: int) -> None:
+    observations = np.zeros((count + 1, count))
+    for lit in range(1, count + 1):
+        observations[lit, :lit] = np.linspace(0.5, 1, lit)
+    found = estimate(observations, LIGHTS[:count])
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
+    np.testing.assert_array_equal(found[0], (0, 0, 1))
+
+
+def test_share_grows_and_coefficients_shrink_with_few_observations() -> None:
+    lit = torch.tensor([0, 3, 8, 10, 32, 33, 96])
+    kept = kept_count(lit, share=0.25, fewest=8)
+    assert kept.tolist() == [0, 3, 8, 8, 8, 9, 24]
+    assert coefficient_count(kept).tolist() == [1, 1, 2, 2, 2, 2, 9]
+    # Two observations or more for each unknown, the two angles of the normal among them.
+    many = torch.arange(6, 30)
+    assert (2 * (coefficient_count(many) + 2) <= many).all()
+
+
+def test_eight_observations_fit_a_reflectance_that_varies_with_the_half_angle() -> None:
+    lights = directions(8, 38, 3)
+    half, _ = half_cosines(TRUTH, lights)
+    observations = (1 - 0.3 * (1 - half)) * (TRUTH @ lights.T)
+    # Pixels with none dark enough to count as a shadow.
+    clear = observations.min(axis=1) > 0.4 * np.quantile(observations, 0.6, axis=1)
+    assert clear.mean() > 0.5
+    assert angle_between_deg(solved(observations, lights), TRUTH)[clear].max() < 1e-5
+    assert angle_between_deg(LeastSquares().estimate(observations, lights), TRUTH)[clear].mean() > 0.5

@@ -1,0 +1,63 @@
+"""What must not change a method's answer: the order of the lights, the scale of the images, the size of batches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.methods import Estimator, MethodOptions, make_estimator, method_names
+from splinecli.normals import angle_between_deg
+
+Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
+def make(name: str, batch_size: int | None = None) -> Estimator:
+    return make_estimator(name, MethodOptions(device="cpu", precision="float32", batch_size=batch_size))
+
+
+def largest_difference_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    return float(angle_between_deg(a, b).max())
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_the_order_of_the_lights_changes_nothing(name: str, glossy_pixels: Pixels) -> None:
+    _, lights, observations = glossy_pixels
+    order = np.random.default_rng(0).permutation(len(lights))
+    before = make(name).estimate(observations.astype(np.float32), lights)
+    after = make(name).estimate(observations[:, order].astype(np.float32), lights[order])
+    assert largest_difference_deg(before, after) < 0.05
+
+
+@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize("scale", [2.0**-12, 1e-3, 1000.0])
+def test_the_scale_of_the_images_changes_nothing(name: str, scale: float, glossy_pixels: Pixels) -> None:
+    _, lights, observations = glossy_pixels
+    # A factor for each pixel: albedo is unknown, so it may not matter either.
+    factors = scale * np.linspace(0.5, 2, len(observations))[:, None]
+    before = make(name).estimate(observations.astype(np.float32), lights)
+    after = make(name).estimate((observations * factors).astype(np.float32), lights)
+    assert largest_difference_deg(before, after) < 0.05
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_batches_change_nothing(name: str, glossy_pixels: Pixels) -> None:
+    _, lights, observations = glossy_pixels
+    before = make(name).estimate(observations.astype(np.float32), lights)
+    after = make(name, batch_size=7).estimate(observations.astype(np.float32), lights)
+    assert largest_difference_deg(before, after) < 0.05
+
+
+@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize("n_lights", [3, 4, 5, 14])
+def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: Pixels) -> None:
+    _, lights, observations = glossy_pixels
+    odd = observations[:6, :n_lights].astype(np.float32)
+    odd[0] = 0
+    odd[1] = 1
+    odd[2, 1:] = 0
+    odd[3] = np.where(np.arange(n_lights) < 2, odd[3] + 1, 0)
+    odd[4] *= -1  # a dark frame may have been subtracted
+    found = make(name).estimate(odd, lights[:n_lights])
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    np.testing.assert_array_equal(found[0], (0, 0, 1))
