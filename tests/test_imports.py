@@ -16,6 +16,7 @@ ROOMS = [
     {"synthesis", "inference"},
     {"methods", "metrics"},
     {"networks", "devices"},
+    {"fits"},
     {"capture", "observation_map"},
     {"normals", "files"},
     {"errors", "__init__"},

@@ -1,4 +1,4 @@
-"""Scenes on which the classical methods are exact."""
+"""Pixels that every method has to say something about."""
 
 from __future__ import annotations
 
@@ -22,14 +22,6 @@ def spiral_lights(count: int, limit_deg: float = 35) -> NDArray[np.float64]:
     return np.stack(
         (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
     )
-
-
-@pytest.fixture
-def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels, no shadow among them."""
-    normals, lights = cap_directions(200, 50), spiral_lights(12)
-    albedo = np.random.default_rng(1).uniform(0.01, 100, (200, 1))
-    return normals, lights, albedo * (normals @ lights.T)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
@@ -11,9 +12,11 @@ from splinecli.networks.config import NetworkConfig
 
 
 def test_round_trip() -> None:
-    config = NetworkConfig(size="paper", map_size=16, width=5, grid="cnn-ps")
+    config = NetworkConfig(size="paper", map_size=16, width=5, grid="cnn-ps", interpolates=False)
     assert NetworkConfig.from_dict(config.to_dict()) == config
     assert NetworkConfig.from_dict({}) == NetworkConfig()
+    config = NetworkConfig(fits=("ia14", "ls"))
+    assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 @pytest.mark.parametrize(
@@ -23,6 +26,10 @@ def test_round_trip() -> None:
         ({"grid": "odd"}, "network grid is 'odd'; expected 'even' or 'cnn-ps'"),
         ({"grid": "cnn-ps"}, "network grid is 'cnn-ps'; only the size 'paper' has it"),
         ({"size": "huge"}, "network size is 'huge'; expected 'paper' or 'compact'"),
+        ({"fits": ["cow"]}, r"'fits' is \['cow'\]; expected a list of ls, iw12, iw12-all, ia14"),
+        ({"fits": "ls"}, "'fits' is 'ls'"),
+        ({"size": "paper", "fits": ["ls"]}, "'fits' is for the size 'compact' alone"),
+        ({"interpolates": "no"}, "interpolates is 'no'; expected True or False"),
         ({"width": 0}, "network setting 'width' is 0; expected a whole number from 1 to 4096"),
         ({"width": 1}, "network setting 'width' is 1; expected at least 2"),
         ({"width": 64.0}, "'width' is 64.0"),

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from splinecli.fits.lambertian import fit_lambertian
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.lambertian import fit_lambertian
 from splinecli.networks.spline_net import SplineNet, to_capture_frame, to_pixel_frame
 from splinecli.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig

@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 
 Vectors = NDArray[np.float64]
-NAMES = ("base", "metallic", "specular", "roughness", "sheen", "clearcoat", "clearcoat_gloss")
+NAMES = (
+    "base",
+    "metallic",
+    "specular",
+    "roughness",
+    "sheen",
+    "clearcoat",
+    "clearcoat_gloss",
+    "interface_loss",
+)
 
 
 def material(**values: float) -> PrincipledMaterial:
@@ -33,7 +42,7 @@ def radiance(surface: PrincipledMaterial, normal: Vectors, lights: Vectors) -> V
 
 def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
     """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012 remapping."""
-    base, metallic, specular, roughness, sheen, clearcoat, gloss = (
+    base, metallic, specular, roughness, sheen, clearcoat, gloss, loss = (
         float(getattr(surface, name)) for name in NAMES
     )
     v = np.array([0.0, 0.0, 1.0])
@@ -53,7 +62,7 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
             tangent = np.sqrt(1 - cosine**2) / cosine
             return float(2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)))
 
-        fd90 = 0.5 + 2 * roughness * lh**2
+        fd90 = 1 - loss if loss else 0.5 + 2 * roughness * lh**2
         diffuse = base / np.pi * (1 + (fd90 - 1) * schlick(nl)) * (1 + (fd90 - 1) * schlick(nv))
         alpha = max(roughness, 0.1) ** 2
         ndf = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
@@ -78,6 +87,8 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         material(specular=4.0, roughness=0.15),
         material(metallic=1.0, base=0.8, roughness=0.4),
         material(metallic=0.3, specular=1.0, roughness=0.7),
+        material(interface_loss=0.4, roughness=0.9),
+        material(interface_loss=1.0, specular=0.5),
         material(sheen=1.0),
         material(clearcoat=1.0, clearcoat_gloss=0.0),
         material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
@@ -96,6 +107,15 @@ def test_a_matte_surface_that_faces_light_and_camera_shows_its_base() -> None:
     # Specular 0 leaves no reflection at normal incidence.
     for base, roughness in ((0.2, 0.3), (1.0, 1.0)):
         assert radiance(material(base=base, roughness=roughness), up, up[None])[0] == pytest.approx(base)
+
+
+def test_the_interface_takes_grazing_light_of_a_matte_surface() -> None:
+    # A light and a view at 60 degrees to the normal: cos = 1/2 each, and Schlick's weight is 2^-5.
+    normal = np.array([np.sqrt(0.75), 0.0, 0.5])
+    light = 0.5 * normal + np.array([0.0, np.sqrt(0.75), 0.0])
+    seen = radiance(material(base=0.8, interface_loss=1.0), normal, light[None])
+    # The lobe of no reflectance at normal incidence adds a ten-thousandth here.
+    assert seen[0] == pytest.approx(0.8 * (1 - 2.0**-5) ** 2 * 0.5, rel=2e-4)
 
 
 def test_attached_shadow_is_black() -> None:
@@ -185,12 +205,14 @@ def test_drawn_materials_have_the_stated_classes() -> None:
     assert (values["sheen"] > 0)[~metal].mean() == pytest.approx(0.2, abs=0.01)
     assert not values["sheen"][metal].any()
     assert (values["clearcoat"] > 0).mean() == pytest.approx(0.15, abs=0.01)
+    assert (values["interface_loss"] > 0).mean() == pytest.approx(0.6, abs=0.01)
     ranges = {
         "base": (0.05, 1),
         "specular": (0, 4),
         "sheen": (0, 1),
         "clearcoat": (0, 1),
         "clearcoat_gloss": (0, 1),
+        "interface_loss": (0, 1),
     }
     for name, (low, high) in ranges.items():
         assert low <= values[name].min() <= low + 0.01, name

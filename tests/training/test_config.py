@@ -70,7 +70,8 @@ def test_refused(values: dict[str, Any], message: str) -> None:
 
 
 def test_presets_by_name() -> None:
-    assert preset("compact") == TrainingConfig()
+    compact = preset("compact")
+    assert compact == TrainingConfig(network=NetworkConfig(fits=("ls", "iw12", "iw12-all", "ia14")))
     # The paper's section 4; its code where that is silent (docs/training.md).
     paper = preset("paper")
     assert (paper.batch_size, paper.learning_rate, paper.steps) == (128, 1e-4, 200_000)

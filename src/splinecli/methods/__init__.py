@@ -54,19 +54,18 @@ def _least_squares(*_: object) -> Estimator:
 
 @dataclass(frozen=True)
 class _Solver:
-    """Where a BatchedEstimator's `solve` lies, how many pixels it takes at a time, and in which precision."""
+    """In which file of `fits` a BatchedEstimator's `solve` lies, and how many pixels it takes at a time."""
 
     module: str
     batch_size: int
-    precision: str = "float64"
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
         from splinecli.devices import choose_device
         from splinecli.methods.batched import BatchedEstimator
 
-        solve = import_module(f"splinecli.methods.{self.module}").solve
+        solve = import_module(f"splinecli.fits.{self.module}").solve
         size = self.batch_size if options.batch_size is None else options.batch_size
-        return BatchedEstimator(name, solve, str(choose_device(options.device)), size, self.precision)
+        return BatchedEstimator(name, solve, str(choose_device(options.device)), size)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,6 @@ class BatchedEstimator:
         solve: see Solve. Every pixel is divided by its largest observation first: thresholds and priors then mean
             the same for dark and bright pixels, and scaling the images changes nothing.
         batch_size: pixels at a time.
-        precision: of the computation, "float32" or "float64".
     """
 
     name: str
@@ -52,13 +51,16 @@ class BatchedEstimator:
         self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
-        dtype = getattr(torch, self.precision)
-        lights = torch.as_tensor(light_directions, dtype=dtype, device=self.device)
+        lights = torch.as_tensor(light_directions, dtype=torch.float64, device=self.device)
         normals = np.empty((len(observations), 3), np.float32)
         for start in range(0, len(observations), self.batch_size):
             batch = torch.as_tensor(observations[start : start + self.batch_size])
-            batch = batch.to(self.device, dtype).clamp(min=0)
-            found = torch.nn.functional.normalize(self.solve(batch / map_scale(batch), lights), dim=-1)
+            batch = batch.to(self.device, torch.float64).clamp(min=0)
+            found = self.solve(batch / map_scale(batch), lights)
+            # Lengths tell nothing and may be tiny: in two steps, for normalize takes such vectors for zero.
+            found = torch.nn.functional.normalize(
+                found / found.abs().amax(dim=1, keepdim=True).clamp(min=1e-300), dim=1
+            )
             found[~found.any(dim=1)] = found.new_tensor((0.0, 0.0, 1.0))
             normals[start : start + self.batch_size] = found.cpu().numpy()
         return normals

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from splinecli.errors import ModelError
+from splinecli.networks.starting_fits import STARTING_FITS
 from splinecli.observation_map import MAP_SIZE, Grid
 
 _CHOICES = {"size": ("paper", "compact"), "grid": get_args(Grid), "interpolates": (True, False)}
@@ -19,6 +20,8 @@ class NetworkConfig:
         size: "paper", the layers of the authors' networks; "compact", made for laptop cores.
         map_size: cells along a side of the observation map.
         grid: how lights fall on its cells; "cnn-ps" for the authors' own weights, of the paper size alone.
+        fits: whose normals NE-Net starts from, among the STARTING_FITS, beside the robust Lambertian one; of the
+            compact size alone.
         interpolates: whether there is a LI-Net. Without it NE-Net reads the sparse map alone, which is CNN-PS.
         width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's
             hidden features of the compact size; the paper size has fixed layers and ignores them.
@@ -31,6 +34,7 @@ class NetworkConfig:
     ne_blocks: int = 3
     head_width: int = 256
     grid: Grid = "even"
+    fits: tuple[str, ...] = ()
     interpolates: bool = True
 
     @property
@@ -49,7 +53,10 @@ class NetworkConfig:
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
+        values = {**values, "fits": _fits(values.get("fits", ()))}
         for name, value in values.items():
+            if name == "fits":
+                continue
             if name in _CHOICES:
                 if value not in _CHOICES[name]:
                     expected = " or ".join(map(repr, _CHOICES[name]))
@@ -64,6 +71,15 @@ class NetworkConfig:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
         if config.width < 2:
             raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
+        if config.fits and config.size != "compact":
+            raise ModelError("network setting 'fits' is for the size 'compact' alone")
         if config.grid != "even" and config.size != "paper":
             raise ModelError(f"network grid is {config.grid!r}; only the size 'paper' has it")
         return config
+
+
+def _fits(names: Any) -> tuple[str, ...]:
+    known = ", ".join(STARTING_FITS)
+    if not isinstance(names, list | tuple) or not all(name in STARTING_FITS for name in names):
+        raise ModelError(f"network setting 'fits' is {names!r}; expected a list of {known}")
+    return tuple(names)

@@ -56,9 +56,15 @@ class _DenseBlock(nn.Module):
 
 
 class CompactNENet(nn.Module):
-    """Maps (P, C, w, w) -> a correction of the Lambertian normal (P, 3), zero at first."""
+    """Maps (P, C, w, w) and the normals that K + 1 fits give (P, K + 1, 3) -> (P, 3), not yet of unit length.
 
-    def __init__(self, channels: int, width: int, blocks: int, head_width: int, map_size: int) -> None:
+    A weighted sum of the fits' normals plus a correction. At first the first fit has the weight 1 and all else is
+    zero; with K = 0 that weight is fixed.
+    """
+
+    def __init__(
+        self, channels: int, width: int, blocks: int, head_width: int, map_size: int, fits: int = 0
+    ) -> None:
         super().__init__()
         self.encoder = MapEncoder(channels, width, blocks, map_size)
         self.squeeze = nn.Conv2d(width, width // 2, 1)
@@ -67,10 +73,25 @@ class CompactNENet(nn.Module):
         self.out = nn.Linear(head_width, 3)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
+        self.compare: nn.Linear | None = None
+        self.weigh: nn.Linear | None = None
+        if fits:
+            self.compare = nn.Linear(3 * fits, head_width, bias=False)
+            self.weigh = nn.Linear(head_width, fits + 1)
+            nn.init.zeros_(self.weigh.weight)
+            with torch.no_grad():
+                self.weigh.bias.copy_(torch.arange(fits + 1) == 0)
 
-    def forward(self, maps: Tensor) -> Tensor:
+    def forward(self, maps: Tensor, normals: Tensor) -> Tensor:
         features = torch.relu(self.squeeze(torch.relu(self.encoder(maps))))
         # Patches first, channels last: the order in memory, so that flattening copies nothing.
-        hidden = torch.relu(self.hidden(features.permute(0, 2, 3, 1).flatten(1)))
-        out: Tensor = self.out(hidden)
+        hidden = self.hidden(features.permute(0, 2, 3, 1).flatten(1))
+        if self.compare is None or self.weigh is None:
+            start = normals[:, 0]
+        else:
+            hidden = hidden + self.compare(normals[:, 1:].flatten(1))
+            # In float32, whatever the layers compute in: the normals' digits are needed.
+            weight = self.weigh(torch.relu(hidden)).float()
+            start = (weight[..., None] * normals).sum(dim=1)
+        out: Tensor = start + self.out(torch.relu(hidden))
         return out

@@ -5,7 +5,7 @@ The compact size differs from the paper's in four ways, all of them about learni
 1. Canonical azimuth: each pixel's lights are turned about the view axis until its robust Lambertian normal
    lies over the +x axis, and the estimate is turned back. Normals then come in one azimuth only.
 2. Both networks correct that Lambertian fit instead of starting from nothing: LI-Net its map, NE-Net its
-   normal. A matte pixel is right from the start.
+   normal. A matte pixel is right from the start. NE-Net may weigh the normals of further fits, too.
 3. Beside the sparse map stand the cells that hold an observation, and the residual of the fit there, computed
    with the exact light directions, which a 32 x 32 grid alone would round by up to 2 degrees.
 4. The dense map shares the sparse map's scale (its largest observation), values above 1 cut off: a highlight
@@ -20,10 +20,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from splinecli.fits.lambertian import fit_lambertian
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.lambertian import fit_lambertian
 from splinecli.networks.li_net import CompactLINet, PaperLINet
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
+from splinecli.networks.starting_fits import fit_normals
 from splinecli.observation_map import (
     cell_directions,
     map_scale,
@@ -39,8 +40,8 @@ class Views(NamedTuple):
     """What the networks see of P pixels, in each pixel's own frame.
 
     sparse, holds, residual, lambertian_map: (P, 1, w, w); lambertian_normals (P, 3); scale (P, 1), the
-    observation that the maps call 1; cosine, sine (P,): the turn from the capture's frame to the pixel's;
-    mirrored: y flipped after it.
+    observation that the maps call 1; fitted_normals (P, K, 3), of the configuration's further fits; cosine,
+    sine (P,): the turn from the capture's frame to the pixel's; mirrored: y flipped after it.
     """
 
     sparse: Tensor
@@ -49,6 +50,7 @@ class Views(NamedTuple):
     lambertian_map: Tensor
     lambertian_normals: Tensor
     scale: Tensor
+    fitted_normals: Tensor
     cosine: Tensor
     sine: Tensor
     mirrored: bool
@@ -71,7 +73,9 @@ class SplineNet(nn.Module):
             self.ne_net = PaperNENet(1 + maps, size)
         else:
             self.li_net = CompactLINet(4, width, config.li_blocks, size) if config.interpolates else None
-            self.ne_net = CompactNENet(4 + maps, width, config.ne_blocks, config.head_width, size)
+            self.ne_net = CompactNENet(
+                4 + maps, width, config.ne_blocks, config.head_width, size, len(config.fits)
+            )
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)
@@ -108,9 +112,11 @@ class SplineNet(nn.Module):
             light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
         )
         scaled_normals = rotate_about_view_axis(torch.stack((x, y, z), dim=-1), cosine, sine)
+        fitted = fit_normals(self.config.fits, observed, light_directions, valid)
+        fitted = rotate_about_view_axis(fitted, cosine[:, None], sine[:, None])
         if mirror:
             flip = lights.new_tensor((1.0, -1.0, 1.0))
-            lights, scaled_normals = lights * flip, scaled_normals * flip
+            lights, scaled_normals, fitted = lights * flip, scaled_normals * flip, fitted * flip
         albedo = scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-3)
         predicted = (lights @ scaled_normals[..., None])[..., 0]
         residual = ((observed - predicted) / albedo).clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)
@@ -125,6 +131,7 @@ class SplineNet(nn.Module):
             lambertian_map,
             scaled_normals / scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-12),
             scale,
+            fitted,
             cosine,
             sine,
             mirror,
@@ -148,7 +155,8 @@ class SplineNet(nn.Module):
             raw: Tensor = self.ne_net(torch.cat((views.sparse, *interpolated), dim=1))
         else:
             seen = (views.sparse, views.holds, views.residual, views.lambertian_map)
-            raw = views.lambertian_normals + self.ne_net(torch.cat((*seen, *interpolated), dim=1))
+            normals = torch.cat((views.lambertian_normals[:, None], views.fitted_normals), dim=1)
+            raw = self.ne_net(torch.cat((*seen, *interpolated), dim=1), normals)
         return nn.functional.normalize(raw.float(), dim=-1)
 
     def forward(

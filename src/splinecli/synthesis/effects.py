@@ -85,7 +85,7 @@ def draw_wall(
     Azimuth: within N(0, 50 degrees) of the normal's for 60 % (in a hollow the surface looks at the wall that
     faces it), else uniform. Height U(8, 75) degrees; half-width tan U(15, 88) degrees; edge U(0.01, 0.06).
     The wall leans back by U(0, 60) degrees from upright; it reflects albedo U(0.05, 0.9) times the form
-    factor (1 - cos(height)) / 2 times U(0.5, 2).
+    factor (1 - cos(height)) / 2 times U(0, 1) U(0.5, 2).
     """
     pixels = len(normals)
     spread = torch.randn(pixels, 1, generator=generator, device=generator.device) * math.radians(50)
@@ -100,6 +100,7 @@ def draw_wall(
     up = torch.tensor((0.0, 0.0, 1.0), device=normals.device)
     form_factor = (1 - height.cos()) / 2 * _uniform(generator, pixels, 1, low=0.5, high=2.0)
     strength = form_factor * _uniform(generator, pixels, 1, low=0.05, high=0.9)
+    strength = strength * _uniform(generator, pixels, 1)
     return Wall(
         azimuth=toward,
         # Without shadows the wall lies below every light, but still reflects.
@@ -112,9 +113,9 @@ def draw_wall(
 
 
 def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tensor:
-    """Light from everywhere (P, 1), to be scaled by albedo: 10^U(-3, -1) for a `share` of pixels, else 0."""
+    """Light from everywhere (P, 1), to be scaled by albedo: 10^U(-3.5, -1.3) for a `share` of pixels, else 0."""
     present = _uniform(generator, pixels, 1) < share
-    return 10 ** _uniform(generator, pixels, 1, low=-3.0, high=-1.0) * present
+    return 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:

@@ -18,7 +18,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PrincipledMaterial:
-    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (specular to 4, as in CyclesPS)."""
+    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (specular to 4, as in CyclesPS).
+
+    interface_loss: the one that is not Burley's. Where above 0, the diffuse light loses this share at grazing angles,
+    on its way in and on its way out, as through the smooth surface of a plastic or a glaze; Burley's retro-reflection
+    is then left out.
+    """
 
     base: Tensor
     metallic: Tensor
@@ -27,6 +32,7 @@ class PrincipledMaterial:
     sheen: Tensor
     clearcoat: Tensor
     clearcoat_gloss: Tensor
+    interface_loss: Tensor
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
         """The materials of some of the pixels."""
@@ -40,7 +46,9 @@ class PrincipledMaterial:
         n_dot_h_squared = n_dot_h * n_dot_h
         fresnel = schlick_weight(l_dot_h)
 
-        grazing_90 = 2 * self.roughness * l_dot_h * l_dot_h - 0.5
+        grazing_90 = torch.where(
+            self.interface_loss > 0, -self.interface_loss, 2 * self.roughness * l_dot_h * l_dot_h - 0.5
+        )
         diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
         diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
 
@@ -75,7 +83,7 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
 
     base U(0.05, 1); roughness U(0.05, 1), of metals U(0.2, 0.9); specular U(0, 1), of the specular class U(0,
     1) with half of them U(1, 4); metallic 0, 1 or U(0, 1); sheen U(0, 1) on a fifth of the dielectrics;
-    clearcoat U(0, 1) with gloss U(0, 1) on 15 % of all.
+    clearcoat U(0, 1) with gloss U(0, 1) on 15 % of all; interface_loss U(0, 1) on 60 %.
     """
     device = generator.device
 
@@ -95,6 +103,7 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
         sheen=torch.where((uniform() < 0.2) & ~metal, uniform(), zero),
         clearcoat=torch.where(uniform() < 0.15, uniform(), zero),
         clearcoat_gloss=uniform(),
+        interface_loss=torch.where(uniform() < 0.6, uniform(), zero),
     )
 
 

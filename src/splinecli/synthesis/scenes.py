@@ -193,6 +193,7 @@ def draw_class(name: str, patches: int, generator: torch.Generator) -> Principle
         sheen=zero if metal else uniform() * (uniform() < 0.2),
         clearcoat=zero,
         clearcoat_gloss=zero,
+        interface_loss=zero,
     )
 
 

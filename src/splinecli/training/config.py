@@ -172,7 +172,7 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
 
 # The paper's text (section 4) where it speaks, the authors' code where it does not: docs/training.md.
 PRESETS = {
-    "compact": TrainingConfig(),
+    "compact": TrainingConfig(network=NetworkConfig(fits=("ls", "iw12", "iw12-all", "ia14"))),
     "paper": TrainingConfig(
         network=NetworkConfig(size="paper"),
         pixels=PixelGeneratorConfig(min_lights=10, max_lights=10, usual_lights=10),

@@ -9,8 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splinecli.methods.shadows import SHADOW_SHARE, lit_observations
-from splinecli.methods.weighted_least_squares import weighted_least_squares
+from splinecli.fits.shadows import lit_observations
+from splinecli.fits.weighted_least_squares import dot, weighted_least_squares
+
+SHADOW_SHARE = 0.1
+"""Of the pixel's quantile UNSHADED: what is darker is left out as shadow; the authors threshold shadows, too."""
 
 SMALLEST_VARIANCE = 1e-6
 """Of an error, where the largest intensity is 1: a camera resolves a thousandth of it at best."""
@@ -22,6 +25,7 @@ ITERATIONS = 20
 def solve(
     observations: Tensor,
     light_directions: Tensor,
+    valid: Tensor | None = None,
     *,
     shadow_share: float = SHADOW_SHARE,
     iterations: int = ITERATIONS,
@@ -38,13 +42,14 @@ def solve(
 
     Args:
         observations: (P, F) float64, the largest of each pixel 1.
-        light_directions: (F, 3) float64, unit.
+        light_directions: (F, 3) or (P, F, 3) float64, unit.
+        valid: (P, F) bool, all by default.
         shadow_share: see lit_observations. The authors threshold shadows as well; 0 keeps all observations.
     """
-    lit = lit_observations(observations, shadow_share).to(observations.dtype)
+    lit = lit_observations(observations, shadow_share, valid).to(observations.dtype)
     variance = torch.ones_like(observations)
     for _ in range(iterations):
         scaled_normals, uncertainty = weighted_least_squares(observations, light_directions, lit / variance)
-        error = observations - scaled_normals @ light_directions.T
+        error = observations - dot(scaled_normals, light_directions)
         variance = (error.square() + uncertainty).clamp(min=SMALLEST_VARIANCE)
     return scaled_normals

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from splinecli.methods.shadows import lit_observations
-from splinecli.methods.weighted_least_squares import weighted_least_squares
+from splinecli.fits.shadows import lit_observations
+from splinecli.fits.weighted_least_squares import weighted_least_squares
 
 TRIMMED_SHARE = 0.2
 """Of the observations, at either end. With ten lights the two darkest and the two brightest go."""
+
+SHADOW_SHARE = 0.1
+"""Of the pixel's quantile UNSHADED, as IW12 has it."""
 
 FEWEST = 4
 """Observations that stay: one more than a normal and an albedo need."""
@@ -29,6 +31,6 @@ def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
     ordered = observations.sort(dim=1).values
     darkest, brightest = ordered[:, trimmed, None], ordered[:, count - 1 - trimmed, None]
     middling = (observations >= darkest) & (observations <= brightest)
-    weight = middling & lit_observations(torch.where(middling, observations, 0))
+    weight = lit_observations(observations, SHADOW_SHARE, middling)
     scaled_normals, _ = weighted_least_squares(observations, light_directions, weight.to(observations.dtype))
     return scaled_normals

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splinecli.networks.lambertian import fit_lambertian, solve_3x3
+from splinecli.fits.lambertian import fit_lambertian, solve_3x3
 from splinecli.normals import angle_between_deg
 
 

@@ -11,26 +11,27 @@ from math import comb
 import torch
 from torch import Tensor
 
-from splinecli.methods.quadratic_programme import minimise_nonnegative
+from splinecli.fits.quadratic_programme import minimise_nonnegative
+from splinecli.fits.shadows import lit_observations
 
 __all__ = ["fit", "solve"]
 
 DEGREE_OBSERVATION = 2  # the paper's N1
 DEGREE_LIGHT = 4  # the paper's N2
 _RIDGE = 1e-10  # for a pixel without light, where nothing else fixes the normal and the polynomial
-_LEAST_LIGHTS = 3  # what a normal needs
 
 
 def solve(
     observations: Tensor,
     light_directions: Tensor,
+    valid: Tensor | None = None,
     *,
-    shadow_threshold: float = 0.25,
+    shadow_share: float = 0.2,
     prior_weight: float = 0.01,
 ) -> Tensor:
-    """Normals (P, 3) from observations (P, F), at most 1, under lights (F, 3). See fit."""
+    """Normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3). See fit."""
     normals, _ = fit(
-        observations, light_directions, shadow_threshold=shadow_threshold, prior_weight=prior_weight
+        observations, light_directions, valid, shadow_share=shadow_share, prior_weight=prior_weight
     )
     return normals
 
@@ -38,8 +39,9 @@ def solve(
 def fit(
     observations: Tensor,
     light_directions: Tensor,
+    valid: Tensor | None = None,
     *,
-    shadow_threshold: float = 0.25,
+    shadow_share: float = 0.2,
     prior_weight: float = 0.01,
 ) -> tuple[Tensor, Tensor]:
     """Normals (P, 3), of any length, and the polynomial's increments (P, N1, N2 + 1), each from zero up.
@@ -61,17 +63,20 @@ def fit(
 
     Args:
         observations: (P, F), the largest of a pixel at most 1.
-        light_directions: (F, 3), unit length, z to the camera.
-        shadow_threshold: observations under this part of their pixel's mean are taken for shadows and left out,
-            but never one of the three largest. The mean, and not the largest, as that may be a highlight.
+        light_directions: (F, 3) or (P, F, 3), unit length, z to the camera.
+        valid: (P, F) bool, all by default.
+        shadow_share: of the pixel's quantile UNSHADED; observations below it are taken for shadows and left out, but
+            never one of the three largest.
         prior_weight: a variance of 1 costs as much as a light whose residual is sqrt(prior_weight) of the mean
             shading.
     """
     intensities, lights = observations.double(), light_directions.double()
-    used = _lit(intensities, shadow_threshold)
+    if valid is not None:
+        intensities = torch.where(valid, intensities, 0)
+    used = lit_observations(intensities, shadow_share, valid) & (intensities > 0)
     intensities = torch.where(used, intensities, 0)
     directions = torch.where(used[..., None], lights, 0)
-    basis = _increment_basis(intensities, lights[:, 2])
+    basis = _increment_basis(intensities, lights[..., 2])
 
     # The normal is eliminated: for given increments it is a least squares fit, n = normal_of @ d.
     ridge = _RIDGE * torch.eye(3, dtype=lights.dtype, device=lights.device)
@@ -97,14 +102,6 @@ def fit(
     return (normals / length).to(observations.dtype), increments.to(observations.dtype)
 
 
-def _lit(observations: Tensor, shadow_threshold: float) -> Tensor:
-    """Which observations (P, F) are used."""
-    count = min(_LEAST_LIGHTS, observations.shape[1])
-    largest = observations.topk(count, dim=1).values[:, -1:]
-    floor = torch.minimum(shadow_threshold * observations.mean(dim=1, keepdim=True), largest)
-    return (observations >= floor) & (observations > 0)
-
-
 def _increment_basis(intensities: Tensor, cosines: Tensor) -> Tensor:
     """(P, F, N1 * (N2 + 1)): what each increment adds to g, for intensities (P, F), zero where unused.
 
@@ -115,7 +112,7 @@ def _increment_basis(intensities: Tensor, cosines: Tensor) -> Tensor:
     steps = steps.flip(-1).cumsum(-1).flip(-1)
     mean = intensities.sum(dim=1) / (intensities > 0).sum(dim=1).clamp(min=1)
     steps = steps / (DEGREE_OBSERVATION * torch.where(mean > 0, mean, 1)[:, None, None])
-    return (steps[..., None] * _bernstein(cosines.clamp(0, 1), DEGREE_LIGHT)[:, None, :]).flatten(2)
+    return (steps[..., None] * _bernstein(cosines.clamp(0, 1), DEGREE_LIGHT)[..., None, :]).flatten(2)
 
 
 def _bernstein(values: Tensor, degree: int) -> Tensor:

@@ -7,9 +7,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from splinecli.fits.st14 import coefficient_count, kept_count, solve
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.methods.st14 import coefficient_count, kept_count, solve
 from splinecli.normals import angle_between_deg
 
 Array = NDArray[np.float64]

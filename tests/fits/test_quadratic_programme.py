@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
-from splinecli.methods.quadratic_programme import minimise_nonnegative
+from splinecli.fits.quadratic_programme import minimise_nonnegative
 
 
 @pytest.mark.parametrize("rows", [30, 7], ids=["well determined", "nearly singular"])

@@ -8,9 +8,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from splinecli.methods import MethodOptions, iw12, least_absolute, make_estimator, trimmed_least_squares
-from splinecli.methods.shadows import lit_observations
-from splinecli.methods.weighted_least_squares import RIDGE, weighted_least_squares
+from splinecli.fits import iw12, least_absolute, trimmed_least_squares
+from splinecli.fits.shadows import lit_observations
+from splinecli.fits.weighted_least_squares import RIDGE, weighted_least_squares
+from splinecli.methods import MethodOptions, make_estimator
 from splinecli.normals import angle_between_deg
 
 ROBUST = ("iw12", "l1", "ls-trimmed")
@@ -63,9 +64,15 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
 
 
 def test_shadows_go_and_what_is_needed_stays() -> None:
-    observations = torch.tensor([[1.0, 0.5, 0.3, 0.04], [1.0, 0.5, 0.04, 0.0]])
-    assert lit_observations(observations, 0.05).tolist() == [[True, True, True, False], [True] * 4]
+    # The 0.6 quantiles are 0.46, 0.04 and 0.16: a highlight over a dim pixel darkens nothing.
+    observations = torch.tensor([[1.0, 0.5, 0.3, 0.04], [1.0, 0.04, 0.04, 0.03], [1.0, 0.2, 0.001, 0.0]])
+    expected = [[True, True, True, False], [True] * 4, [True, True, True, False]]
+    assert lit_observations(observations, 0.1).tolist() == expected
     assert lit_observations(observations, 0.0).all()
+    # Observations that are not there count for nothing: not for the quantile, and not among the largest.
+    more = torch.cat((torch.full((3, 5), 9.0), observations), dim=1)
+    valid = torch.arange(9) >= 5
+    assert lit_observations(more, 0.1, valid.expand(3, 9)).tolist() == [[False] * 5 + row for row in expected]
 
 
 def test_l1_is_the_linear_programme_s_optimum() -> None:
@@ -100,6 +107,18 @@ def test_trimmed_ends(count: int, dropped: int) -> None:
     assert torch.equal(trimmed_least_squares.solve(outer, lights), before)
     outer[0, order[count - dropped - 1]] = 9
     assert not torch.allclose(trimmed_least_squares.solve(outer, lights), before)
+
+
+def test_lights_that_span_a_plane_or_a_line_give_finite_normals() -> None:
+    """Three directions, each many times: under IW12's weights one of them may drop out, then another."""
+    rng = np.random.default_rng(0)
+    for spanned in (1, 2, 3):
+        rows = rng.normal(size=(spanned, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
+        lights = (rows / np.linalg.norm(rows, axis=1, keepdims=True))[np.arange(12) % spanned]
+        observations = rng.uniform(size=(2000, 12)).astype(np.float32)
+        for name in ROBUST:
+            found = estimate(name, observations, lights)
+            np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
 def test_weighted_step_against_lapack() -> None:

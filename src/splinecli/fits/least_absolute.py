@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splinecli.methods.weighted_least_squares import weighted_least_squares
+from splinecli.fits.weighted_least_squares import weighted_least_squares
 
 ITERATIONS = 50
 SMALLEST_RESIDUAL = 1e-7

@@ -22,10 +22,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-VIEW = (0.0, 0.0, 1.0)
+from splinecli.fits.shadows import lit_observations
 
-UNSHADED = 0.6
-"""Quantile of the intensities that shadows are told by: half of them may be shadows, nearly half highlights."""
+VIEW = (0.0, 0.0, 1.0)
 
 FEWEST_LIT = 4
 """The brightest observations that never count as shadows: three fix a normal, one more tells noise."""
@@ -142,9 +141,7 @@ def _select(
     count = len(lights)
     view = lights.new_tensor(VIEW)
     ordered, index = observations.sort(dim=1)
-    threshold = shadow * ordered.quantile(UNSHADED, dim=1, keepdim=True)
-    threshold = torch.minimum(threshold, ordered[:, max(count - FEWEST_LIT, 0), None])
-    is_lit = (observations >= threshold) & (observations > 0)
+    is_lit = lit_observations(observations, shadow, fewest=FEWEST_LIT) & (observations > 0)
     lit = is_lit.sum(dim=1)
     kept = kept_count(lit, share=share, fewest=fewest)
 

@@ -10,8 +10,8 @@ import quadprog
 import torch
 from numpy.typing import NDArray
 
+from splinecli.fits.ia14 import fit, solve
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.ia14 import fit, solve
 from splinecli.normals import angle_between_deg
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def objective_of(
     Returns H with the objective x'Hx / 2, the mean of g as a row m'x, the monotonicity as C x >= 0, and which
     lights are used.
     """
-    floor = min(0.25 * intensities.mean(), np.sort(intensities)[-3])
+    floor = min(0.2 * np.quantile(intensities, 0.6), np.sort(intensities)[-3])
     used = (intensities >= floor) & (intensities > 0)
     x, directions_used = intensities[used], lights[used]
     products = bernstein(x, 2)[:, 1:, None] * bernstein(directions_used[:, 2], 4)[:, None, :]

@@ -1,0 +1,46 @@
+"""The normals of other fits, which NE-Net weighs and corrects beside the robust Lambertian one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from splinecli.fits import ia14, iw12
+from splinecli.fits.weighted_least_squares import weighted_least_squares
+
+
+def _least_squares(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Tensor:
+    return weighted_least_squares(observations, light_directions, valid.to(observations.dtype))[0]
+
+
+def _sparse(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Tensor:
+    return iw12.solve(observations, light_directions, valid, shadow_share=0)
+
+
+STARTING_FITS = {"ls": _least_squares, "iw12": iw12.solve, "iw12-all": _sparse, "ia14": ia14.solve}
+"""By the names that NetworkConfig.fits holds. "iw12-all" leaves no observation out: far better on metals."""
+
+
+@torch.no_grad()
+def fit_normals(
+    names: Sequence[str], observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
+) -> Tensor:
+    """Unit normals (P, K, 3) of K fits, zero where a fit has none.
+
+    Args:
+        names: among STARTING_FITS.
+        observations: (P, F), each pixel scaled to a largest value of 1.
+        light_directions: (F, 3) or (P, F, 3), unit.
+        valid: (P, F) bool, all by default.
+    """
+    if not names:
+        return observations.new_zeros(len(observations), 0, 3)
+    if valid is None:
+        valid = torch.ones_like(observations, dtype=torch.bool)
+    # Negative ones, which a subtracted dark frame leaves, are shadow.
+    observed = torch.where(valid, observations, 0).clamp(min=0).double()
+    lights = light_directions.double()
+    found = torch.stack([STARTING_FITS[name](observed, lights, valid) for name in names], dim=1)
+    return torch.nn.functional.normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
