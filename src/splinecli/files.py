@@ -104,8 +104,8 @@ def _lock(file: IO[str], folder: Path) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """write_bytes of UTF-8 text."""
-    write_bytes(path, content.encode())
+    """write_bytes of UTF-8 text; what of a file's name is no text comes as escapes."""
+    write_bytes(path, content.encode(errors="backslashreplace"))
 
 
 def current_umask() -> int:

@@ -86,7 +86,7 @@ def write_estimate(
             for form in formats:
                 write_normals(estimate, form, stage / NORMALS[form], convention)
             if estimate.error_map_deg is not None:
-                from splinecli.evaluation.figures import error_map_picture
+                from splinecli.evaluation.error_map import error_map_picture
 
                 (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
             files = [*(path.name for path in sorted(stage.iterdir())), REPORT]

@@ -98,7 +98,11 @@ def test_refusals(dataset, run, golden):
         (2, [dataset, "--method", "ls", "--skip-first", "=3"]),
         (2, [dataset, "--method", "ls", "--n-lights", 4, "--skip-first", "cow=3"]),
         (2, [dataset, "--method", "ls", "--n-lights", "all", "--skip-first", 6]),
-        (2, [dataset, "--method", "ls", "--pixel", "3,4"]),
+        (2, [dataset, "--method", "ls", "--n-lights", 4, "--skip-first", 20]),
+        (2, [dataset, "--draws", "draws.txt", "--trials", 3]),
+        (2, [dataset, "--pixel", "3,4"]),
+        (2, [dataset, "--method", "ls", "--pixel", "3,4", "--figures"]),
+        (2, [dataset, "--pixel=-1,4", "--figures"]),
         (2, [dataset, "--method", "ls", "--pixel", "3", "--figures"]),
         (2, [dataset, "--jobs", 0]),
         (4, [dataset, "--method", "cnn-ps", "--weights", "spline-net", "--n-lights", 4]),
@@ -116,6 +120,11 @@ def test_a_wide_table_is_turned_and_never_cut(make_capture, run, golden):
     result = run("evaluate", "data", "--method", "ls", "--n-lights", "all")
     golden("evaluate_wide.txt", result.out)
     assert "capture_number_8[red]" in result.out
+    methods = [f"--method={name}" for name in ("ls", "ls-trimmed", "l1", "iw12", "st14", "ia14")]
+    wide = run("evaluate", "data", *methods, "--n-lights", "all").out
+    assert "ls-trimmed" in wide
+    assert "capture_number_8[red]" in wide
+    assert "…" not in wide
 
 
 def test_every_file_is_there_and_goes_on(dataset, run):
@@ -168,9 +177,12 @@ def test_figures(dataset, run):
     maps = cv2.imread("evaluation/figures/shaded.png")
     assert maps.shape[1] > maps.shape[0]
     assert Path("evaluation/report.html").read_text().count("data:image/png") == 4
+    # The results are there although no figure can be drawn, and earlier figures are gone.
     outside = run("evaluate", dataset, "--method", "spline-net", *arguments[:-1], "0,0")
-    assert outside.code == 2
-    assert "row 0, column 0 of matte has no ground truth" in outside.err
+    assert outside.code == 3
+    assert "no figure: the pixel in row 0, column 0 of matte has no ground truth" in outside.err
+    assert "spline-net" in Path("evaluation/table.md").read_text()
+    assert not list(Path("evaluation/figures").iterdir())
 
 
 def test_images_left_out_are_noted(dataset, run):
@@ -181,6 +193,17 @@ def test_images_left_out_are_noted(dataset, run):
     assert document["notes"] == ["shaded: the first 2 images are left out."]
     # Light 1 was the shadowed one.
     assert all(result["mae_deg"] < 1e-3 for result in document["results"])
+
+
+def test_weights_are_named_and_their_lights_warned_about(dataset, run):
+    result = run(
+        "evaluate", dataset / "matte", "--method", "cnn-ps", "--n-lights", 5, "--trials", 1, "--max-pixels", 9
+    )
+    assert result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 5.\n"
+    used = json.loads(Path("evaluation/results.json").read_text())["methods"]["cnn-ps"]
+    assert used["weights"]["name"] == "cnn-ps"
+    assert len(used["weights"]["sha256"]) == 64
+    assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
 
 
 def test_all_methods_by_one_word(dataset, run):

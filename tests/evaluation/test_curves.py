@@ -90,9 +90,12 @@ def test_lights_and_noise_may_both_differ(draw: Callable[[Sequence[Evaluation]],
 
 def test_odd_names_one_point_and_one_trial_are_drawn() -> None:
     odd = Evaluation(Protocol(10), (Result("_m$x$", "a$b_{c$ 猫", 10, (3.0,), 1.0),))
-    assert decode(lights_curves([odd])).std() > 0
-    assert decode(light_noise_curves([odd])).std() > 0
+    # matplotlib takes what stands between dollars for a formula, and raises for this one.
+    for draw in (lights_curves, light_noise_curves):
+        assert (decode(draw([odd])) < 128).any()
 
 
-def test_the_same_counts_twice_are_drawn() -> None:
-    decode(lights_curves([evaluation_of(["ball"], 96), evaluation_of(["ball"], None)]))
+def test_a_capture_with_as_many_lights_as_all_has_one_point_there() -> None:
+    # A logarithmic axis without a width would raise.
+    twice = decode(lights_curves([evaluation_of(["ball"], 96), evaluation_of(["ball"], None)]))
+    assert (twice < 128).any()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.evaluation.figures import TOP_DEG, colour_errors
+from splinecli.evaluation.error_map import TOP_DEG, colour_errors
 from splinecli.evaluation.method_maps import method_maps
 from splinecli.normals import unit
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -311,6 +312,33 @@ def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_pat
     assert fake.lights
 
 
+def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: WriteDome) -> None:
+    """As out of an archive whose times were normalised: names, sizes and times of all files are the same."""
+    folders = [write_dome("u/dome"), write_dome("v/dome")]
+    for folder in folders:
+        for path in folder.iterdir():
+            content = path.read_bytes()
+            if folder is folders[1] and path.suffix == ".npy":
+                half = (len(content) - 128) // 2  # after the header of 128 bytes
+                path.write_bytes(content[:128] + content[128 + half :] + content[128 : 128 + half])
+            os.utime(path, ns=(10**18, 10**18))
+    sizes = [sorted((path.name, path.stat().st_size) for path in folder.iterdir()) for folder in folders]
+    assert sizes[0] == sizes[1]
+    first, second = evaluate(folders, [make_estimator("ls")], Protocol()).results
+    assert first.mae_deg < 0.1 < second.mae_deg
+
+
+def test_noise_that_lays_lights_into_a_plane_is_drawn_again(write_dome: WriteDome) -> None:
+    # Among so many draws of three lights there were some, and one of them ended everything.
+    protocol = Protocol(3, trials=1500, light_noise_deg=30.0, max_pixels=1)
+    assert evaluate([write_dome()], [make_estimator("ls")], protocol).results[0].trials == 1500
+
+
+def test_no_capture_is_called_like_the_average(write_dome: WriteDome) -> None:
+    folders = [write_dome("x/average"), write_dome("x/other")]
+    assert evaluate(folders, [make_estimator("ls")], Protocol()).captures == ("x/average", "x/other")
+
+
 def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     folders = [write_dome("bearPNG"), write_dome("other")]
     fake = Fake(folders[0])
@@ -386,7 +414,7 @@ def test_least_squares_on_diligent(shared_data: Path, name: str, mae_deg: float)
 
 def test_importing_is_light() -> None:
     heavy = {"cv2", "scipy", "tifffile", "torch", "rich", "typer"}
-    modules = ("draws", "figures", "protocol", "tables")
+    modules = ("draws", "error_map", "protocol", "tables")
     imports = ", ".join(f"splinecli.evaluation.{module}" for module in modules)
     code = f"import {imports}, sys; print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

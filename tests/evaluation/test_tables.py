@@ -115,6 +115,7 @@ JSON = """\
   "max_pixels": 500,
   "skip_first": {}
  },
+ "methods": {},
  "results": [
   {
    "method": "ls",

@@ -48,16 +48,16 @@ def read_ground_truth(
     - .txt: H*W rows of x y z in row-major order;
     - .png or .tif: n = 2 v / full range - 1, black or mid-gray for no ground truth; floating-point TIFF as it is.
 
-    Vectors are normalised; zero and non-finite ones are no ground truth. A map whose rows are in the wrong order,
-    as in the normal.txt of DiLiGenT's Harvest, is turned over: it leaves more of the mask empty than upside down.
-
-    Returns:
-        The map, and whether it was turned over.
+    Vectors are normalised; zero and non-finite ones are no ground truth. Text whose rows are in the wrong order, as in
+    the normal.txt of DiLiGenT's Harvest, is turned over: it leaves more of the mask empty than upside down.
 
     Args:
         path: the file.
         shape: (H, W) of the images.
         mask: (H, W), true where normals are wanted.
+
+    Returns:
+        The map, and whether it was turned over.
 
     Raises:
         InputError: the file cannot be read, has another size, or has no normal inside the mask.
@@ -87,7 +87,7 @@ def read_ground_truth(
     is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
     if stored.dtype.kind not in "fiu":
         raise InputError(f"found ground truth of type {stored.dtype}, expected real numbers", path=path)
-    upside_down = not is_picture and _is_upside_down(stored, mask)
+    upside_down = suffix == ".txt" and _is_upside_down(stored, mask)
     if upside_down:
         stored = stored[::-1]
     normals = np.zeros((*shape, 3), np.float32)

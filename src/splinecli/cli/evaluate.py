@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from splinecli.evaluation.records import Evaluation
     from splinecli.methods import Estimator
 
+DEFAULT_TRIALS = 100
 TRIALS, LIGHTS_PLOT, LIGHT_NOISE_PLOT = "trials.jsonl", "lights.png", "light_noise.png"
 
 
@@ -49,7 +50,10 @@ def evaluate(
     n_lights: Annotated[
         list[str] | None, typer.Option(metavar="K|all", help="Lights a draw; may be repeated. [default: 10]")
     ] = None,
-    trials: Annotated[int, typer.Option(metavar="T", min=1, help="Random draws of the lights.")] = 100,
+    trials: Annotated[
+        int | None,
+        typer.Option(metavar="T", min=1, help=f"Random draws of the lights. [default: {DEFAULT_TRIALS}]"),
+    ] = None,
     seed: SeedOption = 0,
     draws: Annotated[
         Path | None,
@@ -112,15 +116,21 @@ def evaluate(
 
     if draws is not None and n_lights:
         raise UsageError("--draws and --n-lights exclude each other", hint="The draws say how many lights")
-    if pixel and not figures:
-        raise UsageError("--pixel chooses what --figures shows", hint="Add --figures")
+    if trials is not None and draws is not None:
+        raise UsageError("--draws and --trials exclude each other", hint="Each line of the draws is a trial")
     pixels = [_pixel(text) for text in pixel or []]
     counts: list[int | None] = (
-        [None] if draws is not None else [_light_count(text) for text in dict.fromkeys(n_lights or ["10"])]
+        [None] if draws is not None else list(dict.fromkeys(map(_light_count, n_lights or ["10"])))
     )
-    skipped = dict(_skip(text) for text in skip_first or [])
+    settings: dict[str, Any] = {
+        "trials": trials or DEFAULT_TRIALS,
+        "seed": seed,
+        "draws_file": draws,
+        "max_pixels": max_pixels,
+        "skip_first": dict(_skip(text) for text in skip_first or []),
+    }
     protocols = [
-        Protocol(count, trials, seed, draws, light_noise_deg=noise, max_pixels=max_pixels, skip_first=skipped)
+        Protocol(count, light_noise_deg=noise, **settings)
         for count in counts
         for noise in dict.fromkeys(light_noise_deg or [0.0])
     ]
@@ -128,6 +138,11 @@ def evaluate(
     methods = list(dict.fromkeys(name for text in asked for name in _names(text, method_names())))
     for name in methods:
         check_method(name)
+    if pixel and not (figures and "spline-net" in methods):
+        raise UsageError(
+            "--pixel chooses whose observation maps --figures shows",
+            hint="Add --figures and --method spline-net",
+        )
     captures = [capture for dataset in datasets for capture in find_captures(dataset)]
     check_writable(output)
     _check_counts(captures, counts)
@@ -135,6 +150,7 @@ def evaluate(
     estimators = [make_estimator(name, options) for name in methods]
     on_gpu = any(estimator.device.startswith("cuda") for estimator in estimators)
     talk = Talk(quiet=quiet)
+    not_drawn: list[str] = []
     with held_folder(output):
         store = TrialStore(output / TRIALS, fresh=overwrite)
         with talk.progress("evaluating", 1.0) as advance:
@@ -146,10 +162,15 @@ def evaluate(
                 jobs=jobs or (1 if on_gpu else _cores()),
                 on_progress=_follow(advance),
             )
-        drawn = _draw_figures(captures, estimators, evaluations, pixels, talk) if figures else []
-        document = _write_results(output, evaluations, drawn)
+        document = _write_results(output, evaluations, [])
+        if figures:
+            drawn, not_drawn = _draw_figures(captures, estimators, evaluations, pixels, talk)
+            _write_figures(output, drawn)
+            _write_results(output, evaluations, drawn)
     for entry in document["skipped"]:
         print(f"splinecli: {entry['capture']} was passed over: {entry['reason']}", file=sys.stderr)
+    for warning in _untrained(evaluations):
+        talk.warn(warning)
     for note in document["notes"]:
         talk.say(f"splinecli: note: {note}")
     if as_json:
@@ -157,7 +178,9 @@ def evaluate(
     elif not quiet:
         for evaluation in evaluations:
             _print_table(evaluation, with_title=len(evaluations) > 1)
-    return InputError.exit_code if document["skipped"] else 0
+    for problem in not_drawn:
+        print(f"splinecli: no figure: {problem}", file=sys.stderr)
+    return InputError.exit_code if document["skipped"] or not_drawn else 0
 
 
 def _write_results(output: Path, evaluations: list[Evaluation], drawn: list[CaptureFigure]) -> dict[str, Any]:
@@ -184,8 +207,6 @@ def _write_results(output: Path, evaluations: list[Evaluation], drawn: list[Capt
         else:
             with refusals_as_output_errors(output / name):
                 (output / name).unlink(missing_ok=True)
-    for figure in drawn:
-        write_bytes(output / "figures" / f"{figure.stem}.png", figure.png)
     write_text(output / "report.html", report)
     write_text(output / "results.json", json.dumps(document, indent=2) + "\n")
     return document
@@ -197,19 +218,49 @@ def _draw_figures(
     evaluations: list[Evaluation],
     pixels: list[tuple[int, int]],
     talk: Talk,
-) -> list[CaptureFigure]:
-    """Of the captures that were scored, under the first protocol."""
-    from splinecli.evaluation.capture_figures import capture_figures
+) -> tuple[list[CaptureFigure], list[str]]:
+    """Of the captures that were scored under the first protocol; and what stood in the way of the others."""
+    from splinecli.evaluation.capture_figures import capture_figures, file_stems
     from splinecli.evaluation.protocol import distinct_names
 
     first = evaluations[0]
     named = {name: folder for folder, name in distinct_names(captures).items() if name in first.captures}
-    drawn = []
+    drawn, problems = [], []
     with talk.progress("drawing", len(named)) as advance:
-        for name, folder in named.items():
-            drawn += capture_figures(folder, name, estimators, first.protocol, pixels)
+        for (name, folder), stem in zip(named.items(), file_stems(list(named)), strict=True):
+            try:
+                drawn += capture_figures(folder, name, stem, estimators, first.protocol, pixels)
+            except (InputError, UsageError) as error:
+                problems.append(str(error))
             advance(1)
-    return drawn
+    return drawn, problems
+
+
+def _write_figures(output: Path, drawn: list[CaptureFigure]) -> None:
+    """Write the figures, and remove those of an earlier call."""
+    from splinecli.files import refusals_as_output_errors, write_bytes
+
+    folder = output / "figures"
+    names = {f"{figure.stem}.png" for figure in drawn}
+    with refusals_as_output_errors(folder):
+        for path in folder.glob("*.png"):
+            if path.name not in names:
+                path.unlink()
+    for figure in drawn:
+        write_bytes(folder / f"{figure.stem}.png", figure.png)
+
+
+def _untrained(evaluations: list[Evaluation]) -> list[str]:
+    """Warnings of shipped weights that were scored with numbers of lights they were not trained for."""
+    used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
+    if not used:
+        return []
+    from splinecli.networks.weights import untrained_warning
+
+    counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
+    return [
+        warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)
+    ]
 
 
 def _cores() -> int:
@@ -232,7 +283,7 @@ def _skip(text: str) -> tuple[str, int]:
 
 def _pixel(text: str) -> tuple[int, int]:
     indices = parse_indices(text, "--pixel")
-    if len(indices) != 2:
+    if len(indices) != 2 or min(indices) < 0:
         raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
     return indices[0], indices[1]
 
@@ -297,4 +348,5 @@ def _print_table(evaluation: Evaluation, *, with_title: bool) -> None:
     for row in cells[1:]:
         table.add_row(*row)
     # A table is for reading, also in a pipe: rather too wide than cut.
-    console.print(table, width=max(console.width, console.measure(table).maximum), crop=False)
+    widest = console.measure(table, options=console.options.update(max_width=10_000)).maximum
+    Console(highlight=False, width=max(console.width, widest)).print(table, crop=False)

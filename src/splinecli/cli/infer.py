@@ -191,7 +191,10 @@ class _Job:
         with self.talk.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
             estimate = estimate_normals(capture, estimator, progress=advance)
         warnings = [*capture.warnings]
-        warnings += _warn_of_untrained(estimator.weights, capture.n_lights)
+        if estimator.weights is not None:
+            from splinecli.networks.weights import untrained_warning
+
+            warnings += untrained_warning(estimator.weights["sha256"], capture.n_lights)
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
         report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
@@ -204,19 +207,6 @@ class _Job:
         from splinecli.evaluation.draws import draw_lights
 
         return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
-
-
-def _warn_of_untrained(weights: dict[str, str] | None, n_lights: int) -> list[str]:
-    """A warning where shipped weights have not been trained with so many lights."""
-    if weights is None:
-        return []
-    from splinecli.networks.weights import manifest
-
-    fewest, most = manifest().get(weights["name"], {}).get("lights", (n_lights, n_lights))
-    if fewest <= n_lights <= most:
-        return []
-    trained = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-    return [f"The weights {weights['name']} were trained with {trained} lights, not {n_lights}."]
 
 
 def _refuse_same_names(captures: list[Path]) -> None:

@@ -16,12 +16,14 @@ from splinecli.evaluation.method_maps import method_maps
 from splinecli.evaluation.observation_map_figure import observation_map_figure
 from splinecli.evaluation.protocol import first_trial, see_trial
 from splinecli.evaluation.records import Protocol
-from splinecli.evaluation.tables import lights_in_words
+from splinecli.evaluation.tables import heading
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import Estimator
 
 SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Of SPLINE-Net's errors: the pixels whose maps are shown unless others are chosen."""
+
+MAPS = "_observation_maps"
 
 MOST_LISTED = 16
 """A title names the lights of a draw up to this many."""
@@ -38,6 +40,7 @@ class CaptureFigure(NamedTuple):
 def capture_figures(
     folder: Path,
     name: str,
+    stem: str,
     estimators: Sequence[Estimator],
     protocol: Protocol,
     pixels: Sequence[tuple[int, int]] = (),
@@ -47,7 +50,7 @@ def capture_figures(
     All pixels that have ground truth are estimated, whatever the protocol's max_pixels.
 
     Args:
-        name: what the capture is called in the tables.
+        name: what the capture is called in the tables; stem: the same as a file's name.
         pixels: row and column of those whose observation maps are shown; by default at the SHOWN_PERCENTILES.
 
     Raises:
@@ -60,8 +63,7 @@ def capture_figures(
     capture = see_trial(whole, trial)
     assert capture.ground_truth is not None  # or there is no first trial
     estimates = {e.name: estimate_normals(capture, e) for e in estimators}
-    words = f"{name}, {lights_in_words(protocol)}{_listed(trial.lights)}"
-    stem = name.replace("/", "_")
+    words = f"{name}, {heading(protocol)}{_listed(trial.lights)}"
     maps = method_maps(
         capture.ground_truth,
         capture.mask,
@@ -74,8 +76,21 @@ def capture_figures(
         if estimator.name == "spline-net":
             png = _observation_maps(whole, capture, estimator, estimates[estimator.name], pixels, title=words)
             caption = f"{words}. Observation maps of single pixels, turned into the network's frame."
-            figures.append(CaptureFigure(f"{stem}_observation_maps", caption, png))
+            figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
+
+
+def file_stems(names: Sequence[str]) -> list[str]:
+    """Names of files for captures, all different, whatever letters or slashes the captures' names hold."""
+    stems: list[str] = []
+    for name in names:
+        plain = stem = name.replace("/", "_")
+        number = 2
+        while {stem, f"{stem}{MAPS}"} & {*stems, *(f"{taken}{MAPS}" for taken in stems)}:
+            stem = f"{plain}_{number}"
+            number += 1
+        stems.append(stem)
+    return stems
 
 
 def _errors(estimate: NormalEstimate) -> NDArray[np.float32]:

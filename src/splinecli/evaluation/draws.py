@@ -102,7 +102,7 @@ class DrawsFile:
                     path=self.path,
                     line=line,
                 )
-            if _in_one_plane(light_directions[list(draw)]):
+            if in_one_plane(light_directions[list(draw)]):
                 raise InputError(
                     "the lights of this draw lie in one plane, so no normal can be found",
                     path=self.path,
@@ -139,7 +139,7 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
     for _ in range(_REDRAWS):
         # By uniform numbers, not Generator.choice: numpy is likelier to keep that stream over its versions.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
-        if not _in_one_plane(light_directions[chosen]):
+        if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
     raise InputError(
         f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws",
@@ -147,7 +147,7 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
     )
 
 
-def _in_one_plane(light_directions: NDArray[np.float64]) -> bool:
+def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
     """Whether Capture would refuse these lights (F, 3)."""
     strengths = np.linalg.svd(light_directions, compute_uv=False)
     return bool(strengths[-1] < FLATTEST_LIGHTS * strengths[0])

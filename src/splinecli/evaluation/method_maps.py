@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.evaluation.figures import TITLE, TOP_DEG, Picture, colour_errors
+from splinecli.evaluation.error_map import TITLE, TOP_DEG, Picture, colour_errors
 from splinecli.evaluation.plotting import png_bytes
 from splinecli.normals import encode_picture
 

@@ -14,17 +14,21 @@ from pathlib import Path
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
+from splinecli.capture.record import MIN_LIGHTS
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.draws import NOISE_STREAM, Draw, DrawsFile, draw_lights, read_draws
+from splinecli.evaluation.draws import NOISE_STREAM, Draw, DrawsFile, draw_lights, in_one_plane, read_draws
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.quirks import describe_quirks
 from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.scored_pixels import keep_scored_pixels
+from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trials import Score, Trial, TrialStore, plan_trials
 from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 
 __all__ = ["Evaluation", "Protocol", "Result", "Skipped", "TrialStore", "evaluate", "evaluate_all"]
+
+_RETILTS = 100
 
 OnProgress = Callable[[int, int], object]
 """Told the trials that are done and those there are, after each."""
@@ -81,7 +85,16 @@ def evaluate_all(
         _CaptureJob.plan(folder, name, estimators, tasks) for folder, name in names_by_folder.items()
     ]
     _run([job for job in jobs_by_capture if job is not None], store, jobs, on_progress)
-    return [task.evaluation(names, store) for task in tasks]
+    settings = {
+        e.name: {
+            "weights": e.weights,
+            "device": e.device,
+            "precision": e.precision,
+            "fingerprint": e.fingerprint,
+        }
+        for e in estimators
+    }
+    return [replace(task.evaluation(names, store), settings=settings) for task in tasks]
 
 
 @dataclass
@@ -109,7 +122,7 @@ class _Task:
         if not results:
             raise _nothing_scored([self.failures[name] for name in captures])
         skipped = (Skipped(name, str(self.failures[name])) for name in captures if name in self.failures)
-        notes = (note for name in captures for note in self.notes.get(name, ()))
+        notes = [note for name in captures for note in self.notes.get(name, ())]
         return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes))
 
 
@@ -232,9 +245,13 @@ def see_trial(capture: Capture, trial: Trial) -> Capture:
     if trial.light_noise_deg == 0:
         return seen
     generator = np.random.default_rng([NOISE_STREAM, trial.seed, trial.number])
-    return replace(
-        seen, light_directions=tilt_lights(seen.light_directions, trial.light_noise_deg, generator)
-    )
+    tilted = seen.light_directions
+    # Lights that the noise has laid into one plane, which takes few of them and much noise, are tilted again.
+    for _ in range(_RETILTS):
+        tilted = tilt_lights(seen.light_directions, trial.light_noise_deg, generator)
+        if not in_one_plane(tilted):
+            break
+    return replace(seen, light_directions=tilted)
 
 
 def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
@@ -266,6 +283,12 @@ def _draws_for(
             hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
         )
     skipped = protocol.skipped_lights(name)
+    left = source.n_lights - skipped
+    if skipped and left < max(MIN_LIGHTS, protocol.n_lights or 0):
+        raise UsageError(
+            f"{name}: {max(left, 0)} of {source.n_lights} images stay when the first {skipped} are left out,"
+            f" expected at least {max(MIN_LIGHTS, protocol.n_lights or 0)}"
+        )
     if draws_file is not None:
         draws_file.check_against(source.light_directions, skipped=skipped)
         return list(draws_file.draws)
@@ -278,13 +301,16 @@ def _draws_for(
 
 
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
-    """Folders, each once, with the captures' names, or where two are equal with the last parts of all paths."""
+    """Folders, each once, with the captures' names, or where two are equal with the last parts of all paths.
+
+    None is called like the tables' average.
+    """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]
-    if len(set(names)) < len(names):
+    if len({*names, AVERAGE}) <= len(names):
         # As capture_name has it: a link keeps its name.
         parts = [(f.resolve() if ".." in f.parts else f.absolute()).parts for f in folders]
-        depth = 1
+        depth = 1 + (AVERAGE in names)
         while len({path[-depth:] for path in parts}) < len(parts):
             depth += 1
         names = ["/".join(path[-depth:]) for path in parts]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,12 +99,14 @@ class Evaluation:
 
     protocol: as asked for; with a draws file, n_lights and trials are the file's.
     notes: sentences on what is particular about the captures and how it was dealt with.
+    settings: of each method by name: {"weights", "device", "precision", "fingerprint"}, as in Estimator.
     """
 
     protocol: Protocol
     results: tuple[Result, ...]
     skipped: tuple[Skipped, ...] = ()
     notes: tuple[str, ...] = ()
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -88,8 +88,14 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     )
     everything = "all that have ground truth"
     at_most = f"at most {first.max_pixels} of each capture, at random"
+    weights = [
+        f"{method}: {used['weights']['name']} (SHA-256 {used['weights']['sha256'][:12]})"
+        for method, used in evaluations[0].settings.items()
+        if used["weights"] is not None
+    ]
     return [
         ("Methods", ", ".join(evaluations[0].methods)),
+        *([("Weights", ", ".join(weights))] if weights else []),
         ("Captures", ", ".join(dict.fromkeys(c for e in evaluations for c in e.captures))),
         ("Lights", ", ".join(lights)),
         ("Trials", " or ".join(map(str, trials))),

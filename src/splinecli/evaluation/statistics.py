@@ -73,11 +73,13 @@ def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
 def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     """The method's MAE in degrees of each trial, averaged over the captures.
 
-    Where captures have different numbers of trials, as those with K lights in all have under K lights, only the
-    trials that every capture has.
+    A capture's only trial, as where it has K lights in all, stands for each of the others' trials. Where numbers of
+    trials differ otherwise, the trials that every capture has.
     """
     maes_deg = [result.maes_deg for result in evaluation.results if result.method == method]
-    return tuple(float(np.mean(trial)) for trial in zip(*maes_deg, strict=False))
+    most = max(map(len, maes_deg))
+    repeated = [trials * most if len(trials) == 1 else trials for trials in maes_deg]
+    return tuple(float(np.mean(trial)) for trial in zip(*repeated, strict=False))
 
 
 def in_words(comparison: Comparison) -> str:

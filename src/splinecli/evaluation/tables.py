@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -51,6 +52,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
             "max_pixels": first.max_pixels,
             "skip_first": dict(first.skip_first),
         },
+        "methods": {name: dict(settings) for name, settings in evaluations[0].settings.items()},
         "results": [
             {**record, "maes_deg": [round(mae_deg, _DEGREE_DIGITS) for mae_deg in result.maes_deg]}
             for record, result in zip(
@@ -174,10 +176,15 @@ def protocol_in_words(protocol: Protocol) -> str:
 
 
 def _markdown_table(evaluation: Evaluation) -> str:
-    rows = _marked_rows(evaluation, lambda cell: cell.replace("|", r"\|"), "**{}**")
+    rows = _marked_rows(evaluation, _escape_markdown, "**{}**")
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     lines.insert(1, "|---|" + "---:|" * (len(rows[0]) - 1))
     return "\n".join(lines) + "\n"
+
+
+def _escape_markdown(text: str) -> str:
+    """Text of one line that Markdown shows as it is."""
+    return re.sub(r"([\\`*<>|])", r"\\\1", " ".join(text.split()))
 
 
 def _latex_table(evaluation: Evaluation) -> str:

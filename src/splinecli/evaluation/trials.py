@@ -13,7 +13,7 @@ from splinecli import __version__
 from splinecli.capture import CaptureFiles
 from splinecli.evaluation.draws import Draw
 from splinecli.evaluation.records import Protocol
-from splinecli.files import refusals_as_output_errors
+from splinecli.files import file_sha256, refusals_as_output_errors
 from splinecli.methods import Estimator
 
 
@@ -40,7 +40,7 @@ class Trial:
     def key(self) -> str:
         """SHA-256 of what decides the score: the noise depends on seed and number, the pixels on the seed."""
         values = asdict(self)
-        del values["capture"]  # a name in the tables; the files are in made_of
+        del values["capture"]  # a name in the tables; the files themselves are in made_of
         if self.light_noise_deg == 0:
             del values["number"]
             if self.max_pixels is None:
@@ -102,11 +102,12 @@ class TrialStore:
 
 
 def digest_of(files: CaptureFiles, estimator: Estimator) -> str:
-    """Changes when a file of the capture or the method's settings do; images by name, size and time alone."""
+    """Changes when a file of the capture or the method's settings do; images by place, size and time alone."""
     named = (files.light_directions, files.light_intensities, files.mask, files.ground_truth)
-    paths = [*files.images, *files.boundaries, *(path for path in named if path is not None)]
-    stamps = [(path.name, (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
-    return hashlib.sha256(json.dumps([__version__, estimator.fingerprint, stamps]).encode()).hexdigest()
+    contents = [file_sha256(path) for path in (*files.boundaries, *named) if path is not None]
+    stamps = [(str(path.resolve()), (s := path.stat()).st_size, s.st_mtime_ns) for path in files.images]
+    values = [__version__, estimator.fingerprint, contents, stamps]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 def plan_trials(

@@ -48,10 +48,10 @@ class NetworkEstimator:
     ) -> None:
         interpolates = loaded.network.config.interpolates
         if interpolates != (name == "spline-net"):
-            kind = "both networks of spline-net" if interpolates else "the one network of cnn-ps"
+            kind, fitting = ("both networks", "spline-net") if interpolates else ("one network", "cnn-ps")
             raise ModelError(
                 f"the weights {loaded.name!r} hold {kind}, so the method {name} cannot use them",
-                hint=f"Take --method {'spline-net' if interpolates else 'cnn-ps'}, or other weights",
+                hint=f"Use them with --method {fitting}",
             )
         if rotations < 1 or batch_size < 1:
             raise UsageError("rotations and batch size are whole numbers from 1")

@@ -127,6 +127,16 @@ def manifest() -> dict[str, dict[str, Any]]:
     return entries
 
 
+def untrained_warning(sha256: str, n_lights: int) -> list[str]:
+    """A sentence where these are shipped weights that were not trained with so many lights; else none."""
+    for name, entry in manifest().items():
+        fewest, most = entry["lights"]
+        if entry["sha256"] == sha256 and not fewest <= n_lights <= most:
+            trained = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+            return [f"The weights {name} were trained with {trained} lights, not {n_lights}."]
+    return []
+
+
 def _exists(path: Path) -> bool:
     try:
         return path.exists()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splinecli.errors import UsageError
-from splinecli.evaluation.figures import colour_errors, error_map_picture
+from splinecli.evaluation.error_map import colour_errors, error_map_picture
 
 # The ends and the middle of viridis as its authors publish it (bids.github.io/colormap), times 255.
 VIOLET, TEAL, YELLOW = (68, 1, 84), (33, 145, 140), (253, 231, 37)
