@@ -85,7 +85,7 @@ def test_the_authors_schedule(progress: float, expected: float) -> None:
 
 def learn(config: TrainingConfig, folder: Path) -> list[float]:
     """Loss, angle, map error and its share at the lights after a run on one batch, over those at its start."""
-    trainer = Trainer(replace(config, learning_rate=1e-2, turn_jitter_deg=0.0, shards=1), folder, CPU)
+    trainer = Trainer(replace(config, turn_jitter_deg=0.0, shards=1), folder, CPU)
     trainer.source = OneBatch(config)
     results = torch.stack([trainer.step() for _ in range(config.steps)])
     shares: list[float] = (results[-5:].mean(dim=0) / results[:3].mean(dim=0)).tolist()[:4]
@@ -94,7 +94,9 @@ def learn(config: TrainingConfig, folder: Path) -> list[float]:
 
 @pytest.mark.parametrize("size", [16, 32])
 def test_normals_of_one_batch_are_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path, size: int) -> None:
-    config = replace(tiny, network=replace(tiny.network, map_size=size), steps=200, seed=1)
+    # At 1e-2 all units of so small a network may fall silent.
+    network = replace(tiny.network, map_size=size)
+    config = replace(tiny, network=network, steps=200, seed=3, learning_rate=3e-3)
     loss, angle, _, _ = learn(config, tmp_path)
     assert angle < 0.4
     # The maps of 16 pixels are more than so few channels can hold.
@@ -103,7 +105,9 @@ def test_normals_of_one_batch_are_learnt_by_heart(tiny: TrainingConfig, tmp_path
 
 def test_the_dense_map_of_one_pixel_is_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path) -> None:
     network = replace(tiny.network, width=32)
-    config = replace(tiny, network=network, batch_size=1, shards=1, angle_weight=0.0, steps=200, seed=6)
+    config = replace(
+        tiny, network=network, batch_size=1, shards=1, angle_weight=0.0, steps=200, seed=6, learning_rate=1e-2
+    )
     _, angle, on_map, masked = learn(config, tmp_path)
     assert on_map < 0.5
     assert masked < 0.1
