@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -20,3 +22,39 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real captures in {folder}")
     return folder.resolve()
+
+
+def cap_directions(count: int, limit_deg: float, seed: int = 0) -> NDArray[np.float64]:
+    """Random unit vectors (count, 3) within limit_deg of the view axis."""
+    rng = np.random.default_rng(seed)
+    azimuth, zenith = rng.uniform(0, 2 * np.pi, count), np.radians(rng.uniform(0, limit_deg, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def spiral_lights(count: int, limit_deg: float = 35) -> NDArray[np.float64]:
+    """Lights (count, 3) on a spiral, 5 to limit_deg degrees from the view axis."""
+    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(5, limit_deg, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+@pytest.fixture
+def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels, no shadow among them."""
+    normals, lights = cap_directions(200, 50), spiral_lights(12)
+    albedo = np.random.default_rng(1).uniform(0.01, 100, (200, 1))
+    return normals, lights, albedo * (normals @ lights.T)
+
+
+@pytest.fixture
+def glossy_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe, attached shadows."""
+    normals, lights = cap_directions(60, 70), spiral_lights(14, 60)
+    half = lights + np.array((0.0, 0.0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    shading = np.clip(normals @ lights.T, 0, None)
+    lobe = np.clip(normals @ half.T, 0, None) ** 40 * (shading > 0)
+    return normals, lights, 0.6 * shading + 0.5 * lobe

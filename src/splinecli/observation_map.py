@@ -109,3 +109,10 @@ def rotate_about_view_axis(vectors: Tensor, cosine: Tensor, sine: Tensor) -> Ten
     """Turn vectors (..., 3) counterclockwise about +z; cosine and sine of the angle broadcast over (...)."""
     x, y, z = vectors.unbind(-1)
     return torch.stack((cosine * x - sine * y, sine * x + cosine * y, z), dim=-1)
+
+
+def dot(vectors: Tensor, directions: Tensor) -> Tensor:
+    """Products (P, D) of a vector for each pixel (P, K) with directions (D, K) or (P, D, K)."""
+    if directions.ndim == 2:
+        return vectors @ directions.T
+    return (directions @ vectors[..., None])[..., 0]

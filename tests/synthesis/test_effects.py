@@ -13,12 +13,11 @@ from scipy import ndimage, stats
 from torch import Tensor
 
 from splinecli.normals import angle_between_deg
-from splinecli.observation_map import cell_directions, rotate_about_view_axis
+from splinecli.observation_map import cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.effects import (
     add_sensor_noise,
     disturb_light_directions,
     disturb_light_strengths,
-    dot,
     draw_ambient,
     draw_exposure,
     draw_wall,

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from splinecli.methods import Estimator
 
 DEFAULT_TRIALS = 100
-TRIALS, LIGHTS_PLOT, LIGHT_NOISE_PLOT = "trials.jsonl", "lights.png", "light_noise.png"
+TRIALS, REPORT = "trials.jsonl", "report.html"
+LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
 
 
 def evaluate(
@@ -111,7 +112,8 @@ def evaluate(
     from splinecli.capture import find_captures
     from splinecli.evaluation.protocol import TrialStore, evaluate_all
     from splinecli.evaluation.records import Protocol
-    from splinecli.files import check_writable, held_folder
+    from splinecli.evaluation.report import html_report
+    from splinecli.files import check_writable, held_folder, write_text
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, make_estimator, method_names
 
     if draws is not None and n_lights:
@@ -162,11 +164,12 @@ def evaluate(
                 jobs=jobs or (1 if on_gpu else _cores()),
                 on_progress=_follow(advance),
             )
-        document = _write_results(output, evaluations, [])
+        document, plots = _write_results(output, evaluations)
         if figures:
             drawn, not_drawn = _draw_figures(captures, estimators, evaluations, pixels, talk)
             _write_figures(output, drawn)
-            _write_results(output, evaluations, drawn)
+            shown = [*plots, *((figure.caption, figure.png) for figure in drawn)]
+            write_text(output / REPORT, html_report(evaluations, shown, document["notes"]))
     for entry in document["skipped"]:
         print(f"splinecli: {entry['capture']} was passed over: {entry['reason']}", file=sys.stderr)
     for warning in _untrained(evaluations):
@@ -183,8 +186,13 @@ def evaluate(
     return InputError.exit_code if document["skipped"] or not_drawn else 0
 
 
-def _write_results(output: Path, evaluations: list[Evaluation], drawn: list[CaptureFigure]) -> dict[str, Any]:
-    """Write all that `evaluate` leaves, and remove plots of an earlier call; returns results.json's content."""
+def _write_results(
+    output: Path, evaluations: list[Evaluation]
+) -> tuple[dict[str, Any], list[tuple[str, bytes]]]:
+    """Write all but the figures, and remove plots of an earlier call.
+
+    Returns results.json's content, and the plots with their captions.
+    """
     from splinecli.evaluation.curves import light_noise_curves, lights_curves
     from splinecli.evaluation.report import html_report
     from splinecli.evaluation.tables import latex, markdown, results_csv, results_document
@@ -196,8 +204,7 @@ def _write_results(output: Path, evaluations: list[Evaluation], drawn: list[Capt
     if len({evaluation.protocol.light_noise_deg for evaluation in evaluations}) > 1:
         plots[LIGHT_NOISE_PLOT] = ("Error against the light noise.", light_noise_curves(evaluations))
     document = results_document(evaluations)
-    shown = [*(plot for plot in plots.values() if plot), *((f.caption, f.png) for f in drawn)]
-    report = html_report(evaluations, shown, document["notes"])
+    drawn = [plot for plot in plots.values() if plot]
     write_text(output / "results.csv", results_csv(evaluations))
     write_text(output / "table.md", markdown(evaluations))
     write_text(output / "table.tex", latex(evaluations))
@@ -207,9 +214,9 @@ def _write_results(output: Path, evaluations: list[Evaluation], drawn: list[Capt
         else:
             with refusals_as_output_errors(output / name):
                 (output / name).unlink(missing_ok=True)
-    write_text(output / "report.html", report)
+    write_text(output / REPORT, html_report(evaluations, drawn, document["notes"]))
     write_text(output / "results.json", json.dumps(document, indent=2) + "\n")
-    return document
+    return document, drawn
 
 
 def _draw_figures(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,7 +57,7 @@ def capture_figures(
         UsageError: a pixel has no ground truth.
     """
     source = open_capture(folder)
-    trial = first_trial(source, name, replace(protocol, max_pixels=None))
+    trial = first_trial(source, name, protocol)
     whole = source.read(range(protocol.skipped_lights(name), source.n_lights))
     capture = see_trial(whole, trial)
     assert capture.ground_truth is not None  # or there is no first trial

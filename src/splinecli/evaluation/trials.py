@@ -101,20 +101,20 @@ class TrialStore:
             self._break_first = False
 
 
-def digest_of(files: CaptureFiles, estimator: Estimator) -> str:
-    """Changes when a file of the capture or the method's settings do; images by place, size and time alone."""
+def stamp_files(files: CaptureFiles) -> list[Any]:
+    """What changes when a file of the capture does; images by place, size and time alone, the others by content."""
     named = (files.light_directions, files.light_intensities, files.mask, files.ground_truth)
     contents = [file_sha256(path) for path in (*files.boundaries, *named) if path is not None]
     stamps = [(str(path.resolve()), (s := path.stat()).st_size, s.st_mtime_ns) for path in files.images]
-    values = [__version__, estimator.fingerprint, contents, stamps]
-    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
+    return [contents, stamps]
 
 
 def plan_trials(
-    capture: str, files: CaptureFiles, estimator: Estimator, draws: list[Draw], protocol: Protocol
+    capture: str, file_stamps: list[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
 ) -> list[Trial]:
-    """The trials of one method on one capture."""
-    made_of = digest_of(files, estimator)
+    """The trials of one method on one capture, whose files stamp_files has stamped."""
+    values = [__version__, estimator.fingerprint, *file_stamps]
+    made_of = hashlib.sha256(json.dumps(values).encode()).hexdigest()
     return [
         Trial(
             capture, estimator.name, number, draw, protocol.light_noise_deg, protocol.seed,

@@ -21,19 +21,9 @@ DEGREE_LIGHT = 4  # the paper's N2
 _RIDGE = 1e-10  # for a pixel without light, where nothing else fixes the normal and the polynomial
 
 
-def solve(
-    observations: Tensor,
-    light_directions: Tensor,
-    valid: Tensor | None = None,
-    *,
-    shadow_share: float = 0.2,
-    prior_weight: float = 0.01,
-) -> Tensor:
+def solve(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
     """Normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3). See fit."""
-    normals, _ = fit(
-        observations, light_directions, valid, shadow_share=shadow_share, prior_weight=prior_weight
-    )
-    return normals
+    return fit(observations, light_directions, valid)[0]
 
 
 def fit(

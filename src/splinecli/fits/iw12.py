@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.shadows import lit_observations
-from splinecli.fits.weighted_least_squares import dot, weighted_least_squares
+from splinecli.fits.weighted_least_squares import weighted_least_squares
+from splinecli.observation_map import dot
 
 SHADOW_SHARE = 0.1
 """Of the pixel's quantile UNSHADED: what is darker is left out as shadow; the authors threshold shadows, too."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from splinecli.observation_map import dot
+
 RIDGE = 1e-12
 """Pull of b to zero: it decides only where the lights that count lie in one plane."""
 
@@ -31,13 +33,6 @@ def weighted_least_squares(
     covariance = _inverse(weighted_sum(weight, products) + ridge)
     scaled_normals = _multiply(covariance, weighted_sum(weight * observations, light_directions))
     return scaled_normals, dot(covariance, products * products.new_tensor(_TWICE_OFF_DIAGONAL))
-
-
-def dot(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Products (P, F) of a vector for each pixel (P, K) with directions (F, K) or (P, F, K)."""
-    if directions.ndim == 2:
-        return vectors @ directions.T
-    return (directions @ vectors[..., None])[..., 0]
 
 
 def weighted_sum(weight: Tensor, directions: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
+from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.observation_map import map_scale
 
 Solve = Callable[[Tensor, Tensor], Tensor]
@@ -46,21 +47,44 @@ class BatchedEstimator:
     def fingerprint(self) -> str:
         return f"{self.name} {self.precision}"
 
-    @torch.inference_mode()
     def estimate(
         self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
-        lights = torch.as_tensor(light_directions, dtype=torch.float64, device=self.device)
-        normals = np.empty((len(observations), 3), np.float32)
-        for start in range(0, len(observations), self.batch_size):
-            batch = torch.as_tensor(observations[start : start + self.batch_size])
-            batch = batch.to(self.device, torch.float64).clamp(min=0)
+
+        def solve_scaled(batch: Tensor, lights: Tensor) -> Tensor:
+            batch = batch.clamp(min=0)
             found = self.solve(batch / map_scale(batch), lights)
             # Lengths tell nothing and may be tiny: in two steps, for normalize takes such vectors for zero.
-            found = torch.nn.functional.normalize(
-                found / found.abs().amax(dim=1, keepdim=True).clamp(min=1e-300), dim=1
-            )
-            found[~found.any(dim=1)] = found.new_tensor((0.0, 0.0, 1.0))
-            normals[start : start + self.batch_size] = found.cpu().numpy()
-        return normals
+            largest = found.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
+            return torch.nn.functional.normalize(found / largest, dim=1)
+
+        return estimate_in_batches(
+            solve_scaled,
+            observations,
+            light_directions,
+            batch_size=self.batch_size,
+            device=self.device,
+            dtype=torch.float64,
+        )
+
+
+@torch.inference_mode()
+def estimate_in_batches(
+    solve: Solve,
+    observations: NDArray[np.float32],
+    light_directions: NDArray[np.float64],
+    *,
+    batch_size: int,
+    device: str,
+    dtype: torch.dtype,
+) -> NDArray[np.float32]:
+    """What `solve` makes of the observations as they are: unit normals (P, 3), or zero, which becomes (0, 0, 1)."""
+    lights = torch.as_tensor(light_directions, dtype=dtype, device=device)
+    normals = np.empty((len(observations), 3), np.float32)
+    for start in range(0, len(observations), batch_size):
+        batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)
+        found = solve(batch, lights)
+        found[~found.any(dim=1)] = found.new_tensor(TOWARDS_CAMERA)
+        normals[start : start + batch_size] = found.cpu().numpy()
+    return normals

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
+from splinecli.methods.batched import estimate_in_batches
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
 
@@ -64,31 +65,27 @@ class NetworkEstimator:
         self.network = loaded.network.to(device)
         self._views = views(rotations, canonical=loaded.network.config.is_canonical)
 
-    @torch.inference_mode()
     def estimate(
         self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
-        lights = torch.as_tensor(light_directions, dtype=torch.float32, device=self.device)
-        normals = np.empty((len(observations), 3), np.float32)
-        for start in range(0, len(observations), self.batch_size):
-            batch = torch.as_tensor(observations[start : start + self.batch_size]).to(
-                self.device, torch.float32
+        return estimate_in_batches(
+            self._average_views,
+            observations,
+            light_directions,
+            batch_size=self.batch_size,
+            device=self.device,
+            dtype=torch.float32,
+        )
+
+    def _average_views(self, batch: Tensor, lights: Tensor) -> Tensor:
+        with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+            total = sum(
+                (self.network(batch, lights, turn_deg=turn, mirror=mirror) for turn, mirror in self._views),
+                start=torch.zeros((), device=lights.device),
             )
-            with torch.autocast(
-                lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
-            ):
-                total = sum(
-                    (
-                        self.network(batch, lights, turn_deg=turn, mirror=mirror)
-                        for turn, mirror in self._views
-                    ),
-                    start=torch.zeros((), device=lights.device),
-                )
-            unit = torch.nn.functional.normalize(total, dim=-1)
-            unit[batch.amax(dim=1) <= 0] = unit.new_tensor((0.0, 0.0, 1.0))
-            normals[start : start + self.batch_size] = unit.cpu().numpy()
-        return normals
+        unit = torch.nn.functional.normalize(total, dim=-1)
+        return unit.masked_fill(batch.amax(dim=1, keepdim=True) <= 0, 0)
 
     @torch.inference_mode()
     def maps(

@@ -53,10 +53,9 @@ class NetworkConfig:
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
-        values = {**values, "fits": _fits(values.get("fits", ()))}
+        values = dict(values)
+        fits = _fits(values.pop("fits", ()))
         for name, value in values.items():
-            if name == "fits":
-                continue
             if name in _CHOICES:
                 if value not in _CHOICES[name]:
                     expected = " or ".join(map(repr, _CHOICES[name]))
@@ -65,7 +64,7 @@ class NetworkConfig:
                 raise ModelError(
                     f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096"
                 )
-        config = cls(**values)
+        config = cls(**values, fits=fits)
         # Both sizes halve the map twice; an instance norm needs more than one cell after that.
         if config.map_size % 4 or not 8 <= config.map_size <= 128:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")

@@ -13,18 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splinecli.observation_map import rotate_about_view_axis
+from splinecli.observation_map import dot, rotate_about_view_axis
 
 
 def _uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
     return torch.rand(*shape, generator=generator, device=generator.device) * (high - low) + low
-
-
-def dot(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Products (P, D) of a vector for each pixel (P, 3) with directions (D, 3) or (P, D, 3)."""
-    if directions.ndim == 2:
-        return vectors @ directions.T
-    return (directions @ vectors[..., None])[..., 0]
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 
 from splinecli.errors import ModelError
-from splinecli.observation_map import MAP_SIZE, cell_directions, rotate_about_view_axis
+from splinecli.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
 from splinecli.synthesis.effects import (
     Wall,
-    dot,
     draw_ambient,
     draw_wall,
 )
