@@ -220,6 +220,8 @@ def test_refusals(run, golden, no_pictures):
         (4, ["-o", "other", "--config", "broken.toml"]),
         (4, ["-o", "other", "--config", "none.toml"]),
         (4, ["-o", "other", "--generator-weight", 0]),
+        (4, ["-o", "other", "--start-from", "nowhere"]),
+        (4, ["-o", "other", "--start-from", "cnn-ps"]),
         *((2, ["-o", "other", f"--n-lights={text}"]) for text in ("few", "2", "9-4", "4-", "")),
         # another run's checkpoint
         (4, ["-o", "run", "--resume", "--steps", 2, "--param", "network.size=paper"]),

@@ -73,6 +73,7 @@ def test_matte_pixels_obey_lambert_s_law() -> None:
         material=replace(
             batch.scene.material,
             **{name: torch.zeros(500, 1) for name in ("metallic", "specular", "sheen", "clearcoat")},
+            minnaert=torch.ones(500, 1),
         ),
     )
     lights = batch.light_directions

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy import integrate
 
 from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 
@@ -19,11 +20,17 @@ NAMES = (
     "clearcoat",
     "clearcoat_gloss",
     "interface_loss",
+    "minnaert",
+    "tail_exponent",
 )
 
 
 def material(**values: float) -> PrincipledMaterial:
-    plain = dict.fromkeys(NAMES, 0.0) | {"base": 0.5, "roughness": 0.5} | values
+    plain = (
+        dict.fromkeys(NAMES, 0.0)
+        | {"base": 0.5, "roughness": 0.5, "minnaert": 1.0, "tail_exponent": 2.0}
+        | values
+    )
     return PrincipledMaterial(
         **{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()}
     )
@@ -41,9 +48,20 @@ def radiance(surface: PrincipledMaterial, normal: Vectors, lights: Vectors) -> V
 
 
 def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
-    """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012 remapping."""
-    base, metallic, specular, roughness, sheen, clearcoat, gloss, loss = (
+    """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012 remapping.
+
+    The height of the highlight's distribution by quadrature: projected facets have unit area.
+    """
+    base, metallic, specular, roughness, sheen, clearcoat, gloss, loss, kappa, gamma = (
         float(getattr(surface, name)) for name in NAMES
+    )
+    alpha = max(roughness, 0.1) ** 2
+    area, _ = integrate.quad(
+        lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
+        0,
+        1,
+        points=[1 - alpha**2],
+        epsrel=1e-9,
     )
     v = np.array([0.0, 0.0, 1.0])
     result = []
@@ -64,8 +82,8 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
 
         fd90 = 1 - loss if loss else 0.5 + 2 * roughness * lh**2
         diffuse = base / np.pi * (1 + (fd90 - 1) * schlick(nl)) * (1 + (fd90 - 1) * schlick(nv))
-        alpha = max(roughness, 0.1) ** 2
-        ndf = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
+        diffuse *= (nl * nv) ** (kappa - 1)
+        ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
         f0 = (1 - metallic) * 0.08 * specular + metallic * base
         fresnel = f0 + (1 - f0) * schlick(lh)
         lobe = ndf * fresnel * g1(nl, alpha) * g1(nv, alpha) / (4 * nl * nv)
@@ -89,6 +107,10 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         material(metallic=0.3, specular=1.0, roughness=0.7),
         material(interface_loss=0.4, roughness=0.9),
         material(interface_loss=1.0, specular=0.5),
+        material(minnaert=0.8, specular=0.2),
+        material(minnaert=1.4, sheen=0.3),
+        material(specular=1.0, roughness=0.4, tail_exponent=1.1),
+        material(metallic=1.0, roughness=0.3, tail_exponent=1.6, clearcoat=4.0, clearcoat_gloss=0.5),
         material(sheen=1.0),
         material(clearcoat=1.0, clearcoat_gloss=0.0),
         material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
@@ -162,6 +184,7 @@ def hemispherical_reflectance(
         (material(base=1.0, roughness=0.5), 1.02),
         (material(base=1.0, roughness=0.5, metallic=1.0), 1.0),
         (material(base=1.0, roughness=0.2, metallic=1.0), 1.0),
+        (material(base=1.0, roughness=0.4, metallic=1.0, tail_exponent=1.2), 1.0),
         (material(base=0.0, roughness=0.3, specular=1.0), 0.3),
     ],
 )
@@ -204,21 +227,31 @@ def test_drawn_materials_have_the_stated_classes() -> None:
     assert (values["specular"][metal] <= 1).all()
     assert (values["sheen"] > 0)[~metal].mean() == pytest.approx(0.2, abs=0.01)
     assert not values["sheen"][metal].any()
-    assert (values["clearcoat"] > 0).mean() == pytest.approx(0.15, abs=0.01)
+    assert (values["clearcoat"] > 0).mean() == pytest.approx(0.2, abs=0.01)
+    assert (values["clearcoat"] > 1).mean() == pytest.approx(0.1, abs=0.01)
     assert (values["interface_loss"] > 0).mean() == pytest.approx(0.6, abs=0.01)
+    assert (values["minnaert"] != 1).mean() == pytest.approx(0.7, abs=0.01)
+    assert (values["tail_exponent"] < 2).mean() == pytest.approx(0.5, abs=0.01)
+    # Half of what is no metal is log-uniform from 0.02, of which log10(2.5) / 1.7 lies under 0.05.
+    assert (values["base"] < 0.05)[~metal].mean() == pytest.approx(
+        0.5 * np.log10(0.05 / 10**-1.7) / 1.7, abs=0.01
+    )
+    assert values["base"][metal].min() >= 0.05
     ranges = {
-        "base": (0.05, 1),
+        "base": (0.02, 1),
         "specular": (0, 4),
         "sheen": (0, 1),
-        "clearcoat": (0, 1),
+        "clearcoat": (0, 4),
         "clearcoat_gloss": (0, 1),
         "interface_loss": (0, 1),
+        "minnaert": (0.85, 1.5),
+        "tail_exponent": (1.1, 2),
     }
     for name, (low, high) in ranges.items():
-        assert low <= values[name].min() <= low + 0.01, name
+        assert low - 1e-3 <= values[name].min() <= low + 0.01, name
         assert high - 0.01 <= values[name].max() <= high, name
     rough = values["roughness"]
-    assert 0.2 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9
+    assert 0.1 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9
     assert rough[~(metal | blend)].min() == pytest.approx(0.05, abs=0.01)
     assert rough.max() == pytest.approx(1, abs=0.01)
 

@@ -221,6 +221,26 @@ def test_a_folder_that_holds_a_run_is_left_alone(tiny: TrainingConfig, tmp_path:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_path: Path) -> None:
+    first = Trainer(tiny, tmp_path / "first", CPU)
+    first.run()
+    config = replace(tiny, start_from=str(tmp_path / "first" / WEIGHTS), seed=9)
+    second = Trainer(config, tmp_path / "second", CPU)
+    for network in (second.network, second.average):
+        for name, tensor in first.average.state_dict().items():
+            assert torch.equal(network.state_dict()[name], tensor.half().float()), name
+    second.run()
+    # Taken up, it is where it was, not at its start.
+    trained = second.network.state_dict()
+    again = Trainer(replace(config, steps=99), tmp_path / "second", CPU, resume=True)
+    assert all(torch.equal(again.network.state_dict()[name], trained[name]) for name in trained)
+
+
+def test_weights_of_another_network_cannot_begin_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="'spline-net' are of a network with width = 64, the run's has 8"):
+        Trainer(replace(tiny, start_from="spline-net"), tmp_path, CPU)
+
+
 def test_no_run_to_take_up(tiny: TrainingConfig, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no such file"):
         Trainer(tiny, tmp_path, CPU, resume=True)

@@ -34,6 +34,10 @@ def train(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3; repeatable."),
     ] = None,
+    start_from: Annotated[
+        str | None,
+        typer.Option(metavar="WEIGHTS", help="Begin with these weights, a shipped name or a file."),
+    ] = None,
     generator_weight: Annotated[
         float | None,
         typer.Option(
@@ -80,6 +84,8 @@ def train(
         changes.append({"sources": _sources(sets or [], generator_weight)})
     if n_lights is not None:
         changes.append({"pixels": _light_counts(n_lights)})
+    if start_from is not None:
+        changes.append({"start_from": start_from})
     changes += [parse_parameter(text) for text in param or []]
     if seed is not None:
         changes.append({"seed": seed})

@@ -58,13 +58,13 @@ class PixelScene:
     def radiance(self, directions: Tensor) -> Tensor:
         """Radiance (P, D) under unit lights (D, 3) or (P, D, 3); matte white that faces its light is 1."""
         visible = torch.ones((), device=self.normals.device)
-        returned = self.ambient
+        returned = self.material.albedo() * self.ambient
         for wall in self.walls:
             visible = visible * wall.visibility(directions)
-            returned = returned + wall.reflected(directions)
+            returned = returned + wall.reflected(self.normals, self.material, directions)
         normal_z = self.normals[:, 2:]
         direct = self.material.shade(dot(self.normals, directions), normal_z, directions[..., 2])
-        total = direct * visible + self.material.albedo() * returned
+        total = direct * visible + returned
         if self.mixed is not None and self.mixed_weight is not None:
             count = len(self.mixed_weight)
             of_mixed = directions if directions.ndim == 2 else directions[:count]

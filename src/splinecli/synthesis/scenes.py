@@ -194,6 +194,8 @@ def draw_class(name: str, patches: int, generator: torch.Generator) -> Principle
         clearcoat=zero,
         clearcoat_gloss=zero,
         interface_loss=zero,
+        minnaert=zero + 1,
+        tail_exponent=zero + 2,
     )
 
 

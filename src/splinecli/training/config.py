@@ -21,6 +21,7 @@ class TrainingConfig:
 
     Attributes:
         sources: where pixels come from, with weights: the share of each in the batches.
+        start_from: shipped name or file of the weights that the run begins with; empty for random ones.
         held_share: share of the scenes of a pixel set that are held back for validation.
         batch_size: pixels a step.
         shards: parts of a batch, drawn each from a random stream of its own; so many processes can share the
@@ -46,6 +47,7 @@ class TrainingConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     pixels: PixelGeneratorConfig = field(default_factory=PixelGeneratorConfig)
     sources: dict[str, float] = field(default_factory=lambda: {GENERATOR: 1.0})
+    start_from: str = ""
     held_share: float = 0.1
     batch_size: int = 256
     shards: int = 4

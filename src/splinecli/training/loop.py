@@ -17,7 +17,7 @@ from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
 from splinecli.files import check_writable, write_text
 from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import save_weights
+from splinecli.networks.weights import resolve_weights, save_weights
 from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.training.checkpoint import Clock, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
@@ -55,6 +55,19 @@ def stream_seed(seed: int, step: int, stream: int) -> int:
     return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
 
 
+def _start_from(weights: str, network: SplineNet) -> None:
+    loaded = resolve_weights(weights).network
+    wanted, found = network.config.to_dict(), loaded.config.to_dict()
+    differing = [name for name in wanted if wanted[name] != found[name]]
+    if differing:
+        name = differing[0]
+        raise ModelError(
+            f"the weights {weights!r} are of a network with {name} = {found[name]!r}, the run's has {wanted[name]!r}",
+            hint="Choose the preset, or the settings network.*, that the weights were trained with",
+        )
+    network.load_state_dict(loaded.state_dict())
+
+
 class Trainer:
     """A run in a folder: checkpoint, weights, config.json and the records.
 
@@ -90,6 +103,8 @@ class Trainer:
         self.sets, self.unheld = sources.sets, sources.unheld
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
+        if config.start_from and not resume:
+            _start_from(config.start_from, self.network)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
