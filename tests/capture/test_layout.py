@@ -139,7 +139,7 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
         find_capture_files(tmp_path / "dark")
     assert str(caught.value) == (
         f"{tmp_path / 'dark'}: the folder holds 2 images but no light file"
-        " (light_directions.txt or lights.txt)."
+        " (light_directions.txt, lights.txt, *.lp or lights.json)."
         " Pass --lights FILE, with one line x y z for each image."
     )
     assert (
@@ -180,7 +180,8 @@ def test_find_captures(tmp_path: Path) -> None:
 def test_find_captures_finds_none(tmp_path: Path) -> None:
     fill(tmp_path, "set/o1/a.png", "set/o1/lights.txt", "empty/notes.txt")
     message = (
-        "found no capture, expected folders of images with a light file (light_directions.txt or lights.txt)."
+        "found no capture, expected folders of images with a light file"
+        " (light_directions.txt, lights.txt, *.lp or lights.json)."
     )
     with pytest.raises(InputError) as caught:
         find_captures(tmp_path)

@@ -13,6 +13,10 @@ from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
 LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt")
+NAMED_LIGHTS = (".lp", "lights.json")
+"""How the names of light files end that name the image of each light."""
+LIGHT_FILES = f"{', '.join(LIGHT_DIRECTIONS)}, *.lp or lights.json"
+"""The names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in IMAGE_SUFFIXES)
 GROUND_TRUTH = tuple(
@@ -37,7 +41,7 @@ class CaptureFiles:
         name: what the capture is called, in most layouts like its folder.
         folder: the folder that holds the files beside the images.
         images: one file a light.
-        light_directions: F x 3 text.
+        light_directions: F x 3 text, or one of the files of named_lights.py, which then orders the images.
         light_intensities: F x 3 text, or None where all lights are equally strong.
         mask: an image, or None where every pixel counts.
         boundaries: instead of a the mask: images whose pixels above zero together are the object.
@@ -81,6 +85,21 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """The first of the names that the folder holds, letter case aside; None for none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}
     return next((files[name] for name in names if name in files), None)
+
+
+def find_lights(folder: Path) -> Path | None:
+    """The light file in the folder; None for none. InputError for several that name their images."""
+    plain = find_named(folder, LIGHT_DIRECTIONS)
+    if plain is not None:
+        return plain
+    named = [e for e in list_folder(folder) if e.name.lower().endswith(NAMED_LIGHTS) and is_file(e)]
+    if len(named) > 1:
+        raise InputError(
+            f"found {len(named)} light files: {', '.join(path.name for path in named)}",
+            path=folder,
+            hint="Choose one by --lights FILE",
+        )
+    return named[0] if named else None
 
 
 def folder_name(folder: Path) -> str:

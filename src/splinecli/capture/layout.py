@@ -8,10 +8,11 @@ from pathlib import Path
 from splinecli.capture import cyclesps, diligent, plain_folder, psbox
 from splinecli.capture.capture_files import (
     FILENAMES,
-    LIGHT_DIRECTIONS,
+    LIGHT_FILES,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
+    find_lights,
     find_named,
     folder_name,
 )
@@ -76,7 +77,7 @@ def find_captures(folder: StrPath) -> list[Path]:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
     raise InputError(
-        f"found no capture, expected folders of images with a light file ({' or '.join(LIGHT_DIRECTIONS)})",
+        f"found no capture, expected folders of images with a light file ({LIGHT_FILES})",
         path=folder,
         hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
     )
@@ -99,7 +100,7 @@ def _captures_below(folder: Path) -> list[Path]:
 
 
 def _looks_like_capture(folder: Path) -> bool:
-    if find_named(folder, LIGHT_DIRECTIONS) is None:
+    if find_lights(folder) is None:
         return False
     if find_named(folder, [FILENAMES]) is not None:
         return True

@@ -6,6 +6,7 @@ Frame: x right, y up, z to the camera; a direction points from the object to the
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,22 +36,40 @@ def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray
     """
     table = _drop_count_line(read_number_rows(Path(path)), n_images)
     vectors, transposed = _one_light_a_row(table, {3: "x y z"}, "light directions", n_images)
+    return unit_directions(
+        vectors,
+        table.path,
+        [table.lines[2 if transposed else light] for light in range(len(vectors))],
+        [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))],
+    )
+
+
+def unit_directions(
+    vectors: NDArray[np.float64],
+    path: Path,
+    lines: Sequence[int | None],
+    places: Sequence[str],
+) -> NDArray[np.float64]:
+    """Vectors (F, 3) at unit length.
+
+    Args:
+        path, lines, places: where each stands in its file: its line, and words that say where on it.
+
+    Raises:
+        InputError: a zero vector, or a light that is not above the horizon.
+    """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     # Divided by the largest component first: squares of very large or small ones leave float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
     directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
-    for light, (vector, z) in enumerate(zip(vectors, directions[:, 2], strict=True)):
-        place = f" in column {light + 1}" if transposed else ""
-        line = table.lines[2 if transposed else light]
+    for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            raise InputError(
-                f"found a zero vector{place}, expected a light direction", path=table.path, line=line
-            )
+            raise InputError(f"found a zero vector{place}, expected a light direction", path=path, line=line)
         if z <= 0:
             raise InputError(
                 f"found a light below the horizon{place} (z = {vector[2]:g}), expected z > 0",
-                path=table.path,
+                path=path,
                 line=line,
                 hint="z points to the camera; the file may be in another frame",
             )

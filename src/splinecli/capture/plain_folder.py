@@ -7,12 +7,13 @@ from pathlib import Path
 from splinecli.capture.capture_files import (
     FILENAMES,
     GROUND_TRUTH,
-    LIGHT_DIRECTIONS,
+    LIGHT_FILES,
     LIGHT_INTENSITIES,
     MASK,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
+    find_lights,
     find_named,
     folder_name,
 )
@@ -32,10 +33,10 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     else:
         images = list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
     check_not_empty(images, folder)
-    lights = overrides.lights or find_named(folder, LIGHT_DIRECTIONS)
+    lights = overrides.lights or find_lights(folder)
     if lights is None:
         raise InputError(
-            f"the folder holds {len(images)} images but no light file ({' or '.join(LIGHT_DIRECTIONS)})",
+            f"the folder holds {len(images)} images but no light file ({LIGHT_FILES})",
             path=folder,
             hint="Pass --lights FILE, with one line x y z for each image",
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import named_lights
 from splinecli.capture.capture_files import CaptureFiles
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.ground_truth import UPSIDE_DOWN, read_ground_truth
@@ -34,11 +35,13 @@ class CaptureSource:
         files: its files.
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
+        warnings: sentences a user should read.
     """
 
     files: CaptureFiles
     light_directions: NDArray[np.float64]
     light_intensities: NDArray[np.float64]
+    warnings: tuple[str, ...] = ()
 
     @property
     def n_lights(self) -> int:
@@ -103,6 +106,7 @@ class CaptureSource:
             mask=mask,
             ground_truth=ground_truth,
             warnings=(
+                *self.warnings,
                 *_warnings(n_saturated / observations.size, n_black / len(observations), n_8_bit),
                 *((UPSIDE_DOWN,) if upside_down else ()),
             ),
@@ -147,13 +151,22 @@ def open_capture(
     files = find_capture_files(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
     )
-    n_images = len(files.images)
-    directions = read_light_directions(files.light_directions, n_images)
-    if files.light_intensities is None:
-        strengths = np.ones((n_images, 3))
+    path = files.light_directions
+    strengths: NDArray[np.float64] | None = None
+    warnings: tuple[str, ...] = ()
+    if path.suffix.lower() in named_lights.SUFFIXES:
+        named = named_lights.read_named_lights(path)
+        images, how = named.match(files.images)
+        files, directions, strengths = replace(files, images=images), named.directions, named.intensities
+        if how != "name":
+            warnings = (f"The lights of {path.name} were matched to the images by {how}.",)
     else:
-        strengths = read_light_intensities(files.light_intensities, n_images)
-    return CaptureSource(files, directions, strengths)
+        directions = read_light_directions(path, len(files.images))
+    if files.light_intensities is not None:
+        strengths = read_light_intensities(files.light_intensities, len(files.images))
+    if strengths is None:
+        strengths = np.ones((len(files.images), 3))
+    return CaptureSource(files, directions, strengths, warnings)
 
 
 def read_capture(

@@ -79,7 +79,7 @@ def read_number_rows(path: Path) -> NumberRows:
         content = text.partition("#")[0].strip()
         words = [word for word in _SEPARATORS.split(content) if word]
         if words:
-            rows.append(tuple(_number(word, path, line) for word in words))
+            rows.append(tuple(parse_number(word, path, line) for word in words))
             lines.append(line)
             texts.append(content)
     if not rows:
@@ -87,7 +87,8 @@ def read_number_rows(path: Path) -> NumberRows:
     return NumberRows(path, tuple(rows), tuple(lines), tuple(texts))
 
 
-def _number(word: str, path: Path, line: int) -> float:
+def parse_number(word: str, path: Path, line: int) -> float:
+    """A finite number from one word of a text file; InputError, with the line, for any other."""
     try:
         # float() would also take Python's own "1_000".
         value = float(word) if "_" not in word else None
