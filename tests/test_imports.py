@@ -16,8 +16,8 @@ ROOMS = [
     {"synthesis", "inference"},
     {"methods", "metrics"},
     {"networks", "devices"},
-    {"fits"},
-    {"capture", "observation_map"},
+    {"fits", "calibration"},
+    {"capture", "observation_map", "surface"},
     {"normals", "files"},
     {"errors", "__init__"},
 ]

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from splinecli import __version__
+from splinecli.cli.calibrate import calibrate
 from splinecli.cli.evaluate import evaluate
 from splinecli.cli.import_weights import import_weights
 from splinecli.cli.infer import infer
@@ -41,6 +42,7 @@ def _splinecli(
 
 
 app.command()(infer)
+app.command()(calibrate)
 app.command()(evaluate)
 app.command()(prepare)
 app.command()(train)

@@ -26,6 +26,7 @@ FILES = (
     ("CAPTURE/light_intensities.txt", "A line r g b for each image. Optional."),
     ("CAPTURE/mask.png", "Bright on the object. Optional: without it every pixel counts."),
     ("CAPTURE/Normal_gt.mat", "True normals. Optional; errors are reported against them."),
+    ("CAPTURE/*.lp, lights.json", "Instead: lights with the name of their image, of RTI or AliceVision."),
     ("OUT/NAME/normals.png", "Normal map, 16-bit RGB, (n + 1) / 2."),
     ("OUT/NAME/normals.npy", "Normal map, float32, H x W x 3, zero outside the mask."),
     ("OUT/NAME/error_map.png", "Angular error with a colour bar, where there is ground truth."),
@@ -44,6 +45,7 @@ EXAMPLES = (
     ("splinecli infer obj/ --lights l.txt", "Normals of one object from all its images."),
     ("splinecli infer catPNG --n-lights 10 --seed 0 --json", "From ten lights, the report on stdout."),
     ("splinecli infer captures/* -o results --overwrite", "A folder of captures."),
+    ("splinecli calibrate chrome/ -o lights", "Light directions from photographs of a mirror ball."),
     (
         "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
         "Methods compared.",

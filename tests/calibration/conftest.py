@@ -1,0 +1,46 @@
+"""Photographs of made-up mirror balls: the oracle is the law of reflection, followed from the camera to the lamp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+Render = Callable[..., NDArray[np.float32]]
+
+
+@pytest.fixture
+def render_ball() -> Render:
+    """A mirror ball (H, W) before a gray wall, 3 x 3 samples a pixel: a lamp of 2 degrees, a dim room around it."""
+
+    def render(
+        light: NDArray[np.float64], x: float = 103.3, y: float = 88.7, radius: float = 61.4,
+        shape: tuple[int, int] = (180, 210), lamp: float = 30.0,
+    ) -> NDArray[np.float32]:  # fmt: skip
+        height, width = shape
+        offsets = (np.arange(3) - 1) / 3
+        rows = (np.arange(height)[:, None] + offsets).ravel()
+        cols = (np.arange(width)[:, None] + offsets).ravel()
+        nx, ny = np.meshgrid((cols - x) / radius, (y - rows) / radius)
+        inside = nx**2 + ny**2 < 1
+        nz = np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))
+        # The ray from the camera, (0, 0, -1), mirrored.
+        mirrored = np.stack((2 * nz * nx, 2 * nz * ny, 2 * nz**2 - 1), axis=-1)
+        room = 0.02 + 0.01 * mirrored[..., 1]
+        values = np.where(mirrored @ light > np.cos(np.radians(2)), lamp, room)
+        values = np.where(inside, values, 0.15)
+        picture = values.reshape(height, 3, width, 3).mean(axis=(1, 3))
+        return np.asarray(picture, np.float32)
+
+    return render
+
+
+@pytest.fixture
+def lights() -> NDArray[np.float64]:
+    """Seven lights (7, 3), 0 to 60 degrees from the view."""
+    zenith, azimuth = np.radians(np.linspace(0, 60, 7)), np.arange(7) * 2.4
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )

@@ -1,0 +1,94 @@
+"""Circles from masks and in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
+from splinecli.capture import read_image, read_mask
+from splinecli.errors import InputError
+
+TRUE = Circle(103.3, 88.7, 61.4)
+
+
+def disc(circle: Circle = TRUE, shape: tuple[int, int] = (180, 210)) -> NDArray[np.bool_]:
+    return circle.inside(shape)
+
+
+def assert_close(found: Circle, true: Circle, pixels: float) -> None:
+    assert abs(found.x - true.x) < pixels
+    assert abs(found.y - true.y) < pixels
+    assert abs(found.radius - true.radius) < pixels
+
+
+def test_circle_of_a_mask() -> None:
+    found = circle_from_mask(disc())
+    assert_close(found, TRUE, 0.2)
+    assert found.seen > 0.98
+    assert found.spread < 0.5
+
+
+def test_a_stand_and_specks_do_not_move_the_circle() -> None:
+    mask = disc()
+    mask[130:, 90:118] = True
+    mask[5:8, 5:8] = True
+    found = circle_from_mask(mask)
+    assert_close(found, TRUE, 0.4)
+    assert 0.5 < found.seen < 0.9
+
+
+def test_a_mask_cut_off_by_the_frame_keeps_its_circle() -> None:
+    beyond = Circle(40.0, 88.7, 61.4)
+    found = circle_from_mask(disc(beyond))
+    assert_close(found, beyond, 0.4)
+    assert found.reaches_beyond((180, 210))
+    assert not TRUE.reaches_beyond((180, 210))
+
+
+@pytest.mark.parametrize(
+    "mask", [np.ones((50, 60), np.bool_), np.pad(np.ones((20, 120), np.bool_), 30)], ids=["all", "bar"]
+)
+def test_masks_that_are_no_ball(mask: NDArray[np.bool_]) -> None:
+    with pytest.raises(InputError, match="expected a ball"):
+        circle_from_mask(mask)
+
+
+@pytest.mark.parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
+@pytest.mark.parametrize("scale", [1, 6])
+def test_circle_in_a_picture(ball: float, wall: float, scale: int) -> None:
+    true = Circle(scale * TRUE.x, scale * TRUE.y, scale * TRUE.radius)
+    shape = (180 * scale, 210 * scale)
+    picture = np.where(disc(true, shape), ball, wall)
+    picture += np.random.default_rng(0).normal(0, 0.02 * abs(ball - wall), shape)
+    found = find_circle(picture.clip(0))
+    assert_close(found, true, 0.5 * max(1, scale / 3))
+    assert found.seen > 0.9
+
+
+def test_no_circle_in_a_picture() -> None:
+    with pytest.raises(InputError, match="found no circle"):
+        find_circle(np.tile(np.linspace(0, 1, 200), (150, 1)))
+
+
+def test_normals_of_the_ball() -> None:
+    normals = Circle(10, 20, 5).normals(np.array([10.0, 13, 10, 16]), np.array([20.0, 20, 16, 20]))
+    np.testing.assert_allclose(normals[:3], [(0, 0, 1), (0.6, 0, 0.8), (0, 0.8, 0.6)], atol=1e-12)
+    assert np.isnan(normals[3]).any()
+
+
+def test_real_balls(shared_data: Path, record_property: Callable[[str, object], None]) -> None:
+    # PSBox's own circles; their y counts from the lower edge.
+    for number in (1, 2):
+        folder = shared_data / f"psbox/LightProbe-{number}"
+        x, y, radius = (float(word) for word in (folder / "circle_data.txt").read_text().split())
+        picture = read_image(folder / "ref.JPG").mean(axis=2)
+        found = find_circle(picture)
+        record_property(f"ball {number}", found)
+        assert_close(found, Circle(x, len(picture) - y, radius), 0.01 * radius)
+    found = circle_from_mask(read_mask(shared_data / "uw/chrome/mask.png"))
+    assert found.seen > 0.98

@@ -1,0 +1,72 @@
+"""Highlights and directions, against a ball whose reflections are followed to the lamp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.calibration.circle import Circle
+from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
+from splinecli.errors import InputError
+from splinecli.normals import angle_between_deg
+
+BALL = Circle(103.3, 88.7, 61.4)
+Render = Callable[..., NDArray[np.float32]]
+
+
+@pytest.mark.parametrize("full_scale", [None, 1.0])
+def test_directions_come_back(
+    render_ball: Render, lights: NDArray[np.float64], full_scale: float | None
+) -> None:
+    for light in lights:
+        picture = render_ball(light)
+        picture = picture if full_scale is None else picture.clip(0, full_scale)
+        highlight = find_highlight(picture, BALL, full_scale=full_scale)
+        # A pixel of this ball is 1.9 degrees of light near its middle, and more towards its rim.
+        assert angle_between_deg(light_direction(BALL, highlight), light) < 0.7
+        assert (highlight.saturated > 0.1) == (full_scale is not None)
+
+
+def test_the_normal_is_not_the_light(render_ball: Render, lights: NDArray[np.float64]) -> None:
+    highlight = find_highlight(render_ball(lights[4]), BALL)
+    normal = BALL.normals(np.array([highlight.x]), np.array([highlight.y]))[0]
+    assert angle_between_deg(normal, lights[4]) == pytest.approx(20, abs=0.5)  # half of 40 degrees
+
+
+def test_a_sparkle_is_no_lamp(render_ball: Render, lights: NDArray[np.float64]) -> None:
+    picture = render_ball(lights[3]).clip(0, 1)
+    expected = find_highlight(picture, BALL)
+    picture[110, 80] = 1.0
+    found = find_highlight(picture, BALL)
+    assert (found.x, found.y) == (expected.x, expected.y)
+
+
+def test_light_outside_the_ball_does_not_count(render_ball: Render, lights: NDArray[np.float64]) -> None:
+    picture = render_ball(lights[3])
+    expected = find_highlight(picture, BALL)
+    picture[:20, :20] = 100
+    assert find_highlight(picture, BALL) == expected
+
+
+def test_no_highlight(render_ball: Render) -> None:
+    behind = np.array([0.0, 0.6, -0.8])
+    with pytest.raises(InputError, match="found no highlight"):
+        find_highlight(render_ball(behind, lamp=0.03), BALL)
+    with pytest.raises(InputError, match="found no highlight"):
+        find_highlight(np.zeros((180, 210), np.float32), BALL)
+
+
+def test_a_window_is_no_lamp(render_ball: Render, lights: NDArray[np.float64]) -> None:
+    picture = render_ball(lights[0])
+    picture[60:110, 70:130] = 20
+    with pytest.raises(InputError, match="too wide for a lamp"):
+        find_highlight(picture, BALL)
+
+
+@pytest.mark.parametrize("x", [0.75, 0.99, 1.2])
+def test_highlights_near_the_rim(x: float) -> None:
+    with pytest.raises(InputError, match="level with the ball or behind it"):
+        light_direction(Circle(0, 0, 1), Highlight(x, 0, 5, 0))

@@ -1,0 +1,163 @@
+"""`splinecli calibrate`: its files, its words and its refusals, on made-up mirror balls."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.capture import read_light_directions
+
+SIZE, CENTRE, RADIUS = (100, 120), (60.0, 48.0), 40.0
+LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-0.48, 0.36, 0.8), (0.0, -0.6, 0.8)])
+
+
+def normals():
+    y, x = np.indices(SIZE)
+    nx, ny = (x - CENTRE[0]) / RADIUS, (CENTRE[1] - y) / RADIUS
+    inside = nx**2 + ny**2 < 1
+    return np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1), inside
+
+
+def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
+    """The ball shows each lamp as a soft spot where the normal halves view and light."""
+    folder.mkdir()
+    n, inside = normals()
+    for number, light in enumerate(lights):
+        half = light + (0, 0, 1)
+        half /= np.linalg.norm(half)
+        spot = np.exp(-((np.degrees(np.arccos((n @ half).clip(-1, 1))) / 2) ** 2))
+        picture = np.where(inside, 0.02 + 0.9 * spot, wall)
+        cv2.imwrite(str(folder / f"{number}.png"), np.rint(picture * 65535).astype(np.uint16))
+    return folder
+
+
+def write_gray(folder: Path, strengths) -> Path:
+    folder.mkdir()
+    n, inside = normals()
+    for number, (light, strength) in enumerate(zip(LIGHTS, strengths, strict=True)):
+        picture = np.where(inside, 0.5 * strength * (n @ light).clip(0), 0)
+        cv2.imwrite(str(folder / f"{number}.png"), np.rint(picture * 65535).astype(np.uint16))
+    cv2.imwrite(str(folder / "mask.png"), inside.astype(np.uint8) * 255)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def angles_deg(found, expected=LIGHTS):
+    return np.degrees(np.arccos((found * expected).sum(axis=1).clip(-1, 1)))
+
+
+def test_one_ball(run):
+    write_balls(Path("ball"))
+    result = run("calibrate", "ball")
+    assert (result.code, result.out) == (0, "calibration/light_directions.txt\n")
+    assert result.err.startswith("ball: circle 60.")
+    assert "from picture, 100 % of the outline" in result.err
+    assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
+    assert cv2.imread("calibration/calibration.png").shape == (222, 800, 3)
+    assert not Path("calibration/light_intensities.txt").exists()
+
+
+def test_the_outline_that_is_given(run):
+    write_balls(Path("ball"))
+    result = run("calibrate", "ball", "--circle", "60,48,40", "--json", "-o", "out")
+    report = json.loads(result.out)
+    assert report["balls"][0]["circle"] == {
+        "x": 60.0, "y": 48.0, "radius": 40.0, "from": "--circle", "seen": 1.0, "spread": 0.0,
+    }  # fmt: skip
+    assert angles_deg(np.array(report["light_directions"])).max() < 0.6
+    assert report["disagreement_deg"] is None
+    assert json.loads(Path("out/calibration.json").read_text()) == report
+
+
+def test_two_balls_and_strengths(run):
+    write_balls(Path("one"))
+    write_balls(Path("two"))
+    strengths = [1.0, 0.5, 0.75, 1.25]
+    write_gray(Path("gray"), strengths)
+    circles = ["--circle", "60,48,40", "--circle", "61,48,40"]
+    result = run("calibrate", "one", "two", *circles, "--gray-ball", "gray", "--json")
+    report = json.loads(result.out)
+    # A centre 1 pixel off turns the light by about 2 / 40, 2.9 degrees; the mean lies in the middle.
+    assert report["disagreement_deg"]["mean"] == pytest.approx(1.5, abs=0.2)
+    np.testing.assert_allclose(
+        np.array(report["light_intensities"])[:, 0], np.array(strengths) / 0.875, rtol=0.03
+    )
+    assert np.loadtxt("calibration/light_intensities.txt").shape == (4, 3)
+
+
+def test_the_normals_are_not_the_lights(run):
+    write_balls(Path("ball"))
+    half = LIGHTS + (0, 0, 1)
+    np.savetxt("mistake.txt", half / np.linalg.norm(half, axis=1, keepdims=True))
+    np.savetxt("right.txt", LIGHTS)
+    result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")
+    assert result.code == 0
+    assert "the compared file is 13." in result.err
+    assert (
+        "warning: The compared light file holds the ball's normals at the highlights, not the lights"
+        in result.err
+    )
+    result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "right.txt", "--overwrite")
+    assert "degrees off" in result.err
+    assert "warning" not in result.err
+
+
+def test_balls_that_disagree_and_an_unsure_outline(run):
+    write_balls(Path("one"))
+    write_balls(Path("two"), LIGHTS[::-1])
+    result = run("calibrate", "one", "two", "--circle", "60,48,40", "--circle", "60,48,40")
+    assert "warning: The balls disagree by up to" in result.err
+    mask = normals()[1].astype(np.uint8) * 255
+    mask[:48] = 0
+    cv2.imwrite("half.png", mask)
+    result = run("calibrate", "one", "--mask", "half.png", "-o", "half")
+    assert result.code == 0
+    assert "warning: one: the ball's outline is unsure (" in result.err
+
+
+def test_refusals(run, golden):
+    write_balls(Path("ball"))
+    write_balls(Path("short"), LIGHTS[:3])
+    write_balls(Path("flat"), wall=0.02)
+    write_balls(Path("dark"), LIGHTS[:1])
+    cv2.imwrite("dark/1.png", np.full(SIZE, 900, np.uint16))
+    write_balls(Path("cut"))
+    for path in Path("cut").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, 35:])
+    write_gray(Path("gray"), [1, 1, 0, 1])
+    Path("empty").mkdir()
+    Path("done").mkdir()
+    Path("done/calibration.png").touch()
+    messages = []
+    for code, arguments in (
+        (2, []),
+        (2, ["ball", "--circle", "60,48"]),
+        (2, ["ball", "--circle", "60,48,-3"]),
+        (2, ["ball", "short", "--circle", "60,48,40"]),
+        (2, ["ball", "--gray-ball", "gray", "--gray-card", "gray"]),
+        (3, ["missing"]),
+        (3, ["empty"]),
+        (3, ["flat"]),
+        (3, ["cut"]),
+        (3, ["dark", "--circle", "60,48,40"]),
+        (3, ["ball", "--circle", "600,480,40"]),
+        (3, ["ball", "short", "--circle", "60,48,40", "--circle", "60,48,40"]),
+        (3, ["ball", "--mask", "missing.png"]),
+        (3, ["ball", "--circle", "60,48,40", "--gray-ball", "gray"]),
+        (3, ["ball", "--circle", "60,48,40", "--gray-card", "short"]),
+        (3, ["ball", "--circle", "60,48,40", "--compare", "missing.txt"]),
+        (5, ["ball", "-o", "done"]),
+    ):
+        result = run("calibrate", *arguments)
+        assert (result.code, result.out) == (code, ""), (arguments, result.err)
+        messages.append(result.err.replace(f"{Path.cwd()}/", ""))
+    golden("calibrate_refusals.txt", "".join(messages))
+    assert not Path("calibration").exists()
