@@ -27,7 +27,7 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
     folder.mkdir()
     n, inside = normals()
     for number, light in enumerate(lights):
-        half = light + (0, 0, 1)
+        half = light + np.array((0, 0, 1))
         half /= np.linalg.norm(half)
         spot = np.exp(-((np.degrees(np.arccos((n @ half).clip(-1, 1))) / 2) ** 2))
         picture = np.where(inside, 0.02 + 0.9 * spot, wall)
@@ -95,7 +95,7 @@ def test_two_balls_and_strengths(run):
 
 def test_the_normals_are_not_the_lights(run):
     write_balls(Path("ball"))
-    half = LIGHTS + (0, 0, 1)
+    half = LIGHTS + np.array((0, 0, 1))
     np.savetxt("mistake.txt", half / np.linalg.norm(half, axis=1, keepdims=True))
     np.savetxt("right.txt", LIGHTS)
     result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")

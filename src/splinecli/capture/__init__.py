@@ -1,7 +1,7 @@
 """Captures: photographs of one object under known lights, read from folders of files."""
 
 from splinecli.capture.capture_files import CaptureFiles
-from splinecli.capture.ground_truth import read_normals
+from splinecli.capture.ground_truth import read_normal_map, read_normals
 from splinecli.capture.images import read_image, read_mask
 from splinecli.capture.layout import capture_name, find_capture_files, find_captures
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
@@ -21,5 +21,6 @@ __all__ = [
     "read_light_directions",
     "read_light_intensities",
     "read_mask",
+    "read_normal_map",
     "read_normals",
 ]

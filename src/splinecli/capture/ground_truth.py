@@ -36,6 +36,31 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
     return read_ground_truth(path, shape, mask)[0]
 
 
+def read_normal_map(path: StrPath) -> NDArray[np.float32]:
+    """A normal map (H, W, 3) of any size, in one of the forms of read_ground_truth but text.
+
+    Raises:
+        InputError: the file cannot be read, or holds no normal map.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    mode = find_mode(path)
+    if mode is None or not stat.S_ISREG(mode):
+        raise InputError("the normal map does not exist or is no file", path=path)
+    if suffix == ".mat":
+        stored = _read_mat(path)
+    elif suffix == ".npy":
+        stored = _read_npy(path)
+    else:
+        stored = decode_image(path)
+    if stored.ndim != 3 or stored.shape[2] != 3:
+        raise InputError(
+            f"found an array of {_times(stored.shape)}, expected a normal map, H x W x 3", path=path
+        )
+    shape = (stored.shape[0], stored.shape[1])
+    return read_ground_truth(path, shape, np.ones(shape, np.bool_))[0]
+
+
 def read_ground_truth(
     path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], bool]:

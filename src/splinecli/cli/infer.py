@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +18,7 @@ from splinecli.cli.options import (
     Device,
     DeviceOption,
     JsonOption,
+    NormalConvention,
     Precision,
     PrecisionOption,
     QuietOption,
@@ -34,13 +34,6 @@ from splinecli.errors import InputError, UsageError
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
     from splinecli.methods import Estimator, MethodOptions
-
-
-class NormalConvention(StrEnum):
-    """Which way green points in the picture."""
-
-    opengl = "opengl"
-    directx = "directx"
 
 
 def infer(

@@ -46,6 +46,7 @@ EXAMPLES = (
     ("splinecli infer catPNG --n-lights 10 --seed 0 --json", "From ten lights, the report on stdout."),
     ("splinecli infer captures/* -o results --overwrite", "A folder of captures."),
     ("splinecli calibrate chrome/ -o lights", "Light directions from photographs of a mirror ball."),
+    ("splinecli integrate results/cat", "Depth and mesh of a normal map that infer wrote."),
     (
         "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
         "Methods compared.",

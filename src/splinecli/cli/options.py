@@ -18,6 +18,13 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
+class NormalConvention(StrEnum):
+    """Which way green points in the picture."""
+
+    opengl = "opengl"
+    directx = "directx"
+
+
 class Precision(StrEnum):
     """What to compute in."""
 

@@ -1,0 +1,119 @@
+"""`splinecli integrate`: a normal map in its forms, the files, and the refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from splinecli.normals import encode_picture
+
+SHAPE = (40, 50)
+
+
+def sphere():
+    """Normals and heights of a cap of radius 30 about (24.5, 19.5), and where it is."""
+    y, x = np.indices(SHAPE).astype(float)
+    nx, ny = (x - 24.5) / 30, (19.5 - y) / 30
+    inside = np.hypot(nx, ny) < 0.6
+    nz = np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 1))
+    normals = np.where(inside[..., None], np.stack((nx, ny, nz), axis=-1), 0)
+    heights = np.where(inside, 30 * nz, np.nan)
+    return normals.astype(np.float32), heights - np.nanmean(heights), inside
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    normals, _, inside = sphere()
+    np.save("normals.npy", normals)
+    cv2.imwrite("normals.png", encode_picture(normals, inside)[..., ::-1])
+    cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
+
+
+def test_heights_and_mesh_of_a_sphere(run):
+    result = run("integrate", "normals.npy", "-o", "out", "--format", "ply,obj,npy,tiff")
+    assert (result.code, result.err) == (0, "")
+    _, heights, inside = sphere()
+    depth = np.load("out/depth.npy")
+    assert (depth.dtype, depth.shape) == (np.float32, SHAPE)
+    assert np.array_equal(np.isfinite(depth), inside)
+    assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
+    np.testing.assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
+    report = json.loads(Path("out/surface.json").read_text())
+    assert report["n_pixels"] == inside.sum()
+    assert report["files"] == ["mesh.ply", "mesh.obj", "depth.npy", "depth.tiff", "surface.json"]
+    assert sorted(path.name for path in Path("out").iterdir()) == sorted(report["files"])
+    assert f"out: {inside.sum()} pixels, from " in result.out
+
+
+@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"], ["."]])
+def test_forms_of_normal_maps(run, arguments):
+    assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
+    _, heights, inside = sphere()
+    assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
+
+
+def test_results_of_infer_stay_together(run, capture):
+    assert run("infer", str(capture), "--method", "ls", "-o", "results").code == 0
+    folder = Path("results") / capture.name
+    assert run("integrate", str(folder), "-q").code == 0
+    assert {"normals.npy", "depth.npy", "mesh.ply", "surface.json"} <= {
+        path.name for path in folder.iterdir()
+    }
+
+
+def test_a_part_in_colour_by_perspective(run):
+    trimesh = pytest.importorskip("trimesh")
+    half = np.zeros(SHAPE, np.uint8)
+    half[:, :25] = 255
+    cv2.imwrite("half.png", half)
+    picture = np.zeros((*SHAPE, 3), np.uint8)
+    picture[..., 2] = 200  # red, in OpenCV's order
+    cv2.imwrite("red.png", picture)
+    Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n0 0 1\n")
+    options = ["--mask", "half.png", "--colours", "red.png", "--camera-matrix", "camera.txt"]
+    report = json.loads(run("integrate", "normals.npy", *options, "-o", "out", "--json").out)
+    assert report["camera"] == "perspective"
+    depth = np.load("out/depth.npy")
+    assert np.isnan(depth[:, 25:]).all()
+    assert np.nanmin(depth) > 0
+    mesh = trimesh.load("out/mesh.ply", process=False)
+    assert (mesh.visual.vertex_colors[:, :3] == (200, 0, 0)).all()
+    assert (mesh.vertices[:, 2] < 0).all()  # before the camera, which looks along -z
+
+
+def test_refusals(run, golden):
+    np.save("flat.npy", np.ones(SHAPE))
+    cv2.imwrite("small.png", np.full((10, 10), 255, np.uint8))
+    corner = np.zeros(SHAPE, np.uint8)
+    corner[0, 0] = 255
+    cv2.imwrite("corner.png", corner)
+    Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n")
+    Path("mirrored.txt").write_text("-200 0 24.5\n0 200 19.5\n0 0 1\n")
+    Path("done").mkdir()
+    Path("done/mesh.ply").touch()
+    messages = []
+    for code, arguments in (
+        (2, []),
+        (2, ["normals.npy", "--format", "stl"]),
+        (2, ["normals.npy", "--stiffness", -1]),
+        (3, ["missing.npy"]),
+        (3, ["done"]),
+        (3, ["flat.npy"]),
+        (3, ["normals.npy", "--mask", "small.png"]),
+        (3, ["normals.npy", "--mask", "corner.png"]),
+        (3, ["normals.npy", "--colours", "small.png"]),
+        (3, ["normals.npy", "--camera-matrix", "camera.txt"]),
+        (3, ["normals.npy", "--camera-matrix", "mirrored.txt"]),
+        (5, ["normals.npy", "-o", "done"]),
+    ):
+        result = run("integrate", *arguments, *(["-o", "out"] if "-o" not in arguments else []))
+        assert (result.code, result.out) == (code, ""), (arguments, result.err)
+        messages.append(result.err.replace(f"{Path.cwd()}/", ""))
+    golden("integrate_refusals.txt", "".join(messages))
+    assert not Path("out").exists()

@@ -1,0 +1,383 @@
+"""Integration of normals, against analytic surfaces and a dense solver."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.normals import unit
+from splinecli.surface.integration import integrate_normals
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+CAMERA = np.array([[210.0, 0.0, 63.0], [0.0, 200.0, 41.0], [0.0, 0.0, 1.0]])
+TIGHT = {"tolerance": 1e-9, "max_iterations": 400}
+
+
+def grid(height: int, width: int) -> tuple[Floats, Floats]:
+    """x (columns) and y, up, of the pixels (H, W), about the centre."""
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    return columns - (width - 1) / 2, (height - 1) / 2 - rows
+
+
+def normals_of_slopes(along_x: Floats, along_y: Floats) -> Floats:
+    return unit(np.stack((-along_x, -along_y, np.ones_like(along_x)), axis=-1))
+
+
+def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats, Mask, Floats]:
+    """Normals, mask and heights of the cap within `reach` of the radius, not centred on a pixel."""
+    x, y = grid(height, width)
+    x, y = x + 0.3, y - 0.2
+    mask = x**2 + y**2 < (reach * radius) ** 2
+    z = np.sqrt(np.where(mask, radius**2 - x**2 - y**2, 1))
+    return np.stack((x, y, z), axis=-1) / radius * mask[..., None], mask, z
+
+
+def bumps(height: int, width: int, seed: int = 0) -> Floats:
+    """Normals that no surface has: smooth ones with noise, some nearly grazing and some facing away."""
+    rng = np.random.default_rng(seed)
+    x, y = grid(height, width)
+    normals = normals_of_slopes(np.sin(x / 3) + y / height, np.cos(y / 2))
+    normals = unit(normals + rng.normal(scale=0.2, size=normals.shape))
+    normals[rng.uniform(size=(height, width)) < 0.03] = unit(np.array([0.6, 0.2, -0.3]))
+    return normals
+
+
+def holes(height: int, width: int, seed: int = 1) -> Mask:
+    """A ragged mask of several parts, with strips one pixel wide and pixels on their own."""
+    mask: Mask = np.random.default_rng(seed).uniform(size=(height, width)) < 0.7
+    mask[:, width // 2] = False
+    mask[1, :] = True
+    mask[2, :] = mask[4, :] = False
+    mask[3, :] = np.arange(width) % 2 == 0
+    return mask
+
+
+def error_share(found: Floats, truth: Floats, mask: Mask) -> float:
+    """The mean error, offset apart, as a share of the range of the truth."""
+    error = (found - truth)[mask]
+    return float(np.abs(error - np.median(error)).mean() / np.ptp(truth[mask]))
+
+
+@pytest.mark.parametrize("stiffness", [0, 2])
+@pytest.mark.parametrize(("reach", "limit"), [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
+def test_sphere(reach: float, limit: float, stiffness: float) -> None:
+    # Up to the rim, where normals are grazing, the last pixel is off by more.
+    normals, mask, truth = sphere(130, 150, 60, reach)
+    found = integrate_normals(normals, mask, stiffness=stiffness)
+    assert error_share(found, truth, mask) < limit
+    assert np.isnan(found[~mask]).all()
+    assert found[mask].mean() == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("slope", [0.3, 1.0, 3.0, 10.0])
+def test_tent(slope: float) -> None:
+    x, _ = grid(60, 90)
+    found = integrate_normals(normals_of_slopes(-slope * np.sign(x), 0 * x), np.ones(x.shape, bool))
+    # The ridge lies between two pixels, whose equations are off by the same in both directions.
+    assert error_share(found, -slope * np.abs(x), np.ones(x.shape, bool)) < 1e-6
+
+
+def test_tent_of_unequal_sides() -> None:
+    # The pixels at the ridge disagree on the gap between them, truly (0.8 - 0.3) / 2: one gap of 90.
+    x, _ = grid(60, 90)
+    slope = np.where(x < 0, 0.3, -0.8)
+    mask = np.ones(x.shape, bool)
+    found = integrate_normals(normals_of_slopes(slope, 0 * x), mask)
+    assert error_share(found, slope * x, mask) < 1e-3
+
+
+def levels(rows: int, columns: int, height: float, slope: float, joined: int) -> tuple[Floats, Floats, Mask]:
+    """Normals and heights of two flat levels; in the first `joined` rows a ramp leads from one up to the other. The
+    rest of the border is a wall one pixel thick, true in the mask, that faces the lower level and nearly all aside.
+    """
+    x, _ = grid(rows, columns)
+    x = np.ceil(x)
+    ramp = np.arange(rows)[:, None] < joined
+    truth = np.where(ramp, np.clip(slope * x + height, 0, height), height * (x >= 0))
+    normals = normals_of_slopes(np.where(ramp & (truth > 0) & (truth < height), slope, 0.0), 0 * x)
+    wall = ~ramp & (x == 0)
+    normals[wall] = unit(np.array([-1, 0, 0.01]))
+    side = (np.arange(rows)[:, None] == joined) & (x < 0) & (slope * x > -height)
+    normals[side] = unit(np.array([0, -1, 0.01]))
+    return normals, truth, wall | side
+
+
+@pytest.mark.parametrize("joined", [30, 70])
+def test_levels_apart(joined: int) -> None:
+    normals, truth, wall = levels(100, 120, 30, 2, joined)
+    everywhere = np.ones(wall.shape, bool)
+    least_squares = integrate_normals(normals, everywhere, stiffness=0)
+    torn = integrate_normals(normals, everywhere)
+    assert error_share(least_squares, truth, ~wall) > 0.1
+    assert error_share(torn, truth, ~wall) < 5e-3
+    # The wall itself may have any height.
+    assert np.isfinite(torn).all()
+
+
+@pytest.mark.parametrize("slopes", [(0.5, -0.25), (-3.0, 1.0), (0.0, 0.0), (12.0, 8.0)])
+@pytest.mark.parametrize("shape", [(30, 50), (50, 30), (1, 40), (40, 1), (2, 2)])
+def test_plane_is_exact(shape: tuple[int, int], slopes: tuple[float, float]) -> None:
+    x, y = grid(*shape)
+    mask = np.ones(shape, bool)
+    normals = normals_of_slopes(slopes[0] + 0 * x, slopes[1] + 0 * x)
+    found = integrate_normals(normals.astype(np.float32), mask)
+    # As float32 slopes of s have errors of s^2 * 1e-7, over 90 pixels.
+    np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=3e-3, rtol=0)
+    found = integrate_normals(normals, mask)
+    np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=1e-4, rtol=0)
+
+
+def seen(camera: Floats, height: int, width: int) -> Floats:
+    """Points (H, W, 3) at depth 1 in the frame that the pixels show: by hand, for a camera without skew."""
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    x, down = (columns - camera[0, 2]) / camera[0, 0], (rows - camera[1, 2]) / camera[1, 1]
+    return np.stack((x, -down, -np.ones_like(x)), axis=-1)
+
+
+def geometric_mean_1(depth: Floats) -> Floats:
+    return np.asarray(depth / np.exp(np.log(depth).mean()))
+
+
+def test_perspective_plane() -> None:
+    rays = seen(CAMERA, 90, 120)
+    normal = unit(np.array([0.3, -0.4, 0.8]))
+    depth = geometric_mean_1(-1 / (rays @ normal))
+    found = integrate_normals(
+        np.broadcast_to(normal, rays.shape), np.ones((90, 120), bool), camera_matrix=CAMERA
+    )
+    # A step of log(depth) is not quite linear in its slope.
+    assert error_share(found, depth, np.ones((90, 120), bool)) < 5e-4
+    np.testing.assert_allclose(found, depth, rtol=1e-3)
+
+
+def test_perspective_sphere() -> None:
+    rays = seen(CAMERA, 90, 120)
+    centre, radius = np.array([0.1, -0.05, -6.0]), 1.1
+    # |t r - c| = R, the nearer of the two.
+    along, square = rays @ centre, (rays**2).sum(axis=-1)
+    discriminant = along**2 - square * (centre @ centre - radius**2)
+    mask = discriminant > 0
+    depth = (along - np.sqrt(np.where(mask, discriminant, 0))) / square
+    normals = np.where(mask[..., None], (depth[..., None] * rays - centre) / radius, 0)
+    found = integrate_normals(normals, mask, camera_matrix=CAMERA)
+    scale = np.exp(np.log(depth[mask]).mean())
+    assert (found[mask] > 0).all()
+    assert np.exp(np.log(found[mask]).mean()) == pytest.approx(1, rel=1e-9)
+    assert error_share(found * scale, depth, mask) < 5e-3
+
+
+def test_a_camera_far_away_is_orthographic() -> None:
+    normals, mask, truth = sphere(60, 80, 40, 0.8)
+    focal = 1e6
+    camera = np.array([[focal, 0, 39.5], [0, focal, 29.5], [0, 0, 1]])
+    # So far away that one pixel of width is one of depth, in units of depth / focal.
+    found = -focal * np.log(integrate_normals(normals, mask, camera_matrix=camera))
+    assert error_share(found, truth, mask) < 5e-4
+
+
+def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
+    """facing * (h' - h) + slant to the right, left, bottom and top: matrices (P, P) and constants (P,), zero for what
+    is not there. Normals at 87 degrees and more say nothing.
+    """
+    number = {(int(r), int(c)): i for i, (r, c) in enumerate(np.argwhere(mask))}
+    matrices, constants = [], []
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        matrix, constant = np.zeros((len(number), len(number))), np.zeros(len(number))
+        for (r, c), i in number.items():
+            j = number.get((r + down, c + right))
+            nx, ny, nz = normals[r, c]
+            if j is not None and nz > 0.05:
+                matrix[i, j] += nz
+                matrix[i, i] -= nz
+                constant[i] = right * nx - down * ny
+        matrices.append(matrix)
+        constants.append(constant)
+    return matrices, constants
+
+
+def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Floats:
+    """The same by the pseudo-inverse, whose heights have mean 0 in every part."""
+    matrices, constants = equations(normals, mask)
+    heights = np.zeros(np.count_nonzero(mask))
+    for iteration in range(iterations):
+        weights = []
+        for forth, back in ((0, 1), (1, 0), (2, 3), (3, 2)):
+            gaps = (matrices[back] @ heights) ** 2 - (matrices[forth] @ heights) ** 2
+            weights.append(1 / (1 + np.exp(-stiffness * (iteration > 0) * gaps)))
+        root = np.sqrt(np.concatenate(weights))
+        heights = np.linalg.lstsq(
+            root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants)
+        )[0]
+    return heights
+
+
+def test_least_squares_is_the_dense_solution() -> None:
+    normals, mask = bumps(14, 19), holes(14, 19)
+    normals[normals[..., 2] < 0.1] = (0, 0, 1)
+    found = integrate_normals(normals, mask, stiffness=0)[mask]
+    np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
+
+
+def test_bilateral_is_the_dense_solution() -> None:
+    normals, mask = bumps(12, 17), holes(12, 17)
+    normals[normals[..., 2] < 0.1] = (0, 0, 1)
+    found = integrate_normals(normals, mask, **TIGHT)[mask]
+    least_squares = dense(normals, mask, 0, 1)
+    expected = dense(normals, mask, 2, 200)
+    assert np.abs(expected - least_squares).max() > 0.5
+    np.testing.assert_allclose(found, expected, atol=5e-3)
+
+
+def test_parts_are_independent() -> None:
+    normals, mask = bumps(20, 31, 2), np.ones((20, 31), bool)
+    mask[:, 15] = False
+    left, right = mask.copy(), mask.copy()
+    left[:, 16:], right[:, :15] = False, False
+    together = integrate_normals(normals, mask, **TIGHT)
+    apart = integrate_normals(normals, left, **TIGHT), integrate_normals(normals, right, **TIGHT)
+    np.testing.assert_allclose(together[left], apart[0][left], atol=5e-3)
+    np.testing.assert_allclose(together[right], apart[1][right], atol=5e-3)
+    assert together[left].mean() == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_single_pixels_and_normals_that_tell_nothing(camera: Floats | None) -> None:
+    normals, mask = bumps(12, 17), holes(12, 17)
+    middle = 0.0 if camera is None else 1.0
+    for some in (
+        normals,
+        np.broadcast_to((1.0, 0, 0), normals.shape),
+        np.broadcast_to((0, 0.6, -0.8), normals.shape),
+    ):
+        found = integrate_normals(some, mask, camera_matrix=camera)
+        assert np.isfinite(found[mask]).all()
+        assert found[3, 4] == pytest.approx(middle, abs=1e-9)
+    np.testing.assert_allclose(found[mask], middle, atol=1e-9)
+
+
+def test_backward_normals_are_bridged() -> None:
+    normals, mask, truth = sphere(60, 80, 40, 0.8)
+    wrong = np.random.default_rng(3).uniform(size=mask.shape) < 0.05
+    normals[wrong & mask] = unit(np.array([0.7, 0.1, -0.7]))
+    found = integrate_normals(normals, mask)
+    assert error_share(found, truth, mask) < 5e-3
+
+
+def turned(array: Any, quarters: int) -> Any:
+    return np.ascontiguousarray(np.rot90(array, quarters))
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
+    normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
+    x, y, z = np.moveaxis(normals, -1, 0)
+    for _ in range(quarters):
+        x, y = -y, x
+    turn = turned(np.stack((x, y, z), axis=-1), 0)
+    found = integrate_normals(normals, mask, **TIGHT)
+    again = integrate_normals(turned(turn, quarters), turned(mask, quarters), **TIGHT)
+    np.testing.assert_allclose(again, turned(found, quarters), atol=5e-3)
+
+
+def test_mirror() -> None:
+    normals, mask = bumps(18, 25, 6), holes(18, 25, 7)
+    found = integrate_normals(normals, mask, **TIGHT)
+    mirrored = integrate_normals(normals[:, ::-1] * (-1, 1, 1), mask[:, ::-1], **TIGHT)
+    np.testing.assert_allclose(mirrored, found[:, ::-1], atol=5e-3)
+
+
+def test_inputs_stay_and_progress_is_told() -> None:
+    normals, mask, _ = sphere(40, 50, 30, 0.9)
+    kept, told = normals.copy(), []
+    integrate_normals(normals, mask, max_iterations=2, progress=lambda done, most: told.append((done, most)))
+    np.testing.assert_array_equal(normals, kept)
+    assert told == [(1, 2), (2, 2)]
+
+
+def test_normals_of_nearly_unit_length_are_taken() -> None:
+    normals, mask, _ = sphere(40, 50, 30, 0.9)
+    np.testing.assert_allclose(
+        integrate_normals(normals * 1.009, mask), integrate_normals(normals, mask), atol=1e-9
+    )
+
+
+NORMALS = np.tile((0.0, 0.0, 1.0), (3, 4, 1))
+MASK = np.ones((3, 4), bool)
+ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, None] == 2))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "message"),
+    [
+        (
+            (NORMALS[..., :2], MASK),
+            {},
+            UsageError,
+            "the normal map has shape (3, 4, 2), expected (3, 4, 3) as the mask.",
+        ),
+        (
+            (NORMALS, MASK.T),
+            {},
+            UsageError,
+            "the normal map has shape (3, 4, 3), expected (4, 3, 3) as the mask.",
+        ),
+        ((NORMALS, MASK.astype(np.uint8)), {}, UsageError, "the mask is uint8 (3, 4), expected bool (H, W)."),
+        ((NORMALS, ~MASK), {}, InputError, "the mask is empty. Mark the pixels of the object in it."),
+        (
+            (ZERO_AT_1_2, MASK),
+            {},
+            InputError,
+            "1 of 12 normals in the mask are not unit vectors, the first in row 1, column 2. Take pixels without a "
+            "normal out of the mask.",
+        ),
+        (
+            (NORMALS * np.nan, MASK),
+            {},
+            InputError,
+            "12 of 12 normals in the mask are not unit vectors, the first in row 0, column 0. Take pixels without a "
+            "normal out of the mask.",
+        ),
+        (
+            (NORMALS, MASK),
+            {"camera_matrix": np.eye(4)},
+            UsageError,
+            "the camera matrix has shape (4, 4), expected (3, 3).",
+        ),
+        (
+            (NORMALS, MASK),
+            {"camera_matrix": np.diag([9.0, 0, 1])},
+            InputError,
+            "[[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]] is no camera matrix [[fx, s, cx], [0, fy, cy], "
+            "[0, 0, 1]] with fx and fy above zero. Give it in pixels, columns to the right and rows down.",
+        ),
+        ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected a number from 0 up."),
+        ((NORMALS, MASK), {"max_iterations": 0}, UsageError, "max_iterations is 0, expected at least 1."),
+        (
+            (NORMALS, MASK),
+            {"tolerance": np.nan},
+            UsageError,
+            "the tolerance is nan, expected a number from 0 up.",
+        ),
+    ],
+)
+def test_bad_input(
+    arguments: tuple[Any, Any], options: dict[str, Any], error: type[SplinecliError], message: str
+) -> None:
+    with pytest.raises(error) as caught:
+        integrate_normals(*arguments, **options)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [CAMERA * np.nan, CAMERA * (1, -1, 1), CAMERA.T, CAMERA * 2, np.ones((3, 3))],
+    ids=["nan", "upwards", "transposed", "doubled", "ones"],
+)
+def test_no_camera_matrix(matrix: Floats) -> None:
+    with pytest.raises(InputError, match="is no camera matrix"):
+        integrate_normals(NORMALS, MASK, camera_matrix=matrix)

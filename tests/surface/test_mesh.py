@@ -1,0 +1,215 @@
+"""Meshes of height maps, and their files as trimesh reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
+from splinecli.surface.mesh import SurfaceMesh, surface_mesh, write_mesh
+
+CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
+
+
+def wave(height: int = 15, width: int = 20) -> NDArray[np.float64]:
+    rows, columns = np.mgrid[:height, :width]
+    return np.asarray(3 * np.sin(columns / 4) + rows / 5)
+
+
+def colourful(height: int = 15, width: int = 20) -> NDArray[np.uint8]:
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+
+
+def ragged(height: int = 15, width: int = 20) -> NDArray[np.bool_]:
+    mask: NDArray[np.bool_] = np.random.default_rng(1).uniform(size=(height, width)) < 0.8
+    return mask
+
+
+def face_normals(mesh: SurfaceMesh) -> NDArray[np.float64]:
+    """Twice the area long (T, 3)."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def test_four_pixels() -> None:
+    depth = np.array([[5.0, 0.0], [1.0, 4.0]])
+    mesh = surface_mesh(depth, np.ones((2, 2), bool))
+    np.testing.assert_array_equal(
+        mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]]
+    )
+    # The edge between pixels 0 and 3, which are nearly as high.
+    assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {
+        frozenset({0, 2, 3}),
+        frozenset({0, 3, 1}),
+    }
+    assert (mesh.vertices.dtype, mesh.triangles.dtype, mesh.colours) == (np.float32, np.int32, None)
+
+
+def test_the_other_diagonal() -> None:
+    mesh = surface_mesh(np.array([[0.0, 5.0], [5.0, 1.0]]), np.ones((2, 2), bool))
+    assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {
+        frozenset({0, 1, 2}),
+        frozenset({1, 2, 3}),
+    }
+
+
+@pytest.mark.parametrize("mask", [np.ones((15, 20), bool), ragged()], ids=["full", "ragged"])
+def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) -> None:
+    mesh = surface_mesh(wave(), mask)
+    assert len(mesh.vertices) == np.count_nonzero(mask)
+    # Seen along z, half a pixel each, counter-clockwise.
+    np.testing.assert_allclose(face_normals(mesh)[:, 2], 1)
+    corners = mask[1:, 1:] * 1 + mask[:-1, 1:] + mask[1:, :-1] + mask[:-1, :-1]
+    assert len(mesh.triangles) == 2 * np.count_nonzero(corners == 4) + np.count_nonzero(corners == 3)
+    assert len({frozenset(triangle) for triangle in mesh.triangles.tolist()}) == len(mesh.triangles)
+
+
+def test_slopes_are_those_of_the_heights() -> None:
+    rows, columns = np.mgrid[:8, :11]
+    normals = face_normals(surface_mesh(0.5 * columns - 2.0 * rows, np.ones((8, 11), bool)))
+    # z = x / 2 + 2 y, y up.
+    np.testing.assert_allclose(
+        normals / normals[:, 2:], np.broadcast_to((-0.5, -2, 1), normals.shape), atol=1e-5
+    )
+
+
+def test_perspective_vertices_project_into_their_pixels() -> None:
+    depth, mask = 50 + wave(), ragged()
+    mesh = surface_mesh(depth, mask, CAMERA)
+    # OpenCV's frame: y down, z forward.
+    image = mesh.vertices * (1, -1, -1) @ CAMERA.T
+    rows, columns = np.nonzero(mask)
+    np.testing.assert_allclose(image[:, 0] / image[:, 2], columns, atol=1e-4)
+    np.testing.assert_allclose(image[:, 1] / image[:, 2], rows, atol=1e-4)
+    np.testing.assert_allclose(image[:, 2], depth[mask], rtol=1e-6)
+    towards_camera = -mesh.vertices[mesh.triangles].mean(axis=1)
+    assert ((face_normals(mesh) * towards_camera).sum(axis=1) > 0).all()
+
+
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
+    height = np.repeat([0.0, 10.0], [4, 5])[None] + np.zeros((6, 1))
+    # A step of 10 pixels at a focal length of sqrt(100 * 110).
+    depth = height if camera is None else 7 * np.exp(-height / np.sqrt(11_000))
+    mask = np.ones(depth.shape, bool)
+    whole = surface_mesh(depth, mask, camera)
+    assert len(surface_mesh(depth, mask, camera, largest_step=10.01).triangles) == len(whole.triangles) == 80
+    cut = surface_mesh(depth, mask, camera, largest_step=9.99)
+    assert len(cut.triangles) == 70
+    assert (np.ptp(cut.vertices[cut.triangles, 2], axis=1) < 1e-5).all()
+
+
+@pytest.mark.parametrize("mask", [np.eye(4, dtype=bool), np.ones((1, 5), bool)], ids=["apart", "row"])
+def test_pixels_without_triangles(mask: NDArray[np.bool_], tmp_path: Path) -> None:
+    mesh = surface_mesh(np.zeros(mask.shape), mask)
+    assert mesh.triangles.shape == (0, 3)
+    for name in ("mesh.ply", "mesh.obj"):
+        write_mesh(mesh, tmp_path / name)
+    assert (tmp_path / "mesh.obj").read_text("utf-8").count("v ") == len(mesh.vertices)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize("name", ["mesh.ply", "MESH.OBJ"])
+def test_files_are_read_back(name: str, coloured: bool, tmp_path: Path) -> None:
+    colours = colourful() if coloured else None
+    mesh = surface_mesh(wave(), np.ones((15, 20), bool), colours=colours)
+    write_mesh(mesh, tmp_path / name)
+    read: Any = trimesh.load_mesh(tmp_path / name, process=False, maintain_order=True)
+    np.testing.assert_allclose(read.vertices, mesh.vertices, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.triangles)
+    assert read.visual.kind == ("vertex" if coloured else None)
+    if colours is not None:
+        np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], colours.reshape(-1, 3))
+
+
+def test_obj_as_text(tmp_path: Path) -> None:
+    mesh = SurfaceMesh(
+        np.array([[0, 0, 0], [1.5, 0, -2], [0, 1, 0.25]], np.float32),
+        np.array([[0, 1, 2]], np.int32),
+        np.array([[255, 0, 0], [0, 51, 0], [0, 0, 1]], np.uint8),
+    )
+    write_mesh(mesh, tmp_path / "mesh.obj")
+    assert (tmp_path / "mesh.obj").read_text("utf-8") == (
+        "v 0 0 0 1 0 0\nv 1.5 0 -2 0 0.2 0\nv 0 1 0.25 0 0 0.003922\nf 1 2 3\n"
+    )
+
+
+def test_unknown_kind_of_file(tmp_path: Path) -> None:
+    mesh = surface_mesh(wave(), ragged())
+    with pytest.raises(UsageError) as caught:
+        write_mesh(mesh, tmp_path / "mesh.stl")
+    expected = f"{tmp_path / 'mesh.stl'}: no kind of mesh. Give it a name that ends in .ply or .obj."
+    assert str(caught.value) == expected
+    assert not list(tmp_path.iterdir())
+
+
+def test_place_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError):
+        write_mesh(surface_mesh(wave(), ragged()), tmp_path / "file" / "mesh.ply")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "message"),
+    [
+        (
+            (wave(3, 4), np.ones((4, 3), bool)),
+            {},
+            UsageError,
+            "the depth has shape (3, 4), expected (4, 3) as the mask.",
+        ),
+        (
+            (wave(3, 4), np.ones((3, 4))),
+            {},
+            UsageError,
+            "the mask is float64 (3, 4), expected bool (H, W).",
+        ),
+        (
+            (wave(3, 4), np.zeros((3, 4), bool)),
+            {},
+            InputError,
+            "the mask is empty. Mark the pixels of the object in it.",
+        ),
+        (
+            (wave(3, 4) * np.nan, np.ones((3, 4), bool)),
+            {},
+            InputError,
+            "a depth in the mask is not finite. Give the mask that the depth was found in.",
+        ),
+        (
+            (wave(3, 4) - 9, np.ones((3, 4), bool), CAMERA),
+            {},
+            InputError,
+            "a depth in the mask is not positive. With a camera matrix depths are needed.",
+        ),
+        (
+            (wave(3, 4), np.ones((3, 4), bool), None, np.zeros((3, 4, 3))),
+            {},
+            UsageError,
+            "the colours are float64 (3, 4, 3), expected uint8 (3, 4, 3).",
+        ),
+        (
+            (wave(3, 4), np.ones((3, 4), bool)),
+            {"largest_step": -1},
+            UsageError,
+            "the largest step is -1, expected a number from 0 up.",
+        ),
+        (
+            (wave(3, 4) + 9, np.ones((3, 4), bool), np.eye(2)),
+            {},
+            UsageError,
+            "the camera matrix has shape (2, 2), expected (3, 3).",
+        ),
+    ],
+)
+def test_bad_input(
+    arguments: tuple[Any, ...], options: dict[str, Any], error: type[SplinecliError], message: str
+) -> None:
+    with pytest.raises(error) as caught:
+        surface_mesh(*arguments, **options)
+    assert str(caught.value) == message
