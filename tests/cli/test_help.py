@@ -13,7 +13,7 @@ from splinecli.cli.man import man_page
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-COMMANDS = ["infer", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]
+COMMANDS = ["infer", "info", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])

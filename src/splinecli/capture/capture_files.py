@@ -38,6 +38,7 @@ class CaptureFiles:
     """The files of one capture; the images in the order of the lights.
 
     Args:
+        layout: what arrangement of files it is, for people.
         name: what the capture is called, in most layouts like its folder.
         folder: the folder that holds the files beside the images.
         images: one file a light.
@@ -48,6 +49,7 @@ class CaptureFiles:
         ground_truth: a normal map, or None.
     """
 
+    layout: str
     name: str
     folder: Path
     images: tuple[Path, ...]

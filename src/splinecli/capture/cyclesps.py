@@ -59,6 +59,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
             hint="Pass --lights FILE, with one line x y z for each image",
         )
     return CaptureFiles(
+        layout="CyclesPS",
         name=_name(images_folder),
         folder=holder,
         images=_list_numbered(images_folder, len(read_light_directions(lights)), lights),

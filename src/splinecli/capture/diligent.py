@@ -27,6 +27,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     if filenames is None or lights is None:
         return None
     return CaptureFiles(
+        layout="DiLiGenT",
         name=folder_name(folder),
         folder=folder,
         images=read_image_list(filenames),

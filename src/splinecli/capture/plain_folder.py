@@ -41,6 +41,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
             hint="Pass --lights FILE, with one line x y z for each image",
         )
     return CaptureFiles(
+        layout="plain folder",
         name=folder_name(folder),
         folder=folder,
         images=images,

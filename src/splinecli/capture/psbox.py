@@ -29,6 +29,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
         return None
     check_not_empty(images, folder / _OBJECTS)
     return CaptureFiles(
+        layout="PSBox",
         name=folder_name(folder),
         folder=folder,
         images=images,

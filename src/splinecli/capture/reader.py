@@ -71,7 +71,7 @@ class CaptureSource:
         )
         first_path = self.files.images[indices[0]]
         first = decode_image(first_path)
-        mask = self._read_mask(first.shape[:2], first_path)
+        mask = self.read_mask(first.shape[:2])
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
             ground_truth, upside_down = read_ground_truth(
@@ -112,7 +112,9 @@ class CaptureSource:
             ),
         )
 
-    def _read_mask(self, shape: tuple[int, ...], image: Path) -> NDArray[np.bool_]:
+    def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """The mask of images of this shape, (H, W); all of it where the capture has none. Raises InputError."""
+        image = self.files.images[0]
         if self.files.boundaries:
             return self._read_boundaries(shape, image)
         if self.files.mask is None:

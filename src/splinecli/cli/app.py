@@ -11,6 +11,7 @@ from splinecli.cli.calibrate import calibrate
 from splinecli.cli.evaluate import evaluate
 from splinecli.cli.import_weights import import_weights
 from splinecli.cli.infer import infer
+from splinecli.cli.info import info
 from splinecli.cli.integrate import integrate
 from splinecli.cli.prepare import prepare
 from splinecli.cli.train import train
@@ -43,6 +44,7 @@ def _splinecli(
 
 
 app.command()(infer)
+app.command()(info)
 app.command()(calibrate)
 app.command()(integrate)
 app.command()(evaluate)

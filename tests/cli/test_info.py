@@ -1,0 +1,70 @@
+"""`splinecli info`: what it says of a capture whose content is known, and that it writes nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+
+def files_below(folder: Path) -> list[str]:
+    return sorted(str(path) for path in folder.rglob("*"))
+
+
+def test_what_is_said_of_a_capture(run, capture):
+    before = files_below(capture.parent)
+    result = run("info", str(capture))
+    assert files_below(capture.parent) == before
+    assert result.code == 0
+    rows = {line[:13].strip(): line[13:] for line in result.out.splitlines()}
+    assert rows["capture"] == f"{capture.name} (plain folder)"
+    assert rows["images"] == "8: 24 x 24, gray, 16 bits"
+    # (+-0.4, +-0.4, 1) are the lowest lights, 29.5 degrees from the view axis.
+    assert rows["lights"].endswith("light_directions.txt, 60 to 90 degrees above the picture's plane")
+    assert rows["mask"].endswith("mask.png (448 pixels)")
+    assert rows["intensities"].startswith("none")
+
+
+def test_the_same_as_json(run, capture):
+    report = json.loads(run("info", str(capture), "--json").out)
+    assert report["image_kinds"] == [{"size": [24, 24], "channels": 1, "type": "uint16"}]
+    assert report["elevation_deg"] == [60.5, 90.0]
+    assert report["light_intensities"] is None
+    assert report["exposure"]["saturated"] == 0
+    # 60000 of 65535 under the light from the camera, at the top of the sphere.
+    assert report["exposure"]["bright"][1] == pytest.approx(60_000 / 65_535, abs=0.01)
+    assert report["warnings"] == ["All lights stand within 30 degrees of the camera; lower ones tell more."]
+
+
+def test_the_plot_of_the_lights(run, capture, tmp_path):
+    assert run("info", str(capture), "--plot", tmp_path / "sky.png", "-q").code == 0
+    picture = cv2.imread(str(tmp_path / "sky.png"))
+    orange = (np.abs(picture.astype(int) - (0x00, 0x5E, 0xD5)).sum(axis=2) < 20).sum()
+    assert orange > 8 * 20  # eight markers
+
+
+def test_warnings(run, capture):
+    photographs = sorted(capture.glob("image*.png"))
+    stored = cv2.imread(str(photographs[0]), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(photographs[0]), (stored // 256).astype(np.uint8))
+    cv2.imwrite(str(photographs[1]), np.full_like(stored, 65_535))
+    cv2.imwrite(str(photographs[2]), stored // 30)
+    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
+    assert warnings[:3] == [
+        "There are images of 8 bits; 16-bit linear images give better normals.",
+        "Images saturated in more than 1 % of the pixels: 1, most image2.png (100.0 %);"
+        " a shorter exposure gives better normals.",
+        "Images that use less than 5 % of the range: 1, such as image3.png; a longer exposure gives less noise.",
+    ]
+    cv2.imwrite(str(photographs[3]), stored[:20])
+    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
+    assert "The images have 2 different sizes; they have to be equal." in warnings
+
+
+def test_no_capture(run, tmp_path):
+    result = run("info", tmp_path / "nowhere")
+    assert (result.code, result.out) == (3, "")
+    assert "the folder does not exist" in result.err
