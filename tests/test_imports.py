@@ -14,11 +14,11 @@ ROOMS = [
     {"outputs"},
     {"evaluation", "training"},
     {"synthesis", "inference"},
-    {"methods", "metrics"},
+    {"methods", "metrics", "albedo"},
     {"networks", "devices"},
     {"fits", "calibration"},
     {"capture", "observation_map", "surface"},
-    {"normals", "files"},
+    {"normals", "files", "transfer"},
     {"errors", "__init__"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}

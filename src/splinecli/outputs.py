@@ -21,11 +21,18 @@ from splinecli.files import check_writable, current_umask, refusals_as_output_er
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
+from splinecli.transfer import encode_srgb
 
 NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
 ERROR_MAP = "error_map.png"
 REPORT = "report.json"
-OWN_FILES = (*NORMALS.values(), ERROR_MAP, REPORT)
+ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
+MAPS = {"albedo": (ALBEDO_PICTURE, ALBEDO), "preview": (PREVIEW,)}
+"""The files of each map that is written where it is asked for."""
+OWN_FILES = (*NORMALS.values(), ERROR_MAP, *(name for names in MAPS.values() for name in names), REPORT)
+
+RAKING_LIGHT = (-0.72, 0.48, 0.5)
+"""Of the preview: low, from the upper left, as relief is looked at."""
 
 
 def check_free(folder: Path, *, overwrite: bool) -> None:
@@ -72,8 +79,15 @@ def write_estimate(
     *,
     formats: Sequence[str],
     convention: Convention,
+    albedo: NDArray[np.float32] | None = None,
+    preview: bool = False,
 ) -> dict[str, Any]:
     """Write the files into `folder`, replacing those of an earlier run there; returns the finished report.
+
+    Args:
+        formats: keys of NORMALS.
+        albedo: (H, W, 3), linear, as albedo_map gives it.
+        preview: whether to write a shaded picture.
 
     Everything is written into a folder beside it first, so that a failure or Ctrl-C leaves nothing half-done.
     Raises OutputError.
@@ -89,6 +103,14 @@ def write_estimate(
                 from splinecli.evaluation.error_map import error_map_picture
 
                 (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
+            if albedo is not None:
+                np.save(stage / ALBEDO, albedo, allow_pickle=False)
+                (stage / ALBEDO_PICTURE).write_bytes(
+                    encode_png(albedo_picture(albedo, estimate.capture.mask))
+                )
+            if preview:
+                picture = preview_picture(estimate.normal_map, estimate.capture.mask)
+                (stage / PREVIEW).write_bytes(encode_png(picture))
             files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
             seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
             report = {**report, "seconds": seconds, "files": files}
@@ -111,6 +133,19 @@ def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: C
         import tifffile
 
         tifffile.imwrite(path, estimate.normal_map, photometric="rgb")
+
+
+def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """An albedo map (H, W, 3) as an 8-bit sRGB picture; the brightest hundredth of the mask's (H, W) pixels is white."""
+    white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
+    return encode_srgb(albedo / white)
+
+
+def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The surface, matte white under RAKING_LIGHT, as an 8-bit sRGB picture (H, W, 3); black outside the mask (H, W)."""
+    light = np.array(RAKING_LIGHT, np.float32)
+    shading = (normal_map @ (light / np.linalg.norm(light))) * mask
+    return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
 def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:

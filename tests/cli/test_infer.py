@@ -66,6 +66,24 @@ def test_no_ground_truth_no_error_map(capture, run):
     assert report["files"] == ["normals.npy", "normals.png", "report.json"]
 
 
+def test_albedo_and_preview_where_they_are_asked_for(capture, run):
+    assert run("infer", capture, "--method", "ls", "--maps", "albedo,preview").code == 0
+    out = Path("out/sphere")
+    assert {"albedo.png", "albedo.npy", "preview.png"} <= set(read_report(out)["files"])
+    albedo = np.load(out / "albedo.npy")
+    mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    # The sphere is 60000 / 65535 white.
+    np.testing.assert_allclose(albedo[mask], 60_000 / 65_535, atol=2e-3)
+    assert not albedo[~mask].any()
+    assert cv2.imread(str(out / "albedo.png"))[mask].min() >= 254
+    preview = cv2.imread(str(out / "preview.png"), cv2.IMREAD_GRAYSCALE)
+    # The light comes from the upper left.
+    assert preview[6, 6] > preview[12, 12] > preview[17, 17] > preview[0, 0] == 0
+    # Not asked for, they are taken away with the other earlier results.
+    assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
+    assert "albedo.png" not in {path.name for path in out.iterdir()}
+
+
 def test_json_is_the_report_and_nothing_else(capture, run):
     result = run("infer", capture, "--method", "ls", "--json")
     assert json.loads(result.out) == read_report(Path("out/sphere"))

@@ -112,6 +112,20 @@ class CaptureSource:
             ),
         )
 
+    def read_colours(self, index: int, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """The pixels (P, 3) RGB of image `index`, linear, each channel divided by its light's intensity.
+
+        Raises:
+            InputError: the image cannot be read, or does not have the size of the mask (H, W).
+        """
+        path = self.files.images[index]
+        stored = decode_image(path)
+        _check_mask_size(mask, stored.shape[:2], path, path)
+        colours: NDArray[np.float32] = to_linear(stored[mask], path) / self.light_intensities[index].astype(
+            np.float32
+        )
+        return colours
+
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """The mask of images of this shape, (H, W); all of it where the capture has none. Raises InputError."""
         image = self.files.images[0]

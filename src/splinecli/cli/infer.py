@@ -76,6 +76,9 @@ def infer(
     formats: Annotated[
         str, typer.Option("--format", metavar="LIST", help="Any of png (16-bit), npy, tiff (both float32).")
     ] = "png,npy",
+    maps: Annotated[
+        str | None, typer.Option(metavar="LIST", help="Also write any of albedo, preview (shaded picture).")
+    ] = None,
     convention: Annotated[
         NormalConvention, typer.Option(help="Green of the PNG: opengl is y up, directx is y down.")
     ] = NormalConvention.opengl,
@@ -93,7 +96,7 @@ def infer(
     from splinecli.capture.record import check_light_indices
     from splinecli.evaluation.draws import check_draw_settings
     from splinecli.methods import MethodOptions, check_method
-    from splinecli.outputs import check_free
+    from splinecli.outputs import MAPS, NORMALS, check_free
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
@@ -109,7 +112,8 @@ def infer(
     job = _Job(
         files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
         output=output,
-        formats=split_commas(formats, "--format", ["png", "npy", "tiff"]),
+        formats=split_commas(formats, "--format", list(NORMALS)),
+        maps=[] if maps is None else split_commas(maps, "--maps", list(MAPS)),
         convention=convention.value,
         n_lights=n_lights,
         seed=seed,
@@ -121,7 +125,7 @@ def infer(
     reports, exit_code = [], 0
     for folder in captures:
         try:
-            capture, read_seconds = job.read(folder)
+            source, capture, read_seconds = job.read(folder)
         except (InputError, UsageError) as error:
             if len(captures) == 1:
                 raise
@@ -129,7 +133,7 @@ def infer(
             print(f"splinecli: {error}", file=sys.stderr)
             report = {"capture": capture_name(folder), "error": str(error)}
         else:
-            report = job.estimate(capture, read_seconds)
+            report = job.estimate(source, capture, read_seconds)
             if not (quiet or as_json):
                 print(_summary(report, output))
         reports.append(report)
@@ -145,6 +149,7 @@ class _Job:
     files: dict[str, Path | None]
     output: Path
     formats: list[str]
+    maps: list[str]
     convention: Any
     n_lights: int | None
     seed: int
@@ -163,8 +168,8 @@ class _Job:
             raise UsageError(f"method {self.method} uses no weights", hint="Leave --weights out")
         return estimator
 
-    def read(self, folder: Path) -> tuple[Capture, float]:
-        """The capture under the lights asked for, and the seconds that it took."""
+    def read(self, folder: Path) -> tuple[CaptureSource, Capture, float]:
+        """The capture under the lights asked for, whence it comes, and the seconds that it took."""
         from splinecli.capture import open_capture
 
         started = time.perf_counter()
@@ -173,9 +178,9 @@ class _Job:
         count = source.n_lights if chosen is None else len(chosen)
         with self.talk.progress(f"{source.files.name}: reading", count) as advance:
             capture = source.read(chosen, progress=lambda: advance(1))
-        return capture, time.perf_counter() - started
+        return source, capture, time.perf_counter() - started
 
-    def estimate(self, capture: Capture, read_seconds: float) -> dict[str, Any]:
+    def estimate(self, source: CaptureSource, capture: Capture, read_seconds: float) -> dict[str, Any]:
         """Estimate and write the normals; returns the report."""
         from splinecli.inference import estimate_normals
         from splinecli.outputs import report_of, write_estimate
@@ -191,8 +196,21 @@ class _Job:
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
         report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
-        target = self.output / capture.name
-        return write_estimate(estimate, report, target, formats=self.formats, convention=self.convention)
+        albedo = None
+        if "albedo" in self.maps:
+            from splinecli.albedo import albedo_map
+
+            with self.talk.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
+                albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
+        return write_estimate(
+            estimate,
+            report,
+            self.output / capture.name,
+            formats=self.formats,
+            convention=self.convention,
+            albedo=albedo,
+            preview="preview" in self.maps,
+        )
 
     def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
         if self.n_lights is None:
