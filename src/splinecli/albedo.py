@@ -43,10 +43,11 @@ def albedo_map(
     for start in range(0, len(normals), _TILE_PIXELS):
         tile = slice(start, start + _TILE_PIXELS)
         counts[tile] = _agreeing(capture.observations[tile], normals[tile] @ lights.T)
+    read = source.colours(capture.mask)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
     for position, index in enumerate(capture.light_indices):
         cosine = (normals @ lights[position]) * counts[:, position]
-        total += cosine[:, None] * source.read_colours(index, capture.mask)
+        total += cosine[:, None] * read(index)
         squares += cosine * cosine
         if progress is not None:
             progress()

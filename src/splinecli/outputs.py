@@ -136,13 +136,13 @@ def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: C
 
 
 def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """An albedo map (H, W, 3) as an 8-bit sRGB picture; the brightest hundredth of the mask's (H, W) pixels is white."""
+    """An albedo map (H, W, 3) as an 8-bit sRGB picture; white is the brightest hundredth of the mask (H, W)."""
     white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
     return encode_srgb(albedo / white)
 
 
 def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The surface, matte white under RAKING_LIGHT, as an 8-bit sRGB picture (H, W, 3); black outside the mask (H, W)."""
+    """The surface, matte white under RAKING_LIGHT, as an 8-bit sRGB picture; black outside the mask (H, W)."""
     light = np.array(RAKING_LIGHT, np.float32)
     shading = (normal_map @ (light / np.linalg.norm(light))) * mask
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)

@@ -1,9 +1,13 @@
-"""Between linear values and what is stored for a screen: the transfer curve of sRGB (IEC 61966-2-1)."""
+"""Between linear values and what is stored for a screen: sRGB's transfer curve (IEC 61966-2-1), and gamma curves."""
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
+
+from splinecli.errors import UsageError
 
 _LINEAR_BELOW = 0.0031308
 
@@ -16,3 +20,28 @@ def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
         255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)
     ).astype(np.uint8)
     return encoded
+
+
+def parse_transfer(text: str) -> float | None:
+    """The gamma of "gamma:G", 1 for "linear", None for "srgb". Raises UsageError."""
+    named: dict[str, float | None] = {"linear": 1.0, "srgb": None}
+    if text in named:
+        return named[text]
+    if match := re.fullmatch(r"gamma:([0-9.]+)", text):
+        try:
+            gamma = float(match[1])
+        except ValueError:
+            gamma = 0.0
+        if 0.1 <= gamma <= 10:
+            return gamma
+    raise UsageError(f"the transfer curve is {text!r}; expected linear, srgb or gamma:G, such as gamma:2.2")
+
+
+def decode_transfer(stored: NDArray[np.float32], gamma: float | None) -> NDArray[np.float32]:
+    """Linear values of stored ones, both 0 to 1: stored^gamma, or by sRGB's curve for None."""
+    if gamma == 1:
+        return stored
+    if gamma is not None:
+        return np.asarray(stored**gamma, np.float32)
+    power = ((stored + 0.055) / 1.055) ** 2.4
+    return np.where(stored <= 12.92 * _LINEAR_BELOW, stored / 12.92, power).astype(np.float32)

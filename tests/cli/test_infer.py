@@ -84,6 +84,30 @@ def test_albedo_and_preview_where_they_are_asked_for(capture, run):
     assert "albedo.png" not in {path.name for path in out.iterdir()}
 
 
+def test_photographs_with_a_curve_and_ambient_light(capture, run):
+    light = 9_000 / 65_535
+    for path in capture.glob("image*.png"):
+        linear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 65_535 * 0.8 + light
+        cv2.imwrite(str(path), np.rint(65_535 * linear ** (1 / 2.2)).astype(np.uint16))
+    dark = np.full((24, 24), round(65_535 * light ** (1 / 2.2)), np.uint16)
+    cv2.imwrite("dark.png", dark)
+
+    def mean_deg(*options):
+        run("infer", capture, "--method", "ls", "--overwrite", *options)
+        return read_report(Path("out/sphere"))["angular_error_deg"]["mean"]
+
+    assert mean_deg() > 5
+    assert mean_deg("--transfer", "gamma:2.2", "--ambient", "dark.png") < 0.1
+    cv2.imwrite(str(capture / "ambient.png"), dark)
+    assert mean_deg("--transfer", "gamma:2.2") < 0.1
+    assert read_report(Path("out/sphere"))["warnings"] == [
+        "The light of ambient.png was taken off all images."
+    ]
+    result = run("infer", capture, "--transfer", "rec709")
+    assert (result.code, result.out) == (2, "")
+    assert "the transfer curve is 'rec709'; expected linear, srgb or gamma:G" in result.err
+
+
 def test_json_is_the_report_and_nothing_else(capture, run):
     result = run("infer", capture, "--method", "ls", "--json")
     assert json.loads(result.out) == read_report(Path("out/sphere"))

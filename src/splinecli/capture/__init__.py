@@ -1,6 +1,7 @@
 """Captures: photographs of one object under known lights, read from folders of files."""
 
 from splinecli.capture.capture_files import CaptureFiles
+from splinecli.capture.development import Development
 from splinecli.capture.ground_truth import read_normal_map, read_normals
 from splinecli.capture.images import read_image, read_mask
 from splinecli.capture.layout import capture_name, find_capture_files, find_captures
@@ -12,6 +13,7 @@ __all__ = [
     "Capture",
     "CaptureFiles",
     "CaptureSource",
+    "Development",
     "capture_name",
     "find_capture_files",
     "find_captures",

@@ -19,6 +19,7 @@ LIGHT_FILES = f"{', '.join(LIGHT_DIRECTIONS)}, *.lp or lights.json"
 """The names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in IMAGE_SUFFIXES)
+AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
 GROUND_TRUTH = tuple(
     f"{stem}{suffix}"
     for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt")
@@ -26,9 +27,9 @@ GROUND_TRUTH = tuple(
 )
 
 NOT_PHOTOGRAPHS = frozenset(
-    {Path(name).stem for name in (*MASK, *GROUND_TRUTH)}
+    {Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)}
     # What splinecli itself writes, should its output folder be the capture's own.
-    | {"normals", "error_map"}
+    | {"normals", "error_map", "albedo", "preview"}
 )
 """Lower-case stems of pictures in a capture's folder that are no photographs."""
 
@@ -47,6 +48,7 @@ class CaptureFiles:
         mask: an image, or None where every pixel counts.
         boundaries: instead of a the mask: images whose pixels above zero together are the object.
         ground_truth: a normal map, or None.
+        ambient: an image without any of the lights, or None.
     """
 
     layout: str
@@ -58,6 +60,7 @@ class CaptureFiles:
     mask: Path | None = None
     ground_truth: Path | None = None
     boundaries: tuple[Path, ...] = ()
+    ambient: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import named_lights
-from splinecli.capture.capture_files import CaptureFiles
+from splinecli.capture.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.decoding import decode_image
+from splinecli.capture.development import AS_STORED, Developer, Development, is_display_encoded
 from splinecli.capture.ground_truth import UPSIDE_DOWN, read_ground_truth
-from splinecli.capture.images import read_boundary, read_mask, to_linear
+from splinecli.capture.images import read_boundary, read_mask
 from splinecli.capture.layout import StrPath, find_capture_files
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.record import Capture, check_light_indices
@@ -36,12 +37,14 @@ class CaptureSource:
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         warnings: sentences a user should read.
+        development: how the images' values become linear light.
     """
 
     files: CaptureFiles
     light_directions: NDArray[np.float64]
     light_intensities: NDArray[np.float64]
     warnings: tuple[str, ...] = ()
+    development: Development = AS_STORED
 
     @property
     def n_lights(self) -> int:
@@ -77,6 +80,7 @@ class CaptureSource:
             ground_truth, upside_down = read_ground_truth(
                 self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
             )
+        develop = Developer(self.development, mask, len(self.files.images))
         observations = np.empty((np.count_nonzero(mask), len(indices)), np.float32)
         n_saturated, n_8_bit = 0, 0
         stored: NDArray[Any] | None = first
@@ -91,8 +95,9 @@ class CaptureSource:
                     f" expected {_size(mask.shape)} as in {first_path.name}",
                     path=path,
                 )
-            observations[:, position], saturated = _observe(stored[mask], self.light_intensities[index], path)
-            n_saturated += saturated
+            pixels = stored[mask]
+            n_saturated += _count_saturated(pixels)
+            observations[:, position] = _observe(develop(pixels, path, index), self.light_intensities[index])
             n_8_bit += stored.dtype == np.uint8
             stored = None  # let go before the next is decoded: one full image at a time
             if progress is not None:
@@ -112,19 +117,21 @@ class CaptureSource:
             ),
         )
 
-    def read_colours(self, index: int, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """The pixels (P, 3) RGB of image `index`, linear, each channel divided by its light's intensity.
+    def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
+        """A function that reads the mask's (H, W) pixels (P, 3) RGB of an image by its index.
 
-        Raises:
-            InputError: the image cannot be read, or does not have the size of the mask (H, W).
+        Linear, each channel divided by its light's intensity. It raises InputError where the image cannot be read, or
+        does not have the size of the mask.
         """
-        path = self.files.images[index]
-        stored = decode_image(path)
-        _check_mask_size(mask, stored.shape[:2], path, path)
-        colours: NDArray[np.float32] = to_linear(stored[mask], path) / self.light_intensities[index].astype(
-            np.float32
-        )
-        return colours
+        develop = Developer(self.development, mask, len(self.files.images))
+
+        def read(index: int) -> NDArray[np.float32]:
+            path = self.files.images[index]
+            stored = decode_image(path)
+            _check_mask_size(mask, stored.shape[:2], path, path)
+            return np.asarray(develop(stored[mask], path, index) / self.light_intensities[index], np.float32)
+
+        return read
 
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """The mask of images of this shape, (H, W); all of it where the capture has none. Raises InputError."""
@@ -158,8 +165,13 @@ def open_capture(
     intensities: StrPath | None = None,
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
+    development: Development = AS_STORED,
 ) -> CaptureSource:
     """Find a capture's files and read its lights; files named here go before those that the folder holds.
+
+    Args:
+        development: how the images' values become linear light; where it names no ambient image, one called `ambient`
+            in the folder is taken off.
 
     Raises:
         InputError: the folder holds no capture (see find_capture_files) or a light file is wrong.
@@ -182,7 +194,16 @@ def open_capture(
         strengths = read_light_intensities(files.light_intensities, len(files.images))
     if strengths is None:
         strengths = np.ones((len(files.images), 3))
-    return CaptureSource(files, directions, strengths, warnings)
+    if development.ambient is None and (found := find_named(files.folder, AMBIENT)) is not None:
+        development = replace(development, ambient=found)
+        warnings += (f"The light of {found.name} was taken off all images.",)
+    files = replace(files, ambient=development.ambient)
+    if development.gamma == 1 and any(is_display_encoded(image) for image in files.images):
+        warnings += (
+            "The images look display-encoded (JPEG, or PNG that says so) but are taken to be linear;"
+            " --transfer srgb undoes sRGB's curve.",
+        )
+    return CaptureSource(files, directions, strengths, warnings, development)
 
 
 def read_capture(
@@ -202,20 +223,21 @@ def read_capture(
     return source.read(light_indices, progress)
 
 
-def _observe(
-    pixels: NDArray[Any], intensity: NDArray[np.float64], path: Path
-) -> tuple[NDArray[np.float32], int]:
-    """Stored pixels (P, C) under a light of RGB intensity (3,) -> observations (P,), number saturated.
+def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Linear pixels (P, C) under a light of RGB intensity (3,) -> observations (P,).
 
     Each channel is divided by its intensity, then the mean is taken; a gray image is equal in all channels.
     """
     weights = 1 / (3 * intensity)
-    if pixels.shape[1] == 1:
+    if linear.shape[1] == 1:
         weights = weights.sum(keepdims=True)
-    n_saturated = 0
-    if pixels.dtype.kind == "u":
-        n_saturated = int(np.count_nonzero((pixels == np.iinfo(pixels.dtype).max).any(axis=1)))
-    return to_linear(pixels, path) @ weights.astype(np.float32), n_saturated
+    return linear @ weights.astype(np.float32)
+
+
+def _count_saturated(pixels: NDArray[Any]) -> int:
+    if pixels.dtype.kind != "u":
+        return 0
+    return int(np.count_nonzero((pixels == np.iinfo(pixels.dtype).max).any(axis=1)))
 
 
 def _warnings(saturated_share: float, black_share: float, n_8_bit: int) -> tuple[str, ...]:

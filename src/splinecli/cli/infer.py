@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splinecli.cli.options import (
+    AmbientOption,
     BatchSizeOption,
     Device,
     DeviceOption,
+    FlatFieldOption,
     JsonOption,
     NormalConvention,
     Precision,
@@ -24,7 +26,9 @@ from splinecli.cli.options import (
     QuietOption,
     RotationsOption,
     SeedOption,
+    TransferOption,
     WeightsOption,
+    parse_development,
     parse_indices,
     split_commas,
 )
@@ -32,7 +36,7 @@ from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture, CaptureSource
+    from splinecli.capture import Capture, CaptureSource, Development
     from splinecli.methods import Estimator, MethodOptions
 
 
@@ -54,6 +58,9 @@ def infer(
         Path | None,
         typer.Option(metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF) to compare with."),
     ] = None,
+    transfer: TransferOption = "linear",
+    ambient: AmbientOption = None,
+    flat_field: FlatFieldOption = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Results go to OUT/<capture name>/.")
     ] = Path("out"),
@@ -106,10 +113,12 @@ def infer(
         check_draw_settings(n_lights, 1, seed)
     if indices is not None:
         check_light_indices(indices, max(indices) + 1)
+    development = parse_development(transfer, ambient, flat_field)
     _refuse_same_names(captures)
     for folder in captures:
         check_free(output / capture_name(folder), overwrite=overwrite)
     job = _Job(
+        development=development,
         files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
         output=output,
         formats=split_commas(formats, "--format", list(NORMALS)),
@@ -146,6 +155,7 @@ def infer(
 class _Job:
     """What the command line asked for, the same for every capture."""
 
+    development: Development
     files: dict[str, Path | None]
     output: Path
     formats: list[str]
@@ -173,7 +183,7 @@ class _Job:
         from splinecli.capture import open_capture
 
         started = time.perf_counter()
-        source = open_capture(folder, **self.files)
+        source = open_capture(folder, development=self.development, **self.files)
         chosen = self._choose_lights(source)
         count = source.n_lights if chosen is None else len(chosen)
         with self.talk.progress(f"{source.files.name}: reading", count) as advance:

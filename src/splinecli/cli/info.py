@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from splinecli.cli.options import JsonOption, QuietOption
+from splinecli.cli.options import (
+    AmbientOption,
+    FlatFieldOption,
+    JsonOption,
+    QuietOption,
+    TransferOption,
+    parse_development,
+)
 from splinecli.cli.talk import Talk
 
 if TYPE_CHECKING:
@@ -29,6 +36,9 @@ def info(
         Path | None, typer.Option(metavar="FILE", help="Picture that is bright on the object.")
     ] = None,
     ground_truth: Annotated[Path | None, typer.Option(metavar="FILE", help="True normals.")] = None,
+    transfer: TransferOption = "linear",
+    ambient: AmbientOption = None,
+    flat_field: FlatFieldOption = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also draw where the lights stand, as a PNG.")
     ] = None,
@@ -45,7 +55,12 @@ def info(
     from splinecli.files import write_bytes
 
     source = open_capture(
-        capture, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+        capture,
+        lights=lights,
+        intensities=intensities,
+        mask=mask,
+        ground_truth=ground_truth,
+        development=parse_development(transfer, ambient, flat_field),
     )
     talk = Talk(quiet=quiet)
     with talk.progress("reading", len(source.files.images)) as advance:

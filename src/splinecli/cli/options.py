@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from splinecli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splinecli.capture import Development
 
 
 class Device(StrEnum):
@@ -33,6 +37,23 @@ class Precision(StrEnum):
     bfloat16 = "bfloat16"
 
 
+TransferOption = Annotated[
+    str, typer.Option("--transfer", metavar="CURVE", help="Of the images: linear, srgb or gamma:G.")
+]
+AmbientOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--ambient",
+        metavar="FILE",
+        help="Image without any of the lights, to be taken off. [default: ambient.*]",
+    ),
+]
+FlatFieldOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--flat-field", metavar="DIR", help="Images of something evenly white, one for each light or for all."
+    ),
+]
 WeightsOption = Annotated[
     str | None,
     typer.Option(
@@ -85,3 +106,19 @@ def parse_indices(text: str, option: str) -> list[int]:
         return [int(item) for item in text.split(",")]
     except ValueError:
         raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
+
+
+def parse_development(transfer: str, ambient: Path | None, flat_field: Path | None) -> Development:
+    """What --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
+    from splinecli.capture import Development
+    from splinecli.capture.image_lists import check_not_empty, list_images
+    from splinecli.transfer import parse_transfer
+
+    flats = (
+        ()
+        if flat_field is None
+        else list_images(flat_field, leave_out_stems=("ambient", "mask"), leave_out=())
+    )
+    if flat_field is not None:
+        check_not_empty(flats, flat_field)
+    return Development(parse_transfer(transfer), ambient, flats)
