@@ -7,7 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from splinecli.files import check_writable, current_umask, refusals_as_output_er
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
+from splinecli.surface.surface_files import SURFACE_FILES
 from splinecli.transfer import encode_srgb
 
 NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
@@ -29,7 +30,13 @@ REPORT = "report.json"
 ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
 MAPS = {"albedo": (ALBEDO_PICTURE, ALBEDO), "preview": (PREVIEW,)}
 """The files of each map that is written where it is asked for."""
-OWN_FILES = (*NORMALS.values(), ERROR_MAP, *(name for names in MAPS.values() for name in names), REPORT)
+OWN_FILES = (
+    *NORMALS.values(),
+    ERROR_MAP,
+    *(name for names in MAPS.values() for name in names),
+    *SURFACE_FILES.values(),
+    REPORT,
+)
 
 RAKING_LIGHT = (-0.72, 0.48, 0.5)
 """Of the preview: low, from the upper left, as relief is looked at."""
@@ -79,15 +86,13 @@ def write_estimate(
     *,
     formats: Sequence[str],
     convention: Convention,
-    albedo: NDArray[np.float32] | None = None,
-    preview: bool = False,
+    more: Sequence[Callable[[Path], None]] = (),
 ) -> dict[str, Any]:
     """Write the files into `folder`, replacing those of an earlier run there; returns the finished report.
 
     Args:
         formats: keys of NORMALS.
-        albedo: (H, W, 3), linear, as albedo_map gives it.
-        preview: whether to write a shaded picture.
+        more: what writes further ones of OWN_FILES into a folder, such as write_albedo.
 
     Everything is written into a folder beside it first, so that a failure or Ctrl-C leaves nothing half-done.
     Raises OutputError.
@@ -103,14 +108,8 @@ def write_estimate(
                 from splinecli.evaluation.error_map import error_map_picture
 
                 (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
-            if albedo is not None:
-                np.save(stage / ALBEDO, albedo, allow_pickle=False)
-                (stage / ALBEDO_PICTURE).write_bytes(
-                    encode_png(albedo_picture(albedo, estimate.capture.mask))
-                )
-            if preview:
-                picture = preview_picture(estimate.normal_map, estimate.capture.mask)
-                (stage / PREVIEW).write_bytes(encode_png(picture))
+            for write in more:
+                write(stage)
             files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
             seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
             report = {**report, "seconds": seconds, "files": files}
@@ -133,6 +132,18 @@ def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: C
         import tifffile
 
         tifffile.imwrite(path, estimate.normal_map, photometric="rgb")
+
+
+def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], folder: Path) -> None:
+    """An albedo map (H, W, 3), linear, as float32 NPY and as a picture."""
+    np.save(folder / ALBEDO, albedo, allow_pickle=False)
+    (folder / ALBEDO_PICTURE).write_bytes(encode_png(albedo_picture(albedo, mask)))
+
+
+def write_preview(estimate: NormalEstimate, folder: Path) -> None:
+    """The shaded picture."""
+    picture = preview_picture(estimate.normal_map, estimate.capture.mask)
+    (folder / PREVIEW).write_bytes(encode_png(picture))
 
 
 def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

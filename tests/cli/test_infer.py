@@ -84,6 +84,23 @@ def test_albedo_and_preview_where_they_are_asked_for(capture, run):
     assert "albedo.png" not in {path.name for path in out.iterdir()}
 
 
+def test_a_surface_in_the_albedo_s_colours(capture, run):
+    trimesh = pytest.importorskip("trimesh")
+    assert run("infer", capture, "--method", "ls", "--surface", "--maps", "albedo").code == 0
+    out = Path("out/sphere")
+    assert {"mesh.ply", "depth.npy", "depth.tiff"} <= set(read_report(out)["files"])
+    # The normals are those of z = 2.5 sqrt(..), a sphere of radius 1 over 12 pixels, stretched.
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    assert len(mesh.vertices) == 448
+    assert mesh.visual.vertex_colors[:, :3].min() >= 254
+    depth = np.load(out / "depth.npy")
+    middle, rim = depth[11:13, 11:13].mean(), np.nanmin(depth)
+    assert middle - rim == pytest.approx(12 / (2 * 2.5), rel=0.1)  # slope r / 2.5 over r = 0 .. 12, in pixels
+    # What integrate makes of the files is the same.
+    assert run("integrate", out, "-o", "again", "--format", "npy").code == 0
+    np.testing.assert_array_equal(np.load("again/depth.npy"), depth)
+
+
 def test_photographs_with_a_curve_and_ambient_light(capture, run):
     light = 9_000 / 65_535
     for path in capture.glob("image*.png"):

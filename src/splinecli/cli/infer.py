@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,6 +37,7 @@ from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource, Development
+    from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator, MethodOptions
 
 
@@ -86,6 +87,9 @@ def infer(
     maps: Annotated[
         str | None, typer.Option(metavar="LIST", help="Also write any of albedo, preview (shaded picture).")
     ] = None,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="Also write mesh.ply, depth.npy and depth.tiff: see integrate.")
+    ] = False,
     convention: Annotated[
         NormalConvention, typer.Option(help="Green of the PNG: opengl is y up, directx is y down.")
     ] = NormalConvention.opengl,
@@ -122,6 +126,7 @@ def infer(
         files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
         output=output,
         formats=split_commas(formats, "--format", list(NORMALS)),
+        surface=surface,
         maps=[] if maps is None else split_commas(maps, "--maps", list(MAPS)),
         convention=convention.value,
         n_lights=n_lights,
@@ -160,6 +165,7 @@ class _Job:
     output: Path
     formats: list[str]
     maps: list[str]
+    surface: bool
     convention: Any
     n_lights: int | None
     seed: int
@@ -206,21 +212,42 @@ class _Job:
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
         report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
-        albedo = None
-        if "albedo" in self.maps:
-            from splinecli.albedo import albedo_map
-
-            with self.talk.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
-                albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
         return write_estimate(
             estimate,
             report,
             self.output / capture.name,
             formats=self.formats,
             convention=self.convention,
-            albedo=albedo,
-            preview="preview" in self.maps,
+            more=self._make_more(source, estimate),
         )
+
+    def _make_more(self, source: CaptureSource, estimate: NormalEstimate) -> list[Callable[[Path], None]]:
+        """What else was asked for, made and ready to be written."""
+        from splinecli.outputs import albedo_picture, write_albedo, write_preview
+
+        capture = estimate.capture
+        more: list[Callable[[Path], None]] = []
+        colours = None
+        if "albedo" in self.maps:
+            from splinecli.albedo import albedo_map
+
+            with self.talk.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
+                albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
+            more.append(partial(write_albedo, albedo, capture.mask))
+            colours = albedo_picture(albedo, capture.mask)
+        if "preview" in self.maps:
+            more.append(partial(write_preview, estimate))
+        if self.surface:
+            from splinecli.surface.integration import integrate_normals
+            from splinecli.surface.mesh import surface_mesh
+            from splinecli.surface.surface_files import write_surface
+
+            with self.talk.progress(f"{capture.name}: integrating", 1) as advance:
+                depth = integrate_normals(estimate.normal_map, capture.mask)
+                advance(1)
+            mesh = surface_mesh(depth, capture.mask, colours=colours)
+            more.append(partial(write_surface, depth=depth, mesh=mesh))
+        return more
 
     def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
         if self.n_lights is None:

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splinecli.surface.mesh import SurfaceMesh
-
-FILES = {"ply": "mesh.ply", "obj": "mesh.obj", "npy": "depth.npy", "tiff": "depth.tiff"}
 REPORT = "surface.json"
 NORMALS = "normals.npy"
 
@@ -82,14 +79,15 @@ def integrate(
     import numpy as np
 
     from splinecli.capture import read_normal_map
-    from splinecli.files import check_writable
+    from splinecli.files import check_writable, write_text
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
+    from splinecli.surface.surface_files import SURFACE_FILES, write_surface
 
-    wanted = split_commas(formats, "--format", list(FILES))
+    wanted = split_commas(formats, "--format", list(SURFACE_FILES))
     folder = output or (normals if normals.is_dir() else normals.parent)
     check_writable(folder)
-    for name in (*(FILES[form] for form in wanted), REPORT):
+    for name in (*(SURFACE_FILES[form] for form in wanted), REPORT):
         if (folder / name).exists() and not overwrite:
             raise OutputError(
                 f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
@@ -129,10 +127,11 @@ def integrate(
         "n_triangles": len(mesh.triangles),
         "stiffness": stiffness,
         "seconds": round(time.perf_counter() - started, 3),
-        "files": [*(FILES[form] for form in wanted), REPORT],
+        "files": [*(SURFACE_FILES[form] for form in wanted), REPORT],
     }
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder, wanted, depth.astype(np.float32), mesh, report)
+    write_surface(folder, depth, mesh, wanted)
+    write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
     if as_json:
         print(json.dumps(report, indent=2))
     elif not quiet:
@@ -183,27 +182,3 @@ def _read_matrix(path: Path) -> NDArray[np.float64]:
             hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
         )
     return matrix
-
-
-def _write(
-    folder: Path, forms: list[str], depth: NDArray[np.float32], mesh: SurfaceMesh, report: dict[str, Any]
-) -> None:
-    import io
-
-    import numpy as np
-    import tifffile
-
-    from splinecli.files import write_bytes, write_text
-    from splinecli.surface.mesh import write_mesh
-
-    for form in forms:
-        buffer = io.BytesIO()
-        if form in ("ply", "obj"):
-            write_mesh(mesh, folder / FILES[form])
-            continue
-        if form == "npy":
-            np.save(buffer, depth, allow_pickle=False)
-        else:
-            tifffile.imwrite(buffer, depth)
-        write_bytes(folder / FILES[form], buffer.getvalue())
-    write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
