@@ -14,6 +14,7 @@ from splinecli.capture import named_lights
 from splinecli.capture.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.development import AS_STORED, Developer, Development, is_display_encoded
+from splinecli.capture.exposure import check_exposures
 from splinecli.capture.ground_truth import UPSIDE_DOWN, read_ground_truth
 from splinecli.capture.images import read_boundary, read_mask
 from splinecli.capture.layout import StrPath, find_capture_files
@@ -190,6 +191,8 @@ def open_capture(
             warnings = (f"The lights of {path.name} were matched to the images by {how}.",)
     else:
         directions = read_light_directions(path, len(files.images))
+    if files.light_intensities is None and strengths is None:
+        check_exposures(files.images)
     if files.light_intensities is not None:
         strengths = read_light_intensities(files.light_intensities, len(files.images))
     if strengths is None:
