@@ -54,10 +54,30 @@ def check_free(folder: Path, *, overwrite: bool) -> None:
             )
 
 
+def finished_report(folder: Path, options: dict[str, Any]) -> dict[str, Any] | None:
+    """The report in the folder, where this version wrote it, with these options, and all its files are there."""
+    try:
+        report = json.loads((folder / REPORT).read_text("utf-8"))
+        whole = all((folder / name).is_file() for name in report["files"])
+        same = report["options"] == json.loads(json.dumps(options)) and report["version"] == __version__
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return report if whole and same else None
+
+
 def report_of(
-    estimate: NormalEstimate, estimator: Estimator, *, read_seconds: float, warnings: Sequence[str]
+    estimate: NormalEstimate,
+    estimator: Estimator,
+    options: dict[str, Any],
+    *,
+    read_seconds: float,
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """The report of the contract (docs/conventions.md), all but `seconds.write` and `files`."""
+    """The report of the contract (docs/conventions.md), all but `seconds.write` and `files`.
+
+    Args:
+        options: what was asked for.
+    """
     capture = estimate.capture
     return {
         "capture": capture.name,
@@ -75,6 +95,7 @@ def report_of(
         "angular_error_deg": None
         if estimate.errors is None
         else {name: round(value, 4) for name, value in asdict(estimate.errors).items()},
+        "options": options,
         "version": __version__,
     }
 

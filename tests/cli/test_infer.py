@@ -239,8 +239,35 @@ def test_usage_errors_end_a_batch_at_once(arguments, capture, make_capture, run,
 def test_a_batch_with_an_existing_output_computes_nothing(capture, make_capture, run):
     make_capture("second")
     run("infer", "second", "--method", "ls")
-    assert run("infer", capture, "second", "--method", "ls").code == 5
+    assert run("infer", capture, "second", "--method", "ls", "--format", "png").code == 5
     assert [path.name for path in Path("out").iterdir()] == ["second"]
+
+
+def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
+    make_capture("second")
+    broken = make_capture("third") / "image3.png"
+    whole = broken.read_bytes()
+    broken.write_bytes(b"no picture")
+    captures = ("sphere", "second", "third")
+    first = run("infer", *captures, "--method", "ls")
+    assert (first.code, "3 captures: 2 done, 0 finished before, 1 bad" in first.err) == (3, True)
+    before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
+    broken.write_bytes(whole)
+    again = run("infer", *captures, "--method", "ls")
+    assert again.code == 0
+    assert again.out.startswith("out/third: ")
+    assert (
+        "out/second: finished before, left as it is\n3 captures: 1 done, 2 finished before, 0 bad\n"
+        in again.err
+    )
+    assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
+    # The same in JSON has all reports; with other options, or a file missing, nothing is taken for finished.
+    reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
+    assert [report["capture"] for report in reports] == list(captures)
+    assert run("infer", *captures, "--method", "ls", "--n-lights", 4).code == 5
+    (Path("out/second/normals.png")).unlink()
+    assert run("infer", *captures, "--method", "ls").code == 5
+    assert run("infer", *captures, "--method", "ls", "--overwrite").code == 0
 
 
 def test_links_are_called_by_their_own_names(capture, run):
@@ -263,7 +290,7 @@ def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     for name in ("inboundary.png", "onboundary.png"):
         (holder / name).write_bytes((capture / "mask.png").read_bytes())
     result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
-    assert (result.code, result.err) == (0, "")
+    assert (result.code, result.err) == (0, "2 captures: 2 done, 0 finished before, 0 bad\n")
     assert {path.name for path in Path("out").iterdir()} == {"Ball_specular", "Ball_metallic"}
     assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
     # An object with several kinds is passed over among others, under its own name.

@@ -101,13 +101,14 @@ def infer(
 
     A capture is a folder of images taken by a fixed camera under different lights, with a light file (in it, or given
     by --lights). Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there is ground
-    truth. A bad capture among several is named and passed over; the exit code is then 3.
+    truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished before
+    with the same options are left as they are.
     """
     from splinecli.capture import capture_name
     from splinecli.capture.record import check_light_indices
     from splinecli.evaluation.draws import check_draw_settings
     from splinecli.methods import MethodOptions, check_method
-    from splinecli.outputs import MAPS, NORMALS, check_free
+    from splinecli.outputs import MAPS, NORMALS, check_free, finished_report
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
@@ -119,14 +120,29 @@ def infer(
         check_light_indices(indices, max(indices) + 1)
     development = parse_development(transfer, ambient, flat_field)
     _refuse_same_names(captures)
+    options = {
+        "method": method, "weights": weights, "rotations": rotations, "precision": precision.value,
+        "n_lights": n_lights, "seed": seed if n_lights is not None else None, "light_indices": indices,
+        "lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth,
+        "transfer": transfer, "ambient": ambient, "flat_field": flat_field,
+        "formats": formats, "convention": convention.value, "maps": maps, "surface": surface,
+    }  # fmt: skip
+    options = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+    finished = {}
     for folder in captures:
-        check_free(output / capture_name(folder), overwrite=overwrite)
+        target = output / capture_name(folder)
+        report = None if overwrite or len(captures) == 1 else finished_report(target, options)
+        if report is None:
+            check_free(target, overwrite=overwrite)
+        else:
+            finished[folder] = report
     job = _Job(
         development=development,
         files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
         output=output,
         formats=split_commas(formats, "--format", list(NORMALS)),
         surface=surface,
+        asked=options,
         maps=[] if maps is None else split_commas(maps, "--maps", list(MAPS)),
         convention=convention.value,
         n_lights=n_lights,
@@ -138,6 +154,10 @@ def infer(
     )
     reports, exit_code = [], 0
     for folder in captures:
+        if folder in finished:
+            reports.append(finished[folder])
+            job.talk.say(f"{output / capture_name(folder)}: finished before, left as it is")
+            continue
         try:
             source, capture, read_seconds = job.read(folder)
         except (InputError, UsageError) as error:
@@ -151,6 +171,10 @@ def infer(
             if not (quiet or as_json):
                 print(_summary(report, output))
         reports.append(report)
+    if len(captures) > 1:
+        failed = sum("error" in report for report in reports)
+        done = len(captures) - len(finished) - failed
+        job.talk.say(f"{len(captures)} captures: {done} done, {len(finished)} finished before, {failed} bad")
     if as_json:
         print(json.dumps(reports[0] if len(captures) == 1 else reports, indent=2))
     return exit_code
@@ -166,6 +190,7 @@ class _Job:
     formats: list[str]
     maps: list[str]
     surface: bool
+    asked: dict[str, Any]
     convention: Any
     n_lights: int | None
     seed: int
@@ -211,7 +236,7 @@ class _Job:
             warnings += untrained_warning(estimator.weights["sha256"], capture.n_lights)
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
-        report = report_of(estimate, estimator, read_seconds=read_seconds, warnings=warnings)
+        report = report_of(estimate, estimator, self.asked, read_seconds=read_seconds, warnings=warnings)
         return write_estimate(
             estimate,
             report,
