@@ -101,8 +101,8 @@ def infer(
 
     A capture is a folder of images taken by a fixed camera under different lights, with a light file (in it, or given
     by --lights). Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there is ground
-    truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished before
-    with the same options are left as they are.
+    truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished
+    before with the same options are left as they are.
     """
     from splinecli.capture import capture_name
     from splinecli.capture.record import check_light_indices
