@@ -11,6 +11,7 @@ import splinecli
 ROOMS = [
     {"__main__"},
     {"cli"},
+    {"page"},
     {"outputs"},
     {"evaluation", "training"},
     {"synthesis", "inference"},

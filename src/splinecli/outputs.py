@@ -26,7 +26,7 @@ from splinecli.transfer import encode_srgb
 
 NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
 ERROR_MAP = "error_map.png"
-REPORT = "report.json"
+REPORT, PAGE = "report.json", "page.html"
 ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
 MAPS = {"albedo": (ALBEDO_PICTURE, ALBEDO), "preview": (PREVIEW,)}
 """The files of each map that is written where it is asked for."""
@@ -35,6 +35,7 @@ OWN_FILES = (
     ERROR_MAP,
     *(name for names in MAPS.values() for name in names),
     *SURFACE_FILES.values(),
+    PAGE,
     REPORT,
 )
 

@@ -101,6 +101,15 @@ def test_a_surface_in_the_albedo_s_colours(capture, run):
     np.testing.assert_array_equal(np.load("again/depth.npy"), depth)
 
 
+def test_a_page_to_look_at(capture, run):
+    assert run("infer", capture, "--method", "ls", "--html", "--maps", "albedo").code == 0
+    page = Path("out/sphere/page.html").read_text("utf-8")
+    assert "page.html" in read_report(Path("out/sphere"))["files"]
+    assert page.count("data:image/png;base64,") >= 4  # normals in two halves, albedo, error map
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "sphere" in page
+
+
 def test_photographs_with_a_curve_and_ambient_light(capture, run):
     light = 9_000 / 65_535
     for path in capture.glob("image*.png"):

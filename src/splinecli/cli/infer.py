@@ -87,6 +87,9 @@ def infer(
     maps: Annotated[
         str | None, typer.Option(metavar="LIST", help="Also write any of albedo, preview (shaded picture).")
     ] = None,
+    html: Annotated[
+        bool, typer.Option("--html", help="Also write page.html: pictures and a view under a movable light.")
+    ] = False,
     surface: Annotated[
         bool, typer.Option("--surface", help="Also write mesh.ply, depth.npy and depth.tiff: see integrate.")
     ] = False,
@@ -125,7 +128,7 @@ def infer(
         "n_lights": n_lights, "seed": seed if n_lights is not None else None, "light_indices": indices,
         "lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth,
         "transfer": transfer, "ambient": ambient, "flat_field": flat_field,
-        "formats": formats, "convention": convention.value, "maps": maps, "surface": surface,
+        "formats": formats, "convention": convention.value, "maps": maps, "surface": surface, "html": html,
     }  # fmt: skip
     options = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
     finished = {}
@@ -142,6 +145,7 @@ def infer(
         output=output,
         formats=split_commas(formats, "--format", list(NORMALS)),
         surface=surface,
+        html=html,
         asked=options,
         maps=[] if maps is None else split_commas(maps, "--maps", list(MAPS)),
         convention=convention.value,
@@ -190,6 +194,7 @@ class _Job:
     formats: list[str]
     maps: list[str]
     surface: bool
+    html: bool
     asked: dict[str, Any]
     convention: Any
     n_lights: int | None
@@ -243,16 +248,18 @@ class _Job:
             self.output / capture.name,
             formats=self.formats,
             convention=self.convention,
-            more=self._make_more(source, estimate),
+            more=self._make_more(source, estimate, report),
         )
 
-    def _make_more(self, source: CaptureSource, estimate: NormalEstimate) -> list[Callable[[Path], None]]:
+    def _make_more(
+        self, source: CaptureSource, estimate: NormalEstimate, report: dict[str, Any]
+    ) -> list[Callable[[Path], None]]:
         """What else was asked for, made and ready to be written."""
         from splinecli.outputs import albedo_picture, write_albedo, write_preview
 
         capture = estimate.capture
         more: list[Callable[[Path], None]] = []
-        colours = None
+        albedo = colours = None
         if "albedo" in self.maps:
             from splinecli.albedo import albedo_map
 
@@ -272,6 +279,19 @@ class _Job:
                 advance(1)
             mesh = surface_mesh(depth, capture.mask, colours=colours)
             more.append(partial(write_surface, depth=depth, mesh=mesh))
+        if self.html:
+            from splinecli.files import write_text
+            from splinecli.outputs import PAGE
+            from splinecli.page import result_page
+
+            page = result_page(
+                report,
+                estimate.normal_map,
+                capture.mask,
+                albedo=albedo,
+                error_map_deg=estimate.error_map_deg,
+            )
+            more.append(lambda folder: write_text(folder / PAGE, page))
         return more
 
     def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
