@@ -1,15 +1,15 @@
 #!/bin/sh
-# Makes the weights that come with splinecli from nothing, in about two and a half hours on two cores:
+# Makes the weights that come with splinecli from nothing, in about six hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
-# Needs the extra 'render' (pip install -c constraints.txt '.[render]'). Cut off, the same command goes on. Seeds are fixed;
-# how many steps fit into the minutes depends on the machine. See MODEL_CARD.md.
+# Needs the extra 'render' (pip install -c constraints.txt '.[render]'). Cut off, the same command goes on. Seeds and
+# numbers of steps are fixed. See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}
 
 splinecli=${SPLINECLI:-splinecli}
-"$splinecli" prepare --scenes 18 --seed 11 -o "$folder/scenes"
+"$splinecli" prepare --scenes 48 --seed 11 -o "$folder/scenes"
 
 # A run that was begun is resumed; one that is at its end is left alone.
 run() {
@@ -17,11 +17,15 @@ run() {
   shift
   if [ -e "$folder/$name/finished" ]; then return; fi
   if [ -e "$folder/$name/checkpoint.safetensors" ]; then set -- "$@" --resume; fi
-  "$splinecli" train "$@" -o "$folder/$name"
+  "$splinecli" train "$folder/scenes" "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-run spline-net "$folder/scenes" --preset compact --generator-weight 3 --minutes 62
-run cnn-ps --preset cnn-ps --minutes 60
+run spline-net-1 --preset compact --generator-weight 3 --steps 15357
+run spline-net-2 --preset compact --generator-weight 2 --steps 12294 --param learning_rate=1e-3 \
+  --start-from "$folder/spline-net-1/weights.safetensors"
+run cnn-ps-1 --preset cnn-ps --generator-weight 3 --steps 8136
+run cnn-ps-2 --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
+  --start-from "$folder/cnn-ps-1/weights.safetensors"
 
-echo "$folder/spline-net/weights.safetensors"
-echo "$folder/cnn-ps/weights.safetensors"
+echo "$folder/spline-net-2/weights.safetensors"
+echo "$folder/cnn-ps-2/weights.safetensors"
