@@ -21,7 +21,7 @@ from splinecli.files import check_writable, current_umask, refusals_as_output_er
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
-from splinecli.surface.surface_files import SURFACE_FILES
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT
 from splinecli.transfer import encode_srgb
 
 NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
@@ -35,6 +35,7 @@ OWN_FILES = (
     ERROR_MAP,
     *(name for names in MAPS.values() for name in names),
     *SURFACE_FILES.values(),
+    SURFACE_REPORT,
     PAGE,
     REPORT,
 )
@@ -55,12 +56,13 @@ def check_free(folder: Path, *, overwrite: bool) -> None:
             )
 
 
-def finished_report(folder: Path, options: dict[str, Any]) -> dict[str, Any] | None:
-    """The report in the folder, where this version wrote it, with these options, and all its files are there."""
+def finished_report(folder: Path, options: dict[str, Any], inputs: str) -> dict[str, Any] | None:
+    """The report in the folder; None unless this version made it, of these inputs, as asked for, and all is there."""
     try:
         report = json.loads((folder / REPORT).read_text("utf-8"))
         whole = all((folder / name).is_file() for name in report["files"])
-        same = report["options"] == json.loads(json.dumps(options)) and report["version"] == __version__
+        same = (report["options"], report["inputs_sha256"]) == (json.loads(json.dumps(options)), inputs)
+        same = same and report["version"] == __version__
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return report if whole and same else None
@@ -70,6 +72,7 @@ def report_of(
     estimate: NormalEstimate,
     estimator: Estimator,
     options: dict[str, Any],
+    inputs: str,
     *,
     read_seconds: float,
     warnings: Sequence[str],
@@ -78,6 +81,7 @@ def report_of(
 
     Args:
         options: what was asked for.
+        inputs: SHA-256 over what tells that the files read are the same.
     """
     capture = estimate.capture
     return {
@@ -97,6 +101,7 @@ def report_of(
         if estimate.errors is None
         else {name: round(value, 4) for name, value in asdict(estimate.errors).items()},
         "options": options,
+        "inputs_sha256": inputs,
         "version": __version__,
     }
 

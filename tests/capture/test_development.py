@@ -96,6 +96,17 @@ def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one:
     np.testing.assert_allclose(observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4)
 
 
+def test_flat_fields_follow_their_images_in_an_lp_file(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
+    folder = store(tmp_path / "capture", light * falloff)
+    flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(4))
+    before = observed(folder, flat_field=flats)
+    (folder / "lights.txt").unlink()
+    rows = [f"{n}.png {row}" for n, row in enumerate(LIGHTS.splitlines())]
+    (folder / "a.lp").write_text("\n".join(["4", *rows[::-1]]))
+    np.testing.assert_array_equal(observed(folder, flat_field=flats), before[:, ::-1])
+
+
 def test_the_albedo_sees_the_same_light(tmp_path: Path, light: NDArray[np.float64]) -> None:
     ambient = np.full(light.shape[1:], 0.1)
     up = np.broadcast_to(np.array((0, 0, 1), np.float32), light.shape[1:])

@@ -274,6 +274,14 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
     assert [report["capture"] for report in reports] == list(captures)
     assert run("infer", *captures, "--method", "ls", "--n-lights", 4).code == 5
+    light = Path("second/light_directions.txt")
+    light.write_text(light.read_text() + "# measured anew\n")
+    assert run("infer", *captures, "--method", "ls").code == 5
+    assert run("infer", *captures, "--method", "ls", "--overwrite").code == 0
+    assert run("infer", *captures, "--method", "ls").code == 0
+    Path("others").mkdir()
+    Path("others/sphere").symlink_to(Path("third").absolute())
+    assert run("infer", "others/sphere", "second", "--method", "ls").code == 5  # another object of that name
     (Path("out/second/normals.png")).unlink()
     assert run("infer", *captures, "--method", "ls").code == 5
     assert run("infer", *captures, "--method", "ls", "--overwrite").code == 0

@@ -256,6 +256,13 @@ def test_drawn_materials_have_the_stated_classes() -> None:
     assert rough.max() == pytest.approx(1, abs=0.01)
 
 
+def test_light_from_behind_what_is_seen_is_finite() -> None:
+    surface = draw_material(50, torch.Generator().manual_seed(0))
+    view = torch.full((50, 1), 0.5)
+    for l_dot_v in (-1.0, -1.0000001):
+        assert torch.isfinite(surface.shade(-view, view, torch.full((50, 1), l_dot_v))).all()
+
+
 def test_take_keeps_parameters_together() -> None:
     drawn = draw_material(10, torch.Generator().manual_seed(0))
     some = drawn.take(torch.tensor([7, 2]))

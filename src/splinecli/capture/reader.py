@@ -186,6 +186,10 @@ def open_capture(
     if path.suffix.lower() in named_lights.SUFFIXES:
         named = named_lights.read_named_lights(path)
         images, how = named.match(files.images)
+        flats = development.flat_field
+        if len(flats) == len(files.images) > 1:  # they lie in the order of the folder's images
+            flat_of = dict(zip(files.images, flats, strict=True))
+            development = replace(development, flat_field=tuple(flat_of[image] for image in images))
         files, directions, strengths = replace(files, images=images), named.directions, named.intensities
         if how != "name":
             warnings = (f"The lights of {path.name} were matched to the images by {how}.",)

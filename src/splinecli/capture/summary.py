@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.decoding import decode_image
+from splinecli.capture.development import Developer
 from splinecli.capture.images import to_linear
 from splinecli.capture.reader import SATURATED_SHARE, CaptureSource
 
@@ -85,6 +86,9 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         stored = decode_image(path)
         if mask is None:
             mask = source.read_mask(stored.shape[:2])
+            Developer(
+                source.development, mask, len(source.files.images)
+            )  # raises where ambient or flats do not fit
         pixels = stored[mask] if mask.shape == stored.shape[:2] else stored.reshape(-1, stored.shape[2])
         full = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else np.inf
         images.append(

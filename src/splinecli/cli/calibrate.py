@@ -54,7 +54,8 @@ def calibrate(
         Path | None, typer.Option(metavar="DIR", help="Photographs of a matte card that faces the camera.")
     ] = None,
     compare: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Say how far these light directions are off.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Say how far the light directions in this text file are off."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")] = False,
     as_json: JsonOption = False,
@@ -71,6 +72,7 @@ def calibrate(
     from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
     from splinecli.calibration.gray import light_strengths
     from splinecli.calibration.picture import calibration_picture
+    from splinecli.capture.development import is_display_encoded
     from splinecli.capture.light_files import read_light_directions
     from splinecli.files import check_writable, write_bytes, write_text
 
@@ -85,6 +87,8 @@ def calibrate(
             raise OutputError(
                 f"holds {name} already", path=output, hint="Add --overwrite, or choose another place with -o"
             )
+    target = gray_ball or gray_card
+    gray_files = None if target is None else find_ball_files(target)
     files = [find_ball_files(folder, mask=own) for folder, own in zip(balls, masks, strict=True)]
     with talk.progress("calibrating", sum(len(ball.images) for ball in files)) as advance:
         calibrated = [
@@ -93,13 +97,17 @@ def calibrate(
         ]
     lights = combine_balls(calibrated)
     strengths = None
-    target = gray_ball or gray_card
-    if target is not None:
+    if gray_files is not None:
         strengths = light_strengths(
-            find_ball_files(target), lights.directions, "ball" if gray_ball is not None else "card"
+            gray_files, lights.directions, "ball" if gray_ball is not None else "card"
         )
     known = None if compare is None else read_light_directions(compare, len(lights.directions))
     report = _report(lights, strengths, known)
+    if gray_files is not None and any(is_display_encoded(image) for image in gray_files.images):
+        report["warnings"].append(
+            "The photographs of the gray target look display-encoded (JPEG, or PNG that says so);"
+            " strengths need linear ones."
+        )
     output.mkdir(parents=True, exist_ok=True)
     write_text(output / DIRECTIONS, _rows(lights.directions))
     if strengths is not None:

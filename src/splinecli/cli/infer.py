@@ -131,17 +131,29 @@ def infer(
         "formats": formats, "convention": convention.value, "maps": maps, "surface": surface, "html": html,
     }  # fmt: skip
     options = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+    files = {"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth}
+
+    def inputs_of(folder: Path) -> str:
+        from splinecli.capture import open_capture
+
+        try:
+            return _inputs_sha256(open_capture(folder, development=development, **files), weights)
+        except InputError:
+            return ""  # told when its turn comes
+
     finished = {}
     for folder in captures:
         target = output / capture_name(folder)
-        report = None if overwrite or len(captures) == 1 else finished_report(target, options)
+        report = (
+            None if overwrite or len(captures) == 1 else finished_report(target, options, inputs_of(folder))
+        )
         if report is None:
             check_free(target, overwrite=overwrite)
         else:
             finished[folder] = report
     job = _Job(
         development=development,
-        files={"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth},
+        files=files,
         output=output,
         formats=split_commas(formats, "--format", list(NORMALS)),
         surface=surface,
@@ -241,7 +253,10 @@ class _Job:
             warnings += untrained_warning(estimator.weights["sha256"], capture.n_lights)
         for warning in warnings:
             self.talk.warn(f"{capture.name}: {warning}")
-        report = report_of(estimate, estimator, self.asked, read_seconds=read_seconds, warnings=warnings)
+        inputs = _inputs_sha256(source, self.options.weights)
+        report = report_of(
+            estimate, estimator, self.asked, inputs, read_seconds=read_seconds, warnings=warnings
+        )
         return write_estimate(
             estimate,
             report,
@@ -300,6 +315,22 @@ class _Job:
         from splinecli.evaluation.draws import draw_lights
 
         return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
+
+
+def _inputs_sha256(source: CaptureSource, weights: str | None) -> str:
+    """Changes when any file that is read for the capture does."""
+    import hashlib
+
+    from splinecli.evaluation.trials import stamp_files
+    from splinecli.files import file_sha256
+
+    flats = [
+        (str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns)
+        for path in source.development.flat_field
+    ]
+    own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
+    stamps = [*stamp_files(source.files), flats, own_weights]
+    return hashlib.sha256(json.dumps(stamps).encode()).hexdigest()
 
 
 def _refuse_same_names(captures: list[Path]) -> None:

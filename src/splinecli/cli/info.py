@@ -84,6 +84,9 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         {(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images}
     )
     elevations, bright = summary.elevations_deg, [image.bright for image in summary.images]
+    strengths = files.light_intensities
+    if strengths is None and (source.light_intensities != 1).any():
+        strengths = files.light_directions  # AliceVision's hold both
     # Observations in float32, the estimate in float32, and one image as it is decoded.
     first = summary.images[0]
     mib = (
@@ -100,7 +103,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         ],
         "n_pixels": summary.n_pixels,
         "light_directions": str(files.light_directions),
-        "light_intensities": None if files.light_intensities is None else str(files.light_intensities),
+        "light_intensities": str(strengths) if strengths is not None else None,
         "mask": None if files.mask is None else str(files.mask),
         "ground_truth": None if files.ground_truth is None else str(files.ground_truth),
         "elevation_deg": [round(float(elevations.min()), 1), round(float(elevations.max()), 1)],

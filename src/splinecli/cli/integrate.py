@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-REPORT = "surface.json"
-NORMALS = "normals.npy"
+NORMALS = ("normals.npy", "normals.tiff", "normals.png")
 
 
 def integrate(
@@ -82,17 +81,17 @@ def integrate(
     from splinecli.files import check_writable, write_text
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
-    from splinecli.surface.surface_files import SURFACE_FILES, write_surface
+    from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, write_surface
 
     wanted = split_commas(formats, "--format", list(SURFACE_FILES))
     folder = output or (normals if normals.is_dir() else normals.parent)
     check_writable(folder)
-    for name in (*(SURFACE_FILES[form] for form in wanted), REPORT):
+    for name in (*(SURFACE_FILES[form] for form in wanted), SURFACE_REPORT):
         if (folder / name).exists() and not overwrite:
             raise OutputError(
                 f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
             )
-    normal_map = read_normal_map(normals / NORMALS if normals.is_dir() else normals)
+    normal_map = read_normal_map(_find_in(normals) if normals.is_dir() else normals)
     if convention is NormalConvention.directx:
         normal_map[..., 1] *= -1
     inside = np.asarray(normal_map.any(axis=2))
@@ -127,11 +126,11 @@ def integrate(
         "n_triangles": len(mesh.triangles),
         "stiffness": stiffness,
         "seconds": round(time.perf_counter() - started, 3),
-        "files": [*(SURFACE_FILES[form] for form in wanted), REPORT],
+        "files": [*(SURFACE_FILES[form] for form in wanted), SURFACE_REPORT],
     }
     folder.mkdir(parents=True, exist_ok=True)
     write_surface(folder, depth, mesh, wanted)
-    write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
+    write_text(folder / SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     if as_json:
         print(json.dumps(report, indent=2))
     elif not quiet:
@@ -139,6 +138,17 @@ def integrate(
         print(
             f"{folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit}, {report['seconds']:.1f} s"
         )
+
+
+def _find_in(folder: Path) -> Path:
+    for name in NORMALS:
+        if (folder / name).is_file():
+            return folder / name
+    raise InputError(
+        f"holds no normal map ({', '.join(NORMALS)})",
+        path=folder,
+        hint="Give a folder that 'splinecli infer' wrote",
+    )
 
 
 def _read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:

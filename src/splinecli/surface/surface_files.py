@@ -15,6 +15,9 @@ from splinecli.surface.mesh import SurfaceMesh, write_mesh
 SURFACE_FILES = {"ply": "mesh.ply", "obj": "mesh.obj", "npy": "depth.npy", "tiff": "depth.tiff"}
 """By the names of their forms."""
 
+SURFACE_REPORT = "surface.json"
+"""Beside them, where `integrate` wrote them."""
+
 USUAL_FORMS = ("ply", "npy", "tiff")
 
 

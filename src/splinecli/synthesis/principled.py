@@ -45,7 +45,8 @@ class PrincipledMaterial:
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
         """pi times the reflected radiance (P, D); arguments as in Material.shade."""
         lit = n_dot_l.clamp(min=0)
-        l_dot_h = ((1 + l_dot_v) / 2).sqrt()
+        # Light from behind what is seen has no half vector; rounding would make it NaN.
+        l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
         n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
         n_dot_h_squared = n_dot_h * n_dot_h
         fresnel = schlick_weight(l_dot_h)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.errors import ModelError, UsageError
+from splinecli.networks.weights import shipped_names
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 
 DEFAULT_PRESET = "compact"
@@ -81,7 +82,10 @@ def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
     pixels = config.pixels
     if pixels.measured_materials:
         pixels = replace(pixels, measured_materials=str(Path(pixels.measured_materials).absolute()))
-    return replace(config, sources=sources, pixels=pixels)
+    start_from = config.start_from
+    if start_from and start_from not in shipped_names():
+        start_from = str(Path(start_from).absolute())
+    return replace(config, sources=sources, pixels=pixels, start_from=start_from)
 
 
 def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
