@@ -83,7 +83,7 @@ def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
     if pixels.measured_materials:
         pixels = replace(pixels, measured_materials=str(Path(pixels.measured_materials).absolute()))
     start_from = config.start_from
-    if start_from and start_from not in shipped_names():
+    if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
         start_from = str(Path(start_from).absolute())
     return replace(config, sources=sources, pixels=pixels, start_from=start_from)
 
