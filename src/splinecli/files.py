@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -65,6 +65,16 @@ def check_writable(folder: Path) -> None:
         )
     if not os.access(place, os.W_OK | os.X_OK):
         raise OutputError("may not be written into", path=place, hint="Choose another place with -o")
+
+
+def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
+    """Raise OutputError where the folder holds one of the names and may not lose it, or could not be written into."""
+    check_writable(folder)
+    for name in () if overwrite else names:
+        if (folder / name).exists():
+            raise OutputError(
+                f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
+            )
 
 
 @contextmanager

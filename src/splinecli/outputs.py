@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.files import check_writable, current_umask, refusals_as_output_errors
+from splinecli.files import current_umask, refusals_as_output_errors
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
@@ -44,28 +44,19 @@ RAKING_LIGHT = (-0.72, 0.48, 0.5)
 """Of the preview: low, from the upper left, as relief is looked at."""
 
 
-def check_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError where the folder holds results that may not be overwritten, or could not be written."""
-    check_writable(folder)
-    if overwrite:
-        return
-    for name in OWN_FILES:
-        if (folder / name).exists():
-            raise OutputError(
-                f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
-            )
-
-
-def finished_report(folder: Path, options: dict[str, Any], inputs: str) -> dict[str, Any] | None:
+def finished_report(
+    folder: Path, options: dict[str, Any], inputs: Callable[[], str]
+) -> dict[str, Any] | None:
     """The report in the folder; None unless this version made it, of these inputs, as asked for, and all is there."""
     try:
         report = json.loads((folder / REPORT).read_text("utf-8"))
         whole = all((folder / name).is_file() for name in report["files"])
-        same = (report["options"], report["inputs_sha256"]) == (json.loads(json.dumps(options)), inputs)
-        same = same and report["version"] == __version__
+        same = (report["options"], report["version"]) == (json.loads(json.dumps(options)), __version__)
+        # Last, for it reads the capture's small files.
+        same = same and whole and report["inputs_sha256"] == inputs()
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return report if whole and same else None
+    return report if same else None
 
 
 def report_of(

@@ -97,7 +97,7 @@ class CaptureSource:
                     path=path,
                 )
             pixels = stored[mask]
-            n_saturated += _count_saturated(pixels)
+            n_saturated += count_saturated(pixels)
             observations[:, position] = _observe(develop(pixels, path, index), self.light_intensities[index])
             n_8_bit += stored.dtype == np.uint8
             stored = None  # let go before the next is decoded: one full image at a time
@@ -241,7 +241,8 @@ def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDA
     return linear @ weights.astype(np.float32)
 
 
-def _count_saturated(pixels: NDArray[Any]) -> int:
+def count_saturated(pixels: NDArray[Any]) -> int:
+    """How many stored pixels (P, C) have a channel at full scale; floating-point ones have none."""
     if pixels.dtype.kind != "u":
         return 0
     return int(np.count_nonzero((pixels == np.iinfo(pixels.dtype).max).any(axis=1)))

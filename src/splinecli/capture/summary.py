@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.development import Developer
 from splinecli.capture.images import to_linear
-from splinecli.capture.reader import SATURATED_SHARE, CaptureSource
+from splinecli.capture.reader import SATURATED_SHARE, CaptureSource, count_saturated
 
 DARK = 0.05
 """An image whose 99 % quantile lies below this share of full scale is called dark."""
@@ -86,18 +86,16 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         stored = decode_image(path)
         if mask is None:
             mask = source.read_mask(stored.shape[:2])
-            Developer(
-                source.development, mask, len(source.files.images)
-            )  # raises where ambient or flats do not fit
+            # It refuses ambient images and flat fields that do not fit.
+            Developer(source.development, mask, len(source.files.images))
         pixels = stored[mask] if mask.shape == stored.shape[:2] else stored.reshape(-1, stored.shape[2])
-        full = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else np.inf
         images.append(
             ImageSummary(
                 path,
                 stored.shape,
                 str(stored.dtype),
                 float(np.quantile(to_linear(pixels, path), 0.99)),
-                float((pixels >= full).any(axis=1).mean()),
+                count_saturated(pixels) / len(pixels),
             )
         )
         if progress is not None:

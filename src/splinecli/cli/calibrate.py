@@ -10,7 +10,7 @@ import typer
 
 from splinecli.cli.options import JsonOption, QuietOption
 from splinecli.cli.talk import Talk
-from splinecli.errors import OutputError, UsageError
+from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,19 +74,15 @@ def calibrate(
     from splinecli.calibration.picture import calibration_picture
     from splinecli.capture.development import is_display_encoded
     from splinecli.capture.light_files import read_light_directions
-    from splinecli.files import check_writable, write_bytes, write_text
+    from splinecli.files import check_free, write_bytes, write_text
+    from splinecli.outputs import encode_png
 
     talk = Talk(quiet=quiet)
     if gray_ball and gray_card:
         raise UsageError("--gray-ball and --gray-card exclude each other")
     circles = _for_each("--circle", [_parse_circle(text) for text in circle or []], len(balls))
     masks = _for_each("--mask", mask or [], len(balls))
-    check_writable(output)
-    for name in OWN_FILES:
-        if (output / name).exists() and not overwrite:
-            raise OutputError(
-                f"holds {name} already", path=output, hint="Add --overwrite, or choose another place with -o"
-            )
+    check_free(output, OWN_FILES, overwrite=overwrite)
     target = gray_ball or gray_card
     gray_files = None if target is None else find_ball_files(target)
     files = [find_ball_files(folder, mask=own) for folder, own in zip(balls, masks, strict=True)]
@@ -112,7 +108,7 @@ def calibrate(
     write_text(output / DIRECTIONS, _rows(lights.directions))
     if strengths is not None:
         write_text(output / INTENSITIES, _rows(strengths))
-    write_bytes(output / PICTURE, _png(calibration_picture(lights.balls)))
+    write_bytes(output / PICTURE, encode_png(calibration_picture(lights.balls)))
     write_text(output / REPORT, json.dumps(report, indent=2) + "\n")
     for line in _told(report):
         talk.say(line)
@@ -146,12 +142,6 @@ def _parse_circle(text: str) -> Circle:
 
 def _rows(values: NDArray[np.float64]) -> str:
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)
-
-
-def _png(picture: NDArray[np.uint8]) -> bytes:
-    import cv2
-
-    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
 
 
 def _report(

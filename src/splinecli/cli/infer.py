@@ -110,8 +110,9 @@ def infer(
     from splinecli.capture import capture_name
     from splinecli.capture.record import check_light_indices
     from splinecli.evaluation.draws import check_draw_settings
+    from splinecli.files import check_free
     from splinecli.methods import MethodOptions, check_method
-    from splinecli.outputs import MAPS, NORMALS, check_free, finished_report
+    from splinecli.outputs import MAPS, NORMALS, OWN_FILES, finished_report
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
@@ -145,10 +146,12 @@ def infer(
     for folder in captures:
         target = output / capture_name(folder)
         report = (
-            None if overwrite or len(captures) == 1 else finished_report(target, options, inputs_of(folder))
+            None
+            if overwrite or len(captures) == 1
+            else finished_report(target, options, partial(inputs_of, folder))
         )
         if report is None:
-            check_free(target, overwrite=overwrite)
+            check_free(target, OWN_FILES, overwrite=overwrite)
         else:
             finished[folder] = report
     job = _Job(
@@ -321,13 +324,10 @@ def _inputs_sha256(source: CaptureSource, weights: str | None) -> str:
     """Changes when any file that is read for the capture does."""
     import hashlib
 
-    from splinecli.evaluation.trials import stamp_files
+    from splinecli.evaluation.trials import place_size_and_time, stamp_files
     from splinecli.files import file_sha256
 
-    flats = [
-        (str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns)
-        for path in source.development.flat_field
-    ]
+    flats = [place_size_and_time(path) for path in source.development.flat_field]
     own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
     stamps = [*stamp_files(source.files), flats, own_weights]
     return hashlib.sha256(json.dumps(stamps).encode()).hexdigest()

@@ -11,7 +11,7 @@ import typer
 
 from splinecli.cli.options import JsonOption, NormalConvention, QuietOption, split_commas
 from splinecli.cli.talk import Talk
-from splinecli.errors import InputError, OutputError
+from splinecli.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -78,19 +78,14 @@ def integrate(
     import numpy as np
 
     from splinecli.capture import read_normal_map
-    from splinecli.files import check_writable, write_text
+    from splinecli.files import check_free, write_text
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
     from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, write_surface
 
     wanted = split_commas(formats, "--format", list(SURFACE_FILES))
     folder = output or (normals if normals.is_dir() else normals.parent)
-    check_writable(folder)
-    for name in (*(SURFACE_FILES[form] for form in wanted), SURFACE_REPORT):
-        if (folder / name).exists() and not overwrite:
-            raise OutputError(
-                f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
-            )
+    check_free(folder, (*(SURFACE_FILES[form] for form in wanted), SURFACE_REPORT), overwrite=overwrite)
     normal_map = read_normal_map(_find_in(normals) if normals.is_dir() else normals)
     if convention is NormalConvention.directx:
         normal_map[..., 1] *= -1

@@ -105,8 +105,13 @@ def stamp_files(files: CaptureFiles) -> list[Any]:
     """What changes when a file of the capture does; images by place, size and time alone, the others by content."""
     named = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
     contents = [file_sha256(path) for path in (*files.boundaries, *named) if path is not None]
-    stamps = [(str(path.resolve()), (s := path.stat()).st_size, s.st_mtime_ns) for path in files.images]
-    return [contents, stamps]
+    return [contents, [place_size_and_time(path) for path in files.images]]
+
+
+def place_size_and_time(path: Path) -> tuple[str, int, int]:
+    """The stamp of a file that is too large to be read for it."""
+    found = path.stat()
+    return str(path.resolve()), found.st_size, found.st_mtime_ns
 
 
 def plan_trials(
