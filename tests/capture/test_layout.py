@@ -133,7 +133,7 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         find_capture_files(tmp_path / "empty")
     assert str(caught.value) == (
-        f"{tmp_path / 'empty'}: the folder holds no images. PNG, TIFF and JPEG files count as images."
+        f"{tmp_path / 'empty'}: the folder holds no images. PNG, TIFF, JPEG and RAW files count as images."
     )
     with pytest.raises(InputError) as caught:
         find_capture_files(tmp_path / "dark")
@@ -210,7 +210,7 @@ def test_psbox_without_images(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         find_capture_files(folder)
     assert str(caught.value) == (
-        f"{folder / 'Objects'}: the folder holds no images. PNG, TIFF and JPEG files count as images."
+        f"{folder / 'Objects'}: the folder holds no images. PNG, TIFF, JPEG and RAW files count as images."
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splinecli.capture.image_lists import IMAGE_SUFFIXES, list_folder
+from splinecli.capture.image_lists import IMAGE_SUFFIXES, PICTURE_SUFFIXES, list_folder
 from splinecli.capture.paths import find_mode, is_file, resolve
 from splinecli.errors import InputError
 
@@ -18,7 +18,7 @@ NAMED_LIGHTS = (".lp", "lights.json")
 LIGHT_FILES = f"{', '.join(LIGHT_DIRECTIONS)}, *.lp or lights.json"
 """The names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
-MASK = tuple(f"mask{suffix}" for suffix in IMAGE_SUFFIXES)
+MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
 AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
 GROUND_TRUTH = tuple(
     f"{stem}{suffix}"

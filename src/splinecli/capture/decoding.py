@@ -1,4 +1,4 @@
-"""PNG, JPEG and TIFF files as pixels, exactly as stored; damaged files are refused, never half read.
+"""PNG, JPEG and TIFF files as pixels, exactly as stored, and RAW files; damaged ones are refused, never half read.
 
 OpenCV fills what is missing of a truncated file with gray and only mutters on stderr, so the container is
 checked before it is decoded, and what the C libraries say is kept off stderr and read instead.
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.raw import RAW_SUFFIXES, decode_raw
 from splinecli.capture.tiff import decode_tiff
 from splinecli.errors import InputError
 
@@ -41,11 +42,11 @@ def decode_image(path: Path) -> NDArray[Any]:
     """The pixels of a PNG, JPEG or TIFF file as stored: (H, W, C), C 1 or 3 (RGB), alpha dropped.
 
     The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). The
-    format is told by content, not by name. An EXIF orientation is ignored: all images of a capture share one
-    pixel grid.
+    format is told by content, not by name, but for RAW files, which are developed (see decode_raw). An EXIF
+    orientation is ignored: all images of a capture share one pixel grid.
 
     Raises:
-        InputError: the file is missing, of another format, truncated or damaged.
+        InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy.
     """
     return decode_with_alpha(path)[0]
 
@@ -53,7 +54,9 @@ def decode_image(path: Path) -> NDArray[Any]:
 def decode_with_alpha(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """The pixels as decode_image gives them, and the alpha channel (H, W), None where there is none."""
     data = _read_bytes(path)
-    if data.startswith(_TIFF):
+    if data and path.suffix.lower() in RAW_SUFFIXES:
+        pixels = decode_raw(data, path, native_stderr)
+    elif data.startswith(_TIFF):
         pixels = decode_tiff(path, lambda: _decode_with_opencv(data, path))
     elif data.startswith(_PNG):
         _check_png(data, path)
@@ -95,7 +98,7 @@ def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
     """(H, W) or (H, W, C), colour in RGB or RGBA order."""
     import cv2
 
-    with _native_stderr() as said:
+    with native_stderr() as said:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
             pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -148,7 +151,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
 
 
 @contextmanager
-def _native_stderr() -> Iterator[list[str]]:
+def native_stderr() -> Iterator[list[str]]:
     """Keep what C libraries print away from stderr; the list holds it after the block.
 
     It swaps file descriptor 2, which belongs to the whole process, so one thread at a time, and only around

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from splinecli.capture.decoding import native_stderr
+from splinecli.capture.raw import RAW_SUFFIXES, read_shot
 from splinecli.errors import InputError
 
 _EXIF, _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x8769, 0x829A, 0x829D, 0x8827
@@ -35,17 +39,37 @@ class Exposure:
 
 def read_exposure(path: Path) -> Exposure | None:
     """Of an image file; None where it does not say, or not all."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:  # reads the header alone
-            tags = image.getexif().get_ifd(_EXIF)
-        seconds, f_number, iso = tags[_EXPOSURE_TIME], tags[_F_NUMBER], tags[_ISO]
+        seconds, f_number, iso = _read_raw(path) if path.suffix.lower() in RAW_SUFFIXES else _read_tags(path)
         exposure = Exposure(float(seconds), float(f_number), float(iso[0] if isinstance(iso, tuple) else iso))
     except Exception:  # damaged tags surface as any of a dozen types, and are no reason to refuse the picture
         return None
     usable = all(0 < value < math.inf for value in (exposure.seconds, exposure.f_number, exposure.iso))
     return exposure if usable else None
+
+
+def _read_tags(path: Path) -> tuple[Any, Any, Any]:
+    from PIL import Image
+
+    with Image.open(path) as image:  # reads the header alone
+        tags = image.getexif().get_ifd(_EXIF)
+    return tags[_EXPOSURE_TIME], tags[_F_NUMBER], tags[_ISO]
+
+
+def _read_raw(path: Path) -> tuple[Any, Any, Any]:
+    from PIL import Image
+
+    tags = Image.Exif()
+    # Pillow knows no sensors' pixels, but can be given the header alone where it is TIFF's: most cameras'.
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of tags that are not as Pillow expects them
+        try:
+            tags.load_from_fp(file)
+        except SyntaxError:
+            with native_stderr():
+                return read_shot(path)
+        exif = tags.get_ifd(_EXIF)
+    return exif[_EXPOSURE_TIME], exif[_F_NUMBER], exif[_ISO]
 
 
 def check_exposures(images: Sequence[Path]) -> None:

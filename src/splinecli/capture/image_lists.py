@@ -8,10 +8,16 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from splinecli.capture.paths import find_mode, is_file, resolve
+from splinecli.capture.raw import RAW_SUFFIXES
 from splinecli.capture.text_files import read_lines
 from splinecli.errors import InputError
 
-IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+_DEVELOPED = (".png", ".tif", ".tiff")
+_JPEG = (".jpg", ".jpeg")
+PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)
+"""Of pictures that need not be photographs, such as masks."""
+IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)
+"""Of photographs, by rank: see list_images."""
 
 _DIGITS = re.compile(r"([0-9]+)")
 
@@ -48,18 +54,31 @@ def list_images(
 ) -> tuple[Path, ...]:
     """The images of the folder in natural order, by their suffixes.
 
+    Where a RAW file and others share a stem, they are one photograph: a PNG or TIFF was developed from the RAW file
+    and counts in its place, and a JPEG is the copy that cameras put beside it and does not count.
+
     Args:
         leave_out_stems: lower-case names without suffix that mean something else, such as "mask".
         leave_out: files that mean something else.
     """
     others = {resolve(path) for path in leave_out}
-    return tuple(
+    images = [
         entry
         for entry in list_folder(folder)
         if entry.suffix.lower() in IMAGE_SUFFIXES
         and entry.stem.lower() not in leave_out_stems
         and is_file(entry)
         and resolve(entry) not in others
+    ]
+    raw, developed = (
+        {image.stem.lower() for image in images if image.suffix.lower() in suffixes}
+        for suffixes in (RAW_SUFFIXES, _DEVELOPED)
+    )
+    return tuple(
+        image
+        for image in images
+        if image.stem.lower() not in raw
+        or image.suffix.lower() in (_DEVELOPED if image.stem.lower() in developed else RAW_SUFFIXES)
     )
 
 
@@ -67,7 +86,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise InputError where there are no images in the folder."""
     if not images:
         raise InputError(
-            "the folder holds no images", path=folder, hint="PNG, TIFF and JPEG files count as images"
+            "the folder holds no images", path=folder, hint="PNG, TIFF, JPEG and RAW files count as images"
         )
 
 
