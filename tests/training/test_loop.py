@@ -38,6 +38,7 @@ from splinecli.training.loop import (
     learning_rate,
     stream_seed,
 )
+from splinecli.training.objective import compute_losses
 from splinecli.training.pixel_sets import PixelSet
 from splinecli.training.records import METRICS, Metrics, read_metrics
 from splinecli.training.validation import validation_deg
@@ -234,6 +235,27 @@ def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_pat
     trained = second.network.state_dict()
     again = Trainer(replace(config, steps=99), tmp_path / "second", CPU, resume=True)
     assert all(torch.equal(again.network.state_dict()[name], trained[name]) for name in trained)
+
+
+def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Path) -> None:
+    Trainer(tiny, tmp_path / "first", CPU).run()
+    config = replace(
+        tiny, network=replace(tiny.network, error_head=True), updates="error_head", steps=40, learning_rate=0.01,
+        start_from=str(tmp_path / "first" / WEIGHTS), average_decay=0.0, weight_decay=0.1,
+    )  # fmt: skip
+    second = Trainer(config, tmp_path / "second", CPU)
+    batch, _, _ = second.draw()
+    before = compute_losses(second.network, batch, config, part="error_head").total.item()
+    second.run()
+    assert compute_losses(second.network, batch, config, part="error_head").total.item() < before - 0.1
+    # Normals are what they were, to the last bit.
+    first, last = (load_weights(tmp_path / name / WEIGHTS).network for name in ("first", "second"))
+    assert set(last.state_dict()) - set(first.state_dict()) == {
+        f"ne_net.error_head.layers.{layer}.{kind}" for layer in (0, 2) for kind in ("weight", "bias")
+    }
+    assert all(torch.equal(last.state_dict()[name], value) for name, value in first.state_dict().items())
+    with pytest.raises(ModelError, match=r"expected network\.error_head = true"):
+        replace(tiny, updates="error_head")
 
 
 def test_weights_of_another_network_cannot_begin_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:

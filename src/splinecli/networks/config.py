@@ -9,7 +9,12 @@ from splinecli.errors import ModelError
 from splinecli.networks.starting_fits import STARTING_FITS
 from splinecli.observation_map import MAP_SIZE, Grid
 
-_CHOICES = {"size": ("paper", "compact"), "grid": get_args(Grid), "interpolates": (True, False)}
+_CHOICES = {
+    "size": ("paper", "compact"),
+    "grid": get_args(Grid),
+    "interpolates": (True, False),
+    "error_head": (True, False),
+}
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,7 @@ class NetworkConfig:
         fits: whose normals NE-Net starts from, among the STARTING_FITS, beside the robust Lambertian one; of the
             compact size alone.
         interpolates: whether there is a LI-Net. Without it NE-Net reads the sparse map alone, which is CNN-PS.
+        error_head: whether NE-Net tells its error, too; of the compact size alone.
         width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's
             hidden features of the compact size; the paper size has fixed layers and ignores them.
     """
@@ -36,6 +42,7 @@ class NetworkConfig:
     grid: Grid = "even"
     fits: tuple[str, ...] = ()
     interpolates: bool = True
+    error_head: bool = False
 
     @property
     def is_canonical(self) -> bool:
@@ -72,6 +79,8 @@ class NetworkConfig:
             raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
         if config.fits and config.size != "compact":
             raise ModelError("network setting 'fits' is for the size 'compact' alone")
+        if config.error_head and config.size != "compact":
+            raise ModelError("network setting 'error_head' is for the size 'compact' alone")
         if config.grid != "even" and config.size != "paper":
             raise ModelError(f"network grid is {config.grid!r}; only the size 'paper' has it")
         return config

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from splinecli.networks.error_head import ErrorHead
 from splinecli.networks.layers import MapEncoder
 
 DROPOUT = 0.2
@@ -58,12 +59,20 @@ class _DenseBlock(nn.Module):
 class CompactNENet(nn.Module):
     """Maps (P, C, w, w) and the normals that K + 1 fits give (P, K + 1, 3) -> (P, 3), not yet of unit length.
 
-    A weighted sum of the fits' normals plus a correction. At first the first fit has the weight 1 and all else is
-    zero; with K = 0 that weight is fixed.
+    Beside them stands what the error head says (P, 2), None without one. A weighted sum of the fits' normals plus a
+    correction: at first the first fit has the weight 1 and all else is zero; with K = 0 that weight is fixed.
     """
 
     def __init__(
-        self, channels: int, width: int, blocks: int, head_width: int, map_size: int, fits: int = 0
+        self,
+        channels: int,
+        width: int,
+        blocks: int,
+        head_width: int,
+        map_size: int,
+        fits: int = 0,
+        *,
+        error_head: bool = False,
     ) -> None:
         super().__init__()
         self.encoder = MapEncoder(channels, width, blocks, map_size)
@@ -81,8 +90,9 @@ class CompactNENet(nn.Module):
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
                 self.weigh.bias.copy_(torch.arange(fits + 1) == 0)
+        self.error_head = ErrorHead(head_width, fits + 2) if error_head else None
 
-    def forward(self, maps: Tensor, normals: Tensor) -> Tensor:
+    def forward(self, maps: Tensor, normals: Tensor) -> tuple[Tensor, Tensor | None]:
         features = torch.relu(self.squeeze(torch.relu(self.encoder(maps))))
         # Patches first, channels last: the order in memory, so that flattening copies nothing.
         hidden = self.hidden(features.permute(0, 2, 3, 1).flatten(1))
@@ -93,5 +103,8 @@ class CompactNENet(nn.Module):
             # In float32, whatever the layers compute in: the normals' digits are needed.
             weight = self.weigh(torch.relu(hidden)).float()
             start = (weight[..., None] * normals).sum(dim=1)
-        out: Tensor = start + self.out(torch.relu(hidden))
-        return out
+        hidden = torch.relu(hidden)
+        out: Tensor = start + self.out(hidden)
+        if self.error_head is None:
+            return out, None
+        return out, self.error_head(hidden, torch.cat((normals, out[:, None].to(normals.dtype)), dim=1))

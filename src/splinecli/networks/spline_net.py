@@ -74,7 +74,13 @@ class SplineNet(nn.Module):
         else:
             self.li_net = CompactLINet(4, width, config.li_blocks, size) if config.interpolates else None
             self.ne_net = CompactNENet(
-                4 + maps, width, config.ne_blocks, config.head_width, size, len(config.fits)
+                4 + maps,
+                width,
+                config.ne_blocks,
+                config.head_width,
+                size,
+                len(config.fits),
+                error_head=config.error_head,
             )
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
@@ -150,14 +156,18 @@ class SplineNet(nn.Module):
 
     def estimate(self, views: Views, dense: Tensor | None) -> Tensor:
         """NE-Net: unit normals (P, 3) in the pixels' frames."""
+        return self.estimate_with_error(views, dense)[0]
+
+    def estimate_with_error(self, views: Views, dense: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """NE-Net: unit normals (P, 3) in the pixels' frames, and what its error head says (P, 2), None without one."""
         interpolated = [] if dense is None else [dense.to(views.sparse.dtype)]
         if self.config.size == "paper":
-            raw: Tensor = self.ne_net(torch.cat((views.sparse, *interpolated), dim=1))
+            raw, error = self.ne_net(torch.cat((views.sparse, *interpolated), dim=1)), None
         else:
             seen = (views.sparse, views.holds, views.residual, views.lambertian_map)
             normals = torch.cat((views.lambertian_normals[:, None], views.fitted_normals), dim=1)
-            raw = self.ne_net(torch.cat((*seen, *interpolated), dim=1), normals)
-        return nn.functional.normalize(raw.float(), dim=-1)
+            raw, error = self.ne_net(torch.cat((*seen, *interpolated), dim=1), normals)
+        return nn.functional.normalize(raw.float(), dim=-1), error
 
     def forward(
         self,
@@ -169,10 +179,25 @@ class SplineNet(nn.Module):
         mirror: bool = False,
     ) -> Tensor:
         """Unit normals (P, 3) in the capture's frame; arguments as in `look`."""
+        return self.normals_with_error(
+            observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror
+        )[0]
+
+    def normals_with_error(
+        self,
+        observations: Tensor,
+        light_directions: Tensor,
+        valid: Tensor | None = None,
+        *,
+        turn_deg: float | Tensor = 0.0,
+        mirror: bool = False,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Unit normals (P, 3) in the capture's frame, and what the error head says (P, 2), None without one."""
         # Only the convolutions may run in bfloat16: the fit and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):
             views = self.look(observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror)
-        return to_capture_frame(self.estimate(views, self.interpolate(views)), views)
+        normals, error = self.estimate_with_error(views, self.interpolate(views))
+        return to_capture_frame(normals, views), error
 
 
 def to_capture_frame(normals: Tensor, views: Views) -> Tensor:

@@ -27,7 +27,8 @@ class TrainingConfig:
         shards: parts of a batch, drawn each from a random stream of its own; so many processes can share the
             drawing, and any number that divides `shards` sees the same batches.
         updates: "joint", both networks at each step, or "alternating", the paper's way: `ne_net_updates` steps
-            for NE-Net, then one for LI-Net, while the other is fixed.
+            for NE-Net, then one for LI-Net, while the other is fixed; or "error_head", which fixes both and trains
+            NE-Net's guess of its own error alone.
         learning_rate: the schedule's top; it rises over `warmup_steps` and then falls, by a cosine to a
             hundredth, or ("stepped", the authors' way) to a tenth over the last tenth.
         steps, minutes: the run's length; minutes wins where it is above 0.
@@ -51,7 +52,7 @@ class TrainingConfig:
     held_share: float = 0.1
     batch_size: int = 256
     shards: int = 4
-    updates: Literal["joint", "alternating"] = "joint"
+    updates: Literal["joint", "alternating", "error_head"] = "joint"
     ne_net_updates: int = 5
     learning_rate: float = 1.5e-3
     schedule: Literal["cosine", "stepped"] = "cosine"
@@ -96,6 +97,10 @@ class TrainingConfig:
             raise ModelError(
                 "training setting 'updates' is 'alternating'; without a LI-Net there is nothing to alternate with"
             )
+        if self.updates == "error_head" and not self.network.error_head:
+            raise ModelError(
+                "training setting 'updates' is 'error_head'; expected network.error_head = true with it"
+            )
         if not sum(self.sources.values()) > 0:
             raise ModelError("training setting 'sources' gives no source a weight above 0")
 
@@ -126,7 +131,7 @@ class TrainingConfig:
 
 
 _CHOICES = {
-    "updates": ("joint", "alternating"),
+    "updates": ("joint", "alternating", "error_head"),
     "schedule": ("cosine", "stepped"),
     "precision": ("bfloat16", "float32"),
     "li_net_norm": ("mean", "sum"),

@@ -21,13 +21,18 @@ AXIS_LENGTH = 0.01
 
 
 def angular_loss(normals: Tensor, truth: Tensor) -> Tensor:
-    """arccos(n . n_gt) in radians, mean over pixels; normals, truth (P, 3) unit.
+    """arccos(n . n_gt) in radians, mean over pixels; normals, truth (P, 3) unit."""
+    return angles(normals, truth).mean()
+
+
+def angles(normals: Tensor, truth: Tensor) -> Tensor:
+    """arccos(n . n_gt) in radians, (P,).
 
     As atan2(|n x n_gt|, n . n_gt): the same angle with a bounded gradient, where that of arccos is infinite
     at 0.
     """
     sine = torch.linalg.cross(normals, truth).square().sum(-1).add(1e-12).sqrt()
-    return torch.atan2(sine, (normals * truth).sum(-1)).mean()
+    return torch.atan2(sine, (normals * truth).sum(-1))
 
 
 def map_loss(dense: Tensor, truth: Tensor, known: Tensor, norm: Norm = "mean") -> Tensor:

@@ -7,13 +7,15 @@ from contextlib import contextmanager
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from splinecli.networks.error_head import error_surprise
 from splinecli.networks.spline_net import SplineNet, Views, to_pixel_frame
 from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig
 from splinecli.training.losses import (
+    angles,
     angular_loss,
     asymmetric_loss,
     asymmetries,
@@ -22,7 +24,7 @@ from splinecli.training.losses import (
     symmetric_loss,
 )
 
-Part = Literal["both", "ne_net", "li_net"]
+Part = Literal["both", "ne_net", "li_net", "error_head"]
 
 
 class Losses(NamedTuple):
@@ -44,6 +46,8 @@ def part_of_step(config: TrainingConfig, step: int) -> Part:
     """Which networks a step updates."""
     if config.updates == "joint":
         return "both"
+    if config.updates == "error_head":
+        return "error_head"
     return "li_net" if step % (config.ne_net_updates + 1) == config.ne_net_updates else "ne_net"
 
 
@@ -61,16 +65,22 @@ def compute_losses(
 
     LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
     NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). Where both are updated, the sum,
-    with the angle once.
+    with the angle once. The error head: minus the log-likelihood of the angle.
     """
     views = network.look(
         batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg, mirror=mirrored
     )
     normal_truth = to_pixel_frame(batch.scene.normals, views)
+    autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+    if part == "error_head":
+        with _fixed(network, part), autocast:
+            normals, error = network.estimate_with_error(views, network.interpolate(views))
+        assert error is not None, "TrainingConfig asks for an error head"
+        angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
+        return Losses(error_surprise(error, angle).mean(), angle.mean(), *[missing] * 4)
     with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
     # Half of the work of a batch; CNN-PS has no use for it.
     dense_truth = dense_truth_in_frame(batch, views, size=network.config.map_size) if with_maps else None
-    autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     with _fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
             dense = network.interpolate(views)
@@ -131,15 +141,17 @@ def dense_truth_in_frame(batch: PixelBatch, views: Views, *, size: int) -> Dense
 
 @contextmanager
 def _fixed(network: SplineNet, part: Part) -> Iterator[None]:
-    """The network that `part` leaves out takes no gradients inside; gradients still pass through it."""
-    fixed: nn.Module | None = {"both": None, "ne_net": network.li_net, "li_net": network.ne_net}[part]
-    if fixed is None:
-        yield
-        return
-    states = [(parameter, parameter.requires_grad) for parameter in fixed.parameters()]
-    fixed.requires_grad_(False)
+    """All but `part` takes no gradients inside; gradients still pass through it."""
+    inside = {"both": "", "ne_net": "ne_net.", "li_net": "li_net.", "error_head": "ne_net.error_head."}[part]
+    fixed = [
+        parameter
+        for name, parameter in network.named_parameters()
+        if not name.startswith(inside) and parameter.requires_grad
+    ]
+    for parameter in fixed:
+        parameter.requires_grad_(False)
     try:
         yield
     finally:
-        for parameter, state in states:
-            parameter.requires_grad_(state)
+        for parameter in fixed:
+            parameter.requires_grad_(True)
