@@ -11,7 +11,7 @@ import splinecli
 ROOMS = [
     {"__main__"},
     {"cli"},
-    {"page"},
+    {"page", "batch"},
     {"outputs"},
     {"evaluation", "training"},
     {"synthesis", "inference"},
@@ -19,7 +19,7 @@ ROOMS = [
     {"networks", "devices"},
     {"fits", "calibration"},
     {"capture", "observation_map", "surface"},
-    {"normals", "files", "transfer"},
+    {"normals", "files", "transfer", "templates"},
     {"errors", "__init__"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -35,6 +35,7 @@ REPORT: dict[str, Any] = {
     "seconds": {"read": 0.6, "estimate": 0.008},
     "peak_memory_mib": 86,
     "warnings": [],
+    "expected_under_5": 0.8123,
     "angular_error_deg": {"mean": 9.063, "median": 6.24, "p90": 18.1, "under_5": 0.3725, "under_10": 0.75},
     "version": "0.1.0",
 }
@@ -100,6 +101,8 @@ class Page(HTMLParser):
         assert source is not None
         png = base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True)
         picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        if picture.ndim == 2:
+            return np.repeat(picture[..., None], 3, axis=2)
         assert picture.shape[2] == 3  # alpha would be multiplied into the rest
         return np.asarray(picture[..., ::-1], np.uint8)
 
@@ -130,6 +133,7 @@ def test_figures_and_pictures() -> None:
             normals,
             mask,
             albedo=np.full_like(normals, 0.3) * mask[..., None],
+            confidence_map=mask.astype(np.float32) * 0.6,
             error_map_deg=errors,
         )
     )
@@ -145,22 +149,26 @@ def test_figures_and_pictures() -> None:
         "Lights": "10",
         "Pixels": "45,200",
         "Size": "296 × 321",
+        "Likely within 5°": "81% of the pixels",
         "Seconds": "read 0.6, estimate 0.008",
         "Computed on": "cpu, float32",
     }
     assert page.text["li"] == ["The images are 8-bit."]
-    assert page.alternative_texts == ["Normal map", "Albedo map", "Error map", ""]
+    assert page.alternative_texts == ["Normal map", "Albedo map", "Confidence map", "Error map", ""]
     assert (page.picture("Albedo map")[20, 20] == 255).all()  # the brightest hundredth is white
+    assert (page.picture("Confidence map")[20, 20] == 153).all()
     assert (page.picture("Error map")[~mask] == 255).all()
     assert {"0°", "30° and beyond"} <= set(page.text["span"])
 
 
 def test_what_is_not_given_is_absent() -> None:
     normals, mask = sphere(40)
-    html = result_page({**REPORT, "weights": None, "angular_error_deg": None}, normals, mask)
+    html = result_page(
+        {**REPORT, "weights": None, "angular_error_deg": None, "expected_under_5": None}, normals, mask
+    )
     page = Page(html)
     assert page.alternative_texts == ["Normal map", ""]
-    assert not {"Weights", "Mean", "Shown at"} & set(page.facts)
+    assert not {"Weights", "Mean", "Likely within 5°", "Shown at"} & set(page.facts)
     assert "Warnings" not in page.text["h2"]
     assert 'id="coloured"' not in html
     assert "beyond" not in "".join(page.text["figcaption"])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
+from splinecli.methods.estimator import tells_confidence
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
 TILE_PIXELS = 16_384
@@ -26,7 +27,9 @@ class NormalEstimate:
     """The normals of one capture.
 
     normal_map: (H, W, 3) float32, unit, zero outside the mask. error_map_deg: (H, W) float32, NaN where there
-    is no ground truth, or None without any; errors: its summary. seconds: spent estimating.
+    is no ground truth, or None without any; errors: its summary. seconds: spent estimating. confidence_map:
+    (H, W) float32, the probability that the normal is off by no more than CONFIDENT_DEG, zero outside the mask; None
+    where the method does not tell.
     """
 
     capture: Capture
@@ -34,6 +37,14 @@ class NormalEstimate:
     seconds: float
     error_map_deg: NDArray[np.float32] | None = None
     errors: AngularErrors | None = None
+    confidence_map: NDArray[np.float32] | None = None
+
+    @property
+    def expected_under_5(self) -> float | None:
+        """The share of the pixels whose normals are probably off by no more than 5 degrees; None without confidence."""
+        if self.confidence_map is None:
+            return None
+        return float(self.confidence_map[self.capture.mask].mean())
 
 
 def estimate_normals(
@@ -46,19 +57,32 @@ def estimate_normals(
     """Run an estimator over a capture, `tile_pixels` at a time; `progress` is told the pixels just done."""
     started = time.perf_counter()
     normals = np.empty((capture.n_pixels, 3), np.float32)
+    confidence = np.empty(capture.n_pixels, np.float32) if tells_confidence(estimator) else None
     for start in range(0, capture.n_pixels, tile_pixels):
         tile = capture.observations[start : start + tile_pixels]
-        normals[start : start + tile_pixels] = estimator.estimate(tile, capture.light_directions)
+        rows = slice(start, start + len(tile))
+        if confidence is None or not tells_confidence(estimator):
+            normals[rows] = estimator.estimate(tile, capture.light_directions)
+        else:
+            normals[rows], confidence[rows] = estimator.estimate_with_confidence(
+                tile, capture.light_directions
+            )
         if progress is not None:
             progress(len(tile))
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
     normal_map[capture.mask] = normals
+    confidence_map = None
+    if confidence is not None:
+        confidence_map = np.zeros(capture.mask.shape, np.float32)
+        confidence_map[capture.mask] = confidence
     if capture.ground_truth is None:
-        return NormalEstimate(capture, normal_map, seconds)
+        return NormalEstimate(capture, normal_map, seconds, confidence_map=confidence_map)
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
-    return NormalEstimate(capture, normal_map, seconds, error_map, summarise_errors(error_map))
+    return NormalEstimate(
+        capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map
+    )
 
 
 def _check_unit(normals: NDArray[np.float32], method: str) -> None:

@@ -24,11 +24,16 @@ from splinecli.normals import Convention, encode_picture
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT
 from splinecli.transfer import encode_srgb
 
-NORMALS = {"png": "normals.png", "npy": "normals.npy", "tiff": "normals.tiff"}
+NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
 ERROR_MAP = "error_map.png"
-REPORT, PAGE = "report.json", "page.html"
+REPORT, PAGE, MASK = "report.json", "page.html", "mask.png"
 ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
-MAPS = {"albedo": (ALBEDO_PICTURE, ALBEDO), "preview": (PREVIEW,)}
+CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
+MAPS = {
+    "albedo": (ALBEDO_PICTURE, ALBEDO),
+    "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
+    "preview": (PREVIEW,),
+}
 """The files of each map that is written where it is asked for."""
 OWN_FILES = (
     *NORMALS.values(),
@@ -36,6 +41,7 @@ OWN_FILES = (
     *(name for names in MAPS.values() for name in names),
     *SURFACE_FILES.values(),
     SURFACE_REPORT,
+    MASK,
     PAGE,
     REPORT,
 )
@@ -74,7 +80,7 @@ def report_of(
         options: what was asked for.
         inputs: SHA-256 over what tells that the files read are the same.
     """
-    capture = estimate.capture
+    capture, expected = estimate.capture, estimate.expected_under_5
     return {
         "capture": capture.name,
         "method": estimator.name,
@@ -91,6 +97,7 @@ def report_of(
         "angular_error_deg": None
         if estimate.errors is None
         else {name: round(value, 4) for name, value in asdict(estimate.errors).items()},
+        "expected_under_5": None if expected is None else round(expected, 4),
         "options": options,
         "inputs_sha256": inputs,
         "version": __version__,
@@ -140,9 +147,10 @@ def write_estimate(
 
 
 def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: Convention) -> None:
-    """The normal map as a 16-bit PNG picture, or as float32 NPY or TIFF."""
-    if form == "png":
-        picture = encode_picture(estimate.normal_map, estimate.capture.mask, convention=convention)
+    """The normal map as a 16-bit or 8-bit PNG picture, or as float32 NPY or TIFF."""
+    if form in ("png", "png8"):
+        bits = 8 if form == "png8" else 16
+        picture = encode_picture(estimate.normal_map, estimate.capture.mask, bits=bits, convention=convention)
         path.write_bytes(encode_png(picture))
     elif form == "npy":
         np.save(path, estimate.normal_map, allow_pickle=False)
@@ -158,6 +166,17 @@ def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], folder: P
     (folder / ALBEDO_PICTURE).write_bytes(encode_png(albedo_picture(albedo, mask)))
 
 
+def write_confidence(confidence_map: NDArray[np.float32], folder: Path) -> None:
+    """A confidence map (H, W) as float32 NPY and as a gray picture, 1 white."""
+    np.save(folder / CONFIDENCE, confidence_map, allow_pickle=False)
+    (folder / CONFIDENCE_PICTURE).write_bytes(encode_png(confidence_picture(confidence_map)))
+
+
+def write_mask(mask: NDArray[np.bool_], folder: Path) -> None:
+    """A mask (H, W) as a black and white picture."""
+    (folder / MASK).write_bytes(encode_png(mask * np.uint8(255)))
+
+
 def write_preview(estimate: NormalEstimate, folder: Path) -> None:
     """The shaded picture."""
     picture = preview_picture(estimate.normal_map, estimate.capture.mask)
@@ -170,6 +189,11 @@ def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDAr
     return encode_srgb(albedo / white)
 
 
+def confidence_picture(confidence_map: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """A confidence map (H, W) as an 8-bit gray picture (H, W): the share of white is the probability."""
+    return np.rint(255 * confidence_map).astype(np.uint8)
+
+
 def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """The surface, matte white under RAKING_LIGHT, as an 8-bit sRGB picture; black outside the mask (H, W)."""
     light = np.array(RAKING_LIGHT, np.float32)
@@ -178,10 +202,10 @@ def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) ->
 
 
 def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:
-    """PNG of an RGB picture (H, W, 3), 8 or 16 bits."""
+    """PNG of an RGB (H, W, 3) or gray (H, W) picture, 8 or 16 bits."""
     import cv2
 
-    done, encoded = cv2.imencode(".png", picture[..., ::-1])
+    done, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
     if not done:
         raise OutputError("the picture could not be encoded as PNG")
     return encoded.tobytes()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 
 from splinecli.evaluation.error_map import TOP_DEG, colour_errors
 from splinecli.normals import unit
-from splinecli.outputs import RAKING_LIGHT, albedo_picture, encode_png
+from splinecli.outputs import RAKING_LIGHT, albedo_picture, confidence_picture, encode_png
+from splinecli.templates import render
 
 LONGEST_SIDE = 1600
 """Pixels. Larger maps are reduced to it: a screen shows no more, and a page is to be mailed."""
@@ -21,7 +21,6 @@ LOW_BITS = 5
 """Below the 8 of a picture: 13 bits keep a normal within 0.01 degrees, where 8 bits would band a highlight. Those of
 16 would be noise, which no PNG compresses, and half of the page. The page's script knows this number, too."""
 
-_TEMPLATE = resources.files("splinecli") / "assets" / "page.html"
 _SIZE = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 
@@ -31,6 +30,7 @@ def result_page(
     mask: NDArray[np.bool_],
     *,
     albedo: NDArray[np.float32] | None = None,
+    confidence_map: NDArray[np.float32] | None = None,
     error_map_deg: NDArray[np.float32] | None = None,
 ) -> str:
     """One HTML file that holds all it shows, and asks no network for anything.
@@ -43,43 +43,39 @@ def result_page(
         report: of the contract (docs/conventions.md); `seconds.write` and `files` may be missing.
         normal_map: (H, W, 3), unit in the mask (H, W); x right, y up, z to the camera.
         albedo: (H, W, 3), linear, as albedo_map gives it.
+        confidence_map: (H, W), probabilities.
         error_map_deg: (H, W) degrees, NaN where there is none.
 
     Raises:
         OutputError: a picture cannot be encoded.
     """
-    from jinja2 import Environment, StrictUndefined
-
     normals, shown = _reduced(normal_map, mask)
     high, low = encode_halves(unit(normals), shown)
-    albedo_png = error_png = None
+    albedo_png = confidence_png = error_png = None
     if albedo is not None:
         albedo_png = _data_url(albedo_picture(_reduced(albedo, mask)[0], shown))
+    if confidence_map is not None:
+        confidence_png = _data_url(confidence_picture(_reduced(confidence_map[..., None], mask)[0][..., 0]))
     if error_map_deg is not None:
         errors, known = _reduced(error_map_deg[..., None], np.isfinite(error_map_deg))
         error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan), TOP_DEG))
     height, width = shown.shape
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return (
-        environment.from_string(_TEMPLATE.read_text("utf-8"))
-        .render(
-            report=report,
-            facts=_facts(report, reduced=(width, height) if shown.shape != mask.shape else None),
-            errors=_errors(report),
-            width=width,
-            height=height,
-            light=unit(np.array(RAKING_LIGHT))[:2].round(4).tolist(),
-            high=_data_url(high),
-            low=_data_url(low),
-            albedo=albedo_png,
-            error_map=error_png,
-            error_colours=_error_colours(),
-            error_ticks=[f"{TOP_DEG * third / 3:g}°" for third in range(4)],
-        )
-        .rstrip()
-        + "\n"
+    return render(
+        "page.html",
+        title=report["capture"],
+        report=report,
+        facts=_facts(report, reduced=(width, height) if shown.shape != mask.shape else None),
+        errors=_errors(report),
+        width=width,
+        height=height,
+        light=unit(np.array(RAKING_LIGHT))[:2].round(4).tolist(),
+        high=_data_url(high),
+        low=_data_url(low),
+        albedo=albedo_png,
+        confidence=confidence_png,
+        error_map=error_png,
+        error_colours=_error_colours(),
+        error_ticks=[f"{TOP_DEG * third / 3:g}°" for third in range(4)],
     )
 
 
@@ -114,13 +110,14 @@ def _reduced(
 
 def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> list[tuple[str, str]]:
     """Terms and their values; `reduced`: width and height of a page's maps that are not the capture's."""
-    weights = report["weights"]
+    weights, expected = report["weights"], report["expected_under_5"]
     return [
         ("Method", report["method"]),
         *([] if weights is None else [("Weights", weights["name"])]),
         ("Lights", str(report["n_lights"])),
         ("Pixels", f"{report['n_pixels']:,}"),
         ("Size", _SIZE.join(map(str, report["image_size"]))),
+        *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels")]),
         *([] if reduced is None else [("Shown at", _SIZE.join(map(str, reduced)))]),
         ("Seconds", ", ".join(f"{step} {seconds:g}" for step, seconds in report["seconds"].items())),
         ("Computed on", f"{report['device']}, {report['precision']}"),

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -102,12 +104,102 @@ def test_a_surface_in_the_albedo_s_colours(capture, run):
 
 
 def test_a_page_to_look_at(capture, run):
-    assert run("infer", capture, "--method", "ls", "--html", "--maps", "albedo").code == 0
+    assert run("infer", capture, "--method", "ls", "--html").code == 0
     page = Path("out/sphere/page.html").read_text("utf-8")
-    assert "page.html" in read_report(Path("out/sphere"))["files"]
+    assert {"page.html", "albedo.png"} & set(read_report(Path("out/sphere"))["files"]) == {"page.html"}
     assert page.count("data:image/png;base64,") >= 4  # normals in two halves, albedo, error map
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert "sphere" in page
+
+
+def test_how_sure_the_network_is(capture, run):
+    assert run("infer", capture, "--maps", "confidence", "--html", "--overwrite").code == 0
+    out, mask = Path("out/sphere"), cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    confidence, report = np.load(out / "confidence.npy"), read_report(out)
+    assert (confidence.dtype, confidence.shape) == (np.float32, mask.shape)
+    assert not confidence[~mask].any()
+    # A matte sphere is the easiest there is, and no error is over a degree.
+    assert 0.7 < confidence[mask].mean() < 1
+    assert report["expected_under_5"] == pytest.approx(confidence[mask].mean(), abs=1e-4)
+    picture = cv2.imread(str(out / "confidence.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(picture, np.rint(255 * confidence))
+    assert 'alt="Confidence map"' in (out / "page.html").read_text("utf-8")
+    (capture / "normals_gt.npy").unlink()
+    said = run("infer", capture, "--overwrite").out
+    assert f"{confidence[mask].mean():.0%} of them likely within 5 deg" in said
+
+
+@pytest.mark.parametrize("method", ["ls", "cnn-ps"])
+def test_who_does_not_tell_how_sure_it_is(capture, run, method):
+    assert run("infer", capture, "--method", method, "--html", "--quiet").code == 0
+    assert read_report(Path("out/sphere"))["expected_under_5"] is None
+    assert "Confidence map" not in Path("out/sphere/page.html").read_text("utf-8")
+    result = run("infer", capture, "--method", method, "--maps", "confidence", "--overwrite")
+    assert (result.code, f"method {method} does not tell how sure it is" in result.err) == (2, True)
+
+
+def test_a_mask_is_found_where_there_is_none(capture, run):
+    mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    for path in capture.glob("image*.png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.where(mask > 0, picture, 300).astype(np.uint16))
+    assert run("infer", capture, "--method", "ls", "--auto-mask").code == 0
+    assert "mask.png" not in read_report(Path("out/sphere"))["files"]  # the capture's own goes first
+    (capture / "mask.png").unlink()
+    assert run("infer", capture, "--method", "ls", "--auto-mask", "--overwrite").code == 0
+    report = read_report(Path("out/sphere"))
+    found = cv2.imread("out/sphere/mask.png", cv2.IMREAD_UNCHANGED)
+    assert ("mask.png" in report["files"], report["n_pixels"]) == (True, np.count_nonzero(found))
+    assert (found != mask).mean() < 0.02  # corners are rounded
+    # What was written is a mask that the next call reads.
+    again = run("infer", capture, "--method", "ls", "--mask", "out/sphere/mask.png", "-o", "again", "--json")
+    assert json.loads(again.out)["n_pixels"] == report["n_pixels"]
+    both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/mask.png", "--overwrite")
+    assert (both.code, "exclude each other" in both.err) == (2, True)
+    for path in capture.glob("image*.png"):
+        cv2.imwrite(str(path), np.full(mask.shape, 30_000, np.uint16))
+    nothing = run("infer", capture, "--method", "ls", "--auto-mask", "-o", "third")
+    assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (3, True, True)
+
+
+def test_eight_bits(capture, run):
+    assert run("infer", capture, "--method", "ls", "--format", "png,png8").code == 0
+    small, large = (
+        cv2.imread(f"out/sphere/{name}", cv2.IMREAD_UNCHANGED) for name in ("normals_8bit.png", "normals.png")
+    )
+    assert (small.dtype, large.dtype) == (np.uint8, np.uint16)
+    np.testing.assert_allclose(small / 255, large / 65_535, atol=0.6 / 255)
+
+
+def test_overexposed_photographs(capture, run):
+    """Saturated pixels are not taken for what they say: a matte surface comes out as if they had not been."""
+    before = run("infer", capture, "--method", "ls", "--json").out
+    for path in capture.glob("image*.png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
+        cv2.imwrite(str(path), np.minimum(picture * 65_535 // 57_000, 65_535).astype(np.uint16))
+    after = json.loads(run("infer", capture, "--method", "ls", "--json", "--overwrite").out)
+    assert json.loads(before)["angular_error_deg"]["mean"] < 0.01
+    assert after["angular_error_deg"]["mean"] < 0.1
+    assert any("saturated" in warning for warning in after["warnings"])
+
+
+def test_an_index_of_several_captures(capture, make_capture, run):
+    make_capture("a b")
+    make_capture("broken")
+    Path("broken/image3.png").write_bytes(b"no picture")
+    Path("out").mkdir()
+    Path("out/index.html").write_text("<html>my site</html>", "utf-8")
+    captures = (capture, "a b", "broken", "--method", "ls", "--html")
+    kept = run("infer", *captures)
+    assert (kept.code, "index.html: was not written by splinecli" in kept.err) == (5, True)
+    Path("out/index.html").unlink()
+    assert run("infer", *captures).code == 3
+    index = Path("out/index.html").read_text("utf-8")
+    links = re.findall(r'href="([^"]+)"', index)
+    assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
+    assert all((Path("out") / unquote(link)).is_file() for link in links)
+    assert "found neither PNG, TIFF nor JPEG" in index
+    assert run("infer", *captures).code == 3  # our own index is replaced
 
 
 def test_photographs_with_a_curve_and_ambient_light(capture, run):
@@ -223,8 +315,8 @@ def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
     result = run("infer", capture, "broken", "third", "--method", "ls")
     assert result.code == 3
     golden("batch.out.txt", result.out)
-    golden("batch.err.txt", result.err)
-    assert sorted(path.name for path in Path("out").iterdir()) == ["sphere", "third"]
+    golden("batch.err.txt", re.sub(r"[0-9]+\.[0-9]$", "SECONDS", result.err, flags=re.MULTILINE))
+    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "sphere", "third"]
 
     documents = json.loads(run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out)
     assert documents[0] == read_report(Path("out/sphere"))
@@ -265,10 +357,8 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     again = run("infer", *captures, "--method", "ls")
     assert again.code == 0
     assert again.out.startswith("out/third: ")
-    assert (
-        "out/second: finished before, left as it is\n3 captures: 1 done, 2 finished before, 0 bad\n"
-        in again.err
-    )
+    assert "out/second: finished before, left as it is\n" in again.err
+    assert again.err.endswith("3 captures: 1 done, 2 finished before, 0 bad; see out/index.html\n")
     assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
     # The same in JSON has all reports; with other options, or a file missing, nothing is taken for finished.
     reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
@@ -293,7 +383,7 @@ def test_links_are_called_by_their_own_names(capture, run):
         Path(link).symlink_to(capture.absolute())
     assert run("infer", "x/obj", "y/obj", "--method", "ls").code == 2
     assert run("infer", "one", "two", "--method", "ls").code == 0
-    assert sorted(path.name for path in Path("out").iterdir()) == ["one", "two"]
+    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "one", "two"]
 
 
 def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
@@ -307,8 +397,9 @@ def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     for name in ("inboundary.png", "onboundary.png"):
         (holder / name).write_bytes((capture / "mask.png").read_bytes())
     result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
-    assert (result.code, result.err) == (0, "2 captures: 2 done, 0 finished before, 0 bad\n")
-    assert {path.name for path in Path("out").iterdir()} == {"Ball_specular", "Ball_metallic"}
+    assert result.code == 0
+    assert result.err.endswith("2 captures: 2 done, 0 finished before, 0 bad; see out/index.html\n")
+    assert {path.name for path in Path("out").iterdir()} == {"index.html", "Ball_specular", "Ball_metallic"}
     assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
     # An object with several kinds is passed over among others, under its own name.
     result = run("infer", holder, capture, "--method", "ls", "--overwrite")

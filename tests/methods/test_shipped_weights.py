@@ -8,10 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from splinecli.capture import read_capture
+from splinecli.evaluation.draws import draw_lights
 from splinecli.methods import MethodOptions, make_estimator
+from splinecli.methods.estimator import CONFIDENT_DEG, tells_confidence
+from splinecli.networks.error_head import probability_within
 from splinecli.networks.weights import SHIPPED, manifest, resolve_weights
 from splinecli.normals import angle_between_deg, unit
+from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden/shipped_predictions.json"
 
@@ -59,6 +65,48 @@ def test_cnn_ps_on_glossy_pixels():
     normals, lights, observations = glossy_pixels(10)
     estimated = make_estimator("cnn-ps", MethodOptions(precision="float32")).estimate(observations, lights)
     assert angle_between_deg(estimated, normals).mean() < 10
+
+
+def share_found(confidence: np.ndarray, error_deg: np.ndarray) -> float:
+    """Of the largest tenth of the errors, the share among the tenth of the pixels with the least confidence."""
+    large = error_deg > np.quantile(error_deg, 0.9)
+    return float(large[confidence <= np.quantile(confidence, 0.1)].sum() / large.sum())
+
+
+def test_confidence_on_generated_pixels():
+    """Of all pixels with about the same confidence, that share is within the limit."""
+    config = PixelGeneratorConfig(min_lights=10, usual_lights=10, max_lights=10)
+    batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(3000)
+    with torch.inference_mode():
+        normals, error = resolve_weights("spline-net").network.normals_with_error(
+            batch.observations, batch.light_directions, batch.valid
+        )
+    assert error is not None
+    error_deg = angle_between_deg(normals.numpy(), batch.scene.normals.numpy())
+    confidence = probability_within(error, CONFIDENT_DEG).numpy()
+    for fifth in np.array_split(confidence.argsort(), 5):
+        assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == pytest.approx(confidence[fifth].mean(), abs=0.06)
+    assert share_found(confidence, error_deg) > 1 / 3
+
+
+def test_confidence_on_path_traced_captures(shared_data):
+    estimator = make_estimator("spline-net")
+    assert tells_confidence(estimator)
+    confidences, errors_deg = [], []
+    for shape in ("sphere", "relief", "bowl"):
+        for material in "SM":
+            capture = read_capture(shared_data / f"synth/L17/{shape}_{material}")
+            assert capture.ground_truth is not None
+            (lights,) = draw_lights(capture.light_directions, 10, trials=1, seed=0)
+            pixels = np.linspace(0, capture.n_pixels - 1, 1200).astype(int)
+            normals, confidence = estimator.estimate_with_confidence(
+                capture.observations[pixels][:, lights], capture.light_directions[list(lights)]
+            )
+            confidences.append(confidence)
+            errors_deg.append(angle_between_deg(normals, capture.ground_truth[capture.mask][pixels]))
+    confidence, error_deg = np.concatenate(confidences), np.concatenate(errors_deg)
+    assert share_found(confidence, error_deg) > 1 / 3
+    assert (error_deg <= CONFIDENT_DEG).mean() == pytest.approx(confidence.mean(), abs=0.05)
 
 
 @pytest.mark.parametrize("name", sorted(manifest()))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import named_lights
+from splinecli.capture.auto_mask import find_object
 from splinecli.capture.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.development import AS_STORED, Developer, Development, is_display_encoded
@@ -20,6 +21,7 @@ from splinecli.capture.images import read_boundary, read_mask
 from splinecli.capture.layout import StrPath, find_capture_files
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.record import Capture, check_light_indices
+from splinecli.capture.saturation import find_saturated, restore_saturated
 from splinecli.errors import InputError
 
 SATURATED_SHARE = 0.01
@@ -39,6 +41,7 @@ class CaptureSource:
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         warnings: sentences a user should read.
         development: how the images' values become linear light.
+        found_mask: (H, W) bool, instead of one among the files; see find_mask.
     """
 
     files: CaptureFiles
@@ -46,13 +49,18 @@ class CaptureSource:
     light_intensities: NDArray[np.float64]
     warnings: tuple[str, ...] = ()
     development: Development = AS_STORED
+    found_mask: NDArray[np.bool_] | None = None
 
     @property
     def n_lights(self) -> int:
         return len(self.light_directions)
 
     def read(
-        self, light_indices: Sequence[int] | None = None, progress: Callable[[], object] | None = None
+        self,
+        light_indices: Sequence[int] | None = None,
+        progress: Callable[[], object] | None = None,
+        *,
+        restore: bool = False,
     ) -> Capture:
         """The capture under the chosen lights (all of them for None), in the order given.
 
@@ -62,6 +70,7 @@ class CaptureSource:
         Args:
             light_indices: zero-based.
             progress: called once after each image.
+            restore: put estimates in the place of saturated observations (see restore_saturated).
 
         Raises:
             UsageError: an index is out of range, comes twice, or there are fewer than three.
@@ -83,7 +92,8 @@ class CaptureSource:
             )
         develop = Developer(self.development, mask, len(self.files.images))
         observations = np.empty((np.count_nonzero(mask), len(indices)), np.float32)
-        n_saturated, n_8_bit = 0, 0
+        saturated = np.zeros((0, len(indices)), np.bool_)  # grows when there is something to say
+        n_8_bit = 0
         stored: NDArray[Any] | None = first
         del first
         for position, index in enumerate(indices):
@@ -97,12 +107,19 @@ class CaptureSource:
                     path=path,
                 )
             pixels = stored[mask]
-            n_saturated += count_saturated(pixels)
+            here = find_saturated(pixels)
+            if here.any():
+                if not len(saturated):
+                    saturated = np.zeros(observations.shape, np.bool_)
+                saturated[:, position] = here
             observations[:, position] = _observe(develop(pixels, path, index), self.light_intensities[index])
             n_8_bit += stored.dtype == np.uint8
             stored = None  # let go before the next is decoded: one full image at a time
             if progress is not None:
                 progress()
+        if restore and len(saturated):
+            restore_saturated(observations, saturated, self.light_directions[list(indices)])
+        n_saturated = np.count_nonzero(saturated)
         n_black = len(observations) - np.count_nonzero(observations.any(axis=1))
         return Capture(
             name=self.files.name,
@@ -134,9 +151,27 @@ class CaptureSource:
 
         return read
 
+    def find_mask(self, progress: Callable[[], object] | None = None) -> CaptureSource:
+        """The same capture with a mask made from all its images (see find_object); the same where it has one.
+
+        Raises InputError: no object stands out, or an image cannot be read.
+        """
+        if self.files.mask is not None or self.files.boundaries:
+            return self
+        whole = np.ones(decode_image(self.files.images[0]).shape[:2], np.bool_)
+        read = self.colours(whole)
+        total = np.zeros(whole.size, np.float32)
+        for index in range(self.n_lights):
+            total += read(index).mean(axis=1)
+            if progress is not None:
+                progress()
+        return replace(self, found_mask=find_object(total.reshape(whole.shape)))
+
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """The mask of images of this shape, (H, W); all of it where the capture has none. Raises InputError."""
         image = self.files.images[0]
+        if self.found_mask is not None:
+            return self.found_mask
         if self.files.boundaries:
             return self._read_boundaries(shape, image)
         if self.files.mask is None:
@@ -239,13 +274,6 @@ def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDA
     if linear.shape[1] == 1:
         weights = weights.sum(keepdims=True)
     return linear @ weights.astype(np.float32)
-
-
-def count_saturated(pixels: NDArray[Any]) -> int:
-    """How many stored pixels (P, C) have a channel at full scale; floating-point ones have none."""
-    if pixels.dtype.kind != "u":
-        return 0
-    return int(np.count_nonzero((pixels == np.iinfo(pixels.dtype).max).any(axis=1)))
 
 
 def _warnings(saturated_share: float, black_share: float, n_8_bit: int) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.development import Developer
 from splinecli.capture.images import to_linear
-from splinecli.capture.reader import SATURATED_SHARE, CaptureSource, count_saturated
+from splinecli.capture.reader import SATURATED_SHARE, CaptureSource
+from splinecli.capture.saturation import find_saturated
 
 DARK = 0.05
 """An image whose 99 % quantile lies below this share of full scale is called dark."""
@@ -95,7 +96,7 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
                 stored.shape,
                 str(stored.dtype),
                 float(np.quantile(to_linear(pixels, path), 0.99)),
-                count_saturated(pixels) / len(pixels),
+                float(find_saturated(pixels).mean()),
             )
         )
         if progress is not None:

@@ -23,6 +23,7 @@ from splinecli.cli.options import (
     RotationsOption,
     SeedOption,
     WeightsOption,
+    complete_methods,
     parse_indices,
 )
 from splinecli.cli.talk import Talk
@@ -45,7 +46,11 @@ def evaluate(
     ],
     method: Annotated[
         list[str] | None,
-        typer.Option(metavar="M", help="Method to score, or all; may be repeated. [default: spline-net]"),
+        typer.Option(
+            metavar="M",
+            help="Method to score, or all; may be repeated. [default: spline-net]",
+            autocompletion=lambda: [*complete_methods(), "all"],
+        ),
     ] = None,
     weights: WeightsOption = None,
     n_lights: Annotated[

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from splinecli.cli.options import JsonOption, NormalConvention, QuietOption, split_commas
+from splinecli.cli.options import JsonOption, NormalConvention, QuietOption, complete_list, split_commas
 from splinecli.cli.talk import Talk
 from splinecli.errors import InputError
 
@@ -60,7 +60,12 @@ def integrate(
     ] = None,
     formats: Annotated[
         str,
-        typer.Option("--format", metavar="LIST", help="Any of ply, obj (meshes), npy, tiff (float32 depth)."),
+        typer.Option(
+            "--format",
+            metavar="LIST",
+            help="Any of ply, obj (meshes), npy, tiff (float32 depth).",
+            autocompletion=complete_list("ply", "obj", "npy", "tiff"),
+        ),
     ] = "ply,npy,tiff",
     convention: Annotated[
         NormalConvention, typer.Option(help="Green of a picture: opengl is y up, directx is y down.")

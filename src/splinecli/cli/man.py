@@ -1,9 +1,14 @@
-"""The man page, made from the commands themselves: `python -m splinecli.cli.man > man/splinecli.1`."""
+"""The man pages, one of the whole and one a command, made from the commands: `python -m splinecli.cli.man man`."""
 
 from __future__ import annotations
 
 import inspect
+import re
+import shlex
 import sys
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -21,19 +26,37 @@ EXIT_STATUS = (
     ("130", "Interrupted; nothing half-written is left behind."),
 )
 FILES = (
-    ("CAPTURE/*.png, *.tif, *.jpg", "Images, linear, in natural order or in that of filenames.txt."),
+    (
+        "CAPTURE/*.png, *.tif, *.jpg, *.dng, *.nef, ...",
+        "Images, linear, in natural order or in that of filenames.txt. Cameras' RAW files need 'splinecli[raw]'.",
+    ),
     ("CAPTURE/light_directions.txt", "A line x y z for each image: x right, y up, z to the camera."),
+    ("CAPTURE/*.lp, lights.json", "Instead: lights with the name of their image, of RTI or AliceVision."),
     ("CAPTURE/light_intensities.txt", "A line r g b for each image. Optional."),
     ("CAPTURE/mask.png", "Bright on the object. Optional: without it every pixel counts."),
+    ("CAPTURE/ambient.png", "The object under none of the lights, to be taken off all images. Optional."),
     ("CAPTURE/Normal_gt.mat", "True normals. Optional; errors are reported against them."),
-    ("CAPTURE/*.lp, lights.json", "Instead: lights with the name of their image, of RTI or AliceVision."),
     ("OUT/NAME/normals.png", "Normal map, 16-bit RGB, (n + 1) / 2."),
     ("OUT/NAME/normals.npy", "Normal map, float32, H x W x 3, zero outside the mask."),
+    ("OUT/NAME/normals_8bit.png, normals.tiff", "With --format png8, tiff: the same in 8 bits, in float32."),
     ("OUT/NAME/error_map.png", "Angular error with a colour bar, where there is ground truth."),
+    ("OUT/NAME/mask.png", "With --auto-mask: the mask that was found."),
+    ("OUT/NAME/albedo.png, albedo.npy", "With --maps albedo: the picture, and linear in float32."),
+    (
+        "OUT/NAME/confidence.png, confidence.npy",
+        "With --maps confidence: the probability that a normal is off by 5 degrees at most, gray and in float32.",
+    ),
+    ("OUT/NAME/preview.png", "With --maps preview: the surface, matte white, under a raking light."),
+    (
+        "OUT/NAME/mesh.ply, depth.npy, depth.tiff",
+        "With --surface, or of splinecli integrate OUT/NAME, which writes surface.json and can write mesh.obj too.",
+    ),
+    ("OUT/NAME/page.html", "With --html: the pictures, and a view under a light that follows the pointer."),
     (
         "OUT/NAME/report.json",
         "What was done, with which weights, how long it took, how large the errors are.",
     ),
+    ("OUT/index.html", "Of several captures: all of them at a glance."),
 )
 ENVIRONMENT = (
     ("COLUMNS", "Width of the help texts and tables."),
@@ -45,73 +68,177 @@ EXAMPLES = (
     ("splinecli infer obj/ --lights l.txt", "Normals of one object from all its images."),
     ("splinecli infer catPNG --n-lights 10 --seed 0 --json", "From ten lights, the report on stdout."),
     ("splinecli infer captures/* -o results --overwrite", "A folder of captures."),
+    ("splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html", "Much to look at."),
+    ("splinecli info obj/", "What infer would read, before it is run."),
+    (
+        "splinecli info obj/ --transfer srgb --plot lights.png",
+        "The lights drawn; of images made for a screen.",
+    ),
     ("splinecli calibrate chrome/ -o lights", "Light directions from photographs of a mirror ball."),
+    (
+        "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights",
+        "With the outline given, and with the lights' strengths.",
+    ),
     ("splinecli integrate results/cat", "Depth and mesh of a normal map that infer wrote."),
+    (
+        "splinecli integrate normals.png --mask mask.png --format obj -o surface",
+        "A mesh of a normal map from elsewhere.",
+    ),
     (
         "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
         "Methods compared.",
     ),
+    (
+        "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10 --trials 20 --figures",
+        "All of them, with two numbers of lights, and with pictures.",
+    ),
     ("splinecli prepare --scenes 6 -o set", "A pixel set of six rendered scenes in three materials."),
-    ("splinecli train set --preset compact --steps 300 -o run", "A short training on it."),
+    ("splinecli prepare PRPS PRPS_Diffuse -o cycles", "A pixel set of the CyclesPS data."),
+    ("splinecli train set --preset compact --steps 300 -o run", "A short training on a pixel set."),
     (
         "splinecli train -o runs/mine --minutes 90",
         "New weights; then --weights runs/mine/weights.safetensors.",
     ),
+    ("splinecli train -o runs/mine --resume", "Going on after an interruption."),
     (
         "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o official.safetensors",
         "The authors' own weights; then --weights official.safetensors.",
     ),
 )
+EXAMPLE_WIDTH = 64
+"""Columns that an example may fill: with its indent a line of a terminal of 80."""
 
 
-def man_page() -> str:
-    """The page in the man macros, every command with its options."""
+def man_pages() -> dict[str, str]:
+    """Name of the file -> the page in the man macros, of splinecli and of each command."""
     group: Any = typer.main.get_command(app)
-    context = group.context_class(group, info_name="splinecli")
-    lines = [
-        f'.TH SPLINECLI 1 "" "splinecli {__version__}" "User Commands"',
-        ".SH NAME",
-        "splinecli \\- surface normals from a few photographs under known lights",
-        ".SH SYNOPSIS",
-    ]
+    context = group.context_class(group, info_name="splinecli", **group.context_settings)
     commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
-    contexts = {
-        name: command.context_class(command, info_name=name, parent=context)
-        for name, command in commands.items()
-    }
+    pages = {"splinecli.1": _overview(group, context, commands)}
     for name, command in commands.items():
-        lines += [
-            f".B splinecli {name}",
-            _escape(" ".join(command.collect_usage_pieces(contexts[name]))),
-            ".br",
-        ]
-    lines += [".SH DESCRIPTION", _escape(group.help), ".SH COMMANDS"]
+        own_context = command.context_class(command, info_name=name, parent=context)
+        pages[f"{_page_name(name)}.1"] = _command_page_name(name, command, own_context, commands)
+    return pages
+
+
+def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
+    lines = [
+        *_beginning("splinecli", "surface normals from a few photographs under known lights", group, context),
+        ".SH OPTIONS",
+        *_options(group, context),
+        ".SH COMMANDS",
+    ]
     for name, command in commands.items():
-        lines += [f".SS {name}"]
-        for paragraph in inspect.cleandoc(command.help).split("\n\n"):
-            lines += [_escape(" ".join(paragraph.split())), ".PP"]
-        for parameter in command.get_params(contexts[name]):
-            record = parameter.get_help_record(contexts[name])
-            if record:
-                lines += _entry(*record)
+        lines += [".TP", _reference(name), _escape(_paragraphs(command.help)[0])]
     for title, rows in (("EXIT STATUS", EXIT_STATUS), ("FILES", FILES), ("ENVIRONMENT", ENVIRONMENT)):
         lines.append(f".SH {title}")
-        for row in rows:
-            lines += _entry(*row)
-    lines.append(".SH EXAMPLES")
+        for term, meaning in rows:
+            lines += [".TP", f"\\fB{_escape(term)}\\fR", _escape(meaning)]
+    return _page_text([*lines, *_examples(""), *_see_also(commands)])
+
+
+def _command_page_name(name: str, command: Any, context: Any, commands: dict[str, Any]) -> str:
+    summary = _paragraphs(command.help)[0].rstrip(".")
+    lines = [
+        # In NAME stands no sentence: no capital, no full stop.
+        *_beginning(_page_name(name), summary[0].lower() + summary[1:], command, context),
+        ".SH OPTIONS",
+        *_options(command, context),
+        ".SH EXIT STATUS",
+        "0 when all is done; what else it may be is in",
+        ".BR splinecli (1).",
+        *_examples(name),
+    ]
+    # The other commands that this one's texts speak of.
+    text = " ".join([command.help, *(parameter.help or "" for parameter in command.params)])
+    related = [other for other in commands if other != name and re.search(rf"\b{other}\b", text)]
+    return _page_text([*lines, *_see_also(["", *related])])
+
+
+def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str]:
+    """All up to and with the description."""
+    usage = " ".join(command.collect_usage_pieces(context))
+    return [
+        f'.TH {_escape(title.upper())} 1 "" "splinecli {__version__}" "User Commands"',
+        # No hyphens in names of files, no gaps between words.
+        ".nh",
+        ".ad l",
+        ".SH NAME",
+        f"{_escape(title)} \\- {_escape(meaning)}",
+        ".SH SYNOPSIS",
+        f".B {_escape(context.command_path)}",
+        _escape(_without_braces(usage)),
+        ".SH DESCRIPTION",
+        *"\n.PP\n".join(map(_escape, _paragraphs(command.help))).split("\n"),
+    ]
+
+
+def _options(command: Any, context: Any) -> list[str]:
+    """Arguments, then options."""
+    lines = []
+    for parameter in sorted(command.get_params(context), key=lambda one: one.param_type_name != "argument"):
+        term, meaning = parameter.get_help_record(context)
+        if parameter.param_type_name == "argument":
+            # The record has the Python type here.
+            term = _without_braces(" ".join(parameter.get_usage_pieces(context)))
+        # Bold what is typed as it stands, italic what stands for something.
+        words = [rf"\f{'B' if word[0] == '-' else 'I'}{_escape(word)}\fR" for word in term.split()]
+        lines += [".TP", " ".join(words), _escape(" ".join(meaning.split()))]
+    return lines
+
+
+def _examples(name: str) -> list[str]:
+    """Those of a command, or all."""
+    lines = [".SH EXAMPLES"]
     for command_line, meaning in EXAMPLES:
-        lines += [_escape(meaning), ".PP", ".nf", ".RS", _escape(command_line), ".RE", ".fi", ".PP"]
-    return "\n".join(lines) + "\n"
+        if name in ("", shlex.split(command_line)[1]):
+            lines += [_escape(meaning), ".PP", ".RS", ".nf", _escape(_wrap(command_line))]
+            lines += [".fi", ".RE", ".PP"]
+    return lines[:-1]  # no new paragraph before the next section
 
 
-def _entry(term: str, meaning: str) -> list[str]:
-    return [".TP", f"\\fB{_escape(term)}\\fR", _escape(" ".join(meaning.split()))]
+def _wrap(command_line: str) -> str:
+    """The command on several lines where it is long, an option beside its value."""
+    whole = re.sub(r"( -\S+) (?!-)", "\\1\0", command_line)
+    lines = textwrap.wrap(whole, EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return " \\\n    ".join(lines).replace("\0", " ")
+
+
+def _see_also(names: Iterable[str]) -> list[str]:
+    return [".SH SEE ALSO", *(f"{_reference(name)}," for name in names)]
+
+
+def _page_text(lines: list[str]) -> str:
+    return "\n".join(lines).rstrip(",") + "\n"
+
+
+def _page_name(command: str) -> str:
+    return f"splinecli-{command}" if command else "splinecli"
+
+
+def _reference(command: str) -> str:
+    return f".BR {_escape(_page_name(command))} (1)"
+
+
+def _paragraphs(text: str) -> list[str]:
+    return [" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n")]
+
+
+def _without_braces(usage: str) -> str:
+    """Typer sets braces about arguments that are required."""
+    return usage.translate({ord(brace): None for brace in "{}"})
+
+
+# Bare, these would be typeset: hyphens, curly quotes, accents.
+_PLAIN = str.maketrans({"\\": "\\e", "-": "\\-", "'": "\\(aq", "`": "\\(ga", "^": "\\(ha", "~": "\\(ti"})
 
 
 def _escape(text: str) -> str:
-    text = text.replace("\\", "\\e").replace("-", "\\-")
-    return f"\\&{text}" if text[:1] in ".'" else text
+    text = text.translate(_PLAIN)
+    return f"\\&{text}" if text.startswith(".") else text
 
 
 if __name__ == "__main__":
-    sys.stdout.write(man_page())
+    folder = Path(sys.argv[1])
+    for page, text in man_pages().items():
+        (folder / page).write_text(text, "utf-8")

@@ -1,8 +1,11 @@
-"""Option types that several commands share, and the parsing of their values."""
+"""Option types that several commands share, the parsing of their values, and what a shell may complete them to."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from enum import StrEnum
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,8 +40,37 @@ class Precision(StrEnum):
     bfloat16 = "bfloat16"
 
 
+def complete_methods() -> list[str]:
+    """What --method may be."""
+    from splinecli.methods import method_names
+
+    return method_names()
+
+
+def complete_weights() -> list[str]:
+    """Names of the shipped weights. Where none begins like what was typed, the shell completes to files."""
+    # What else reads this file imports torch, which takes longer than one waits for a completion.
+    return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
+
+
+def complete_list(*items: str) -> Callable[[str], list[str]]:
+    """Completion of "a,b": to what was typed up to the last comma, and each item that is not in it."""
+
+    def complete(incomplete: str) -> list[str]:
+        *typed, _ = incomplete.split(",")
+        return [",".join([*typed, item]) for item in items if item not in typed]
+
+    return complete
+
+
 TransferOption = Annotated[
-    str, typer.Option("--transfer", metavar="CURVE", help="Of the images: linear, srgb or gamma:G.")
+    str,
+    typer.Option(
+        "--transfer",
+        metavar="CURVE",
+        help="Of the images: linear, srgb or gamma:G.",
+        autocompletion=lambda: ["linear", "srgb", "gamma:2.2"],
+    ),
 ]
 AmbientOption = Annotated[
     Path | None,
@@ -57,7 +89,10 @@ FlatFieldOption = Annotated[
 WeightsOption = Annotated[
     str | None,
     typer.Option(
-        "--weights", metavar="NAME|FILE", help="Shipped weights by name, or a file. [default: the method's]"
+        "--weights",
+        metavar="NAME|FILE",
+        help="Shipped weights by name, or a file. [default: the method's]",
+        autocompletion=complete_weights,
     ),
 ]
 RotationsOption = Annotated[

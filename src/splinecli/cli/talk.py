@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 
@@ -21,6 +21,21 @@ class Talk:
     def warn(self, message: str) -> None:
         """A line that says something may be wrong."""
         self.say(f"splinecli: warning: {message}")
+
+    def table(self, rows: Sequence[Sequence[str]]) -> None:
+        """A table for people: a header row, then rows whose first cell is a name and whose others are numbers."""
+        if self.quiet:
+            return
+        from rich.console import Console
+        from rich.table import Table
+
+        header, *body = rows
+        table = Table(box=None, pad_edge=False)
+        for position, name in enumerate(header):
+            table.add_column(name, justify="right" if position else "left")
+        for row in body:
+            table.add_row(*row)
+        Console(stderr=True, markup=False, highlight=False).print(table)
 
     @contextmanager
     def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Callable[..., None]]:

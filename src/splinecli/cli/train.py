@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from splinecli.cli.options import Device, DeviceOption, QuietOption
+from splinecli.cli.options import Device, DeviceOption, QuietOption, complete_weights
 from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
@@ -25,7 +25,13 @@ def train(
         list[Path] | None, typer.Argument(metavar="SET", help="Pixel sets made by 'splinecli prepare'.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="compact, paper or cnn-ps. [default: compact]")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="compact, paper or cnn-ps. [default: compact]",
+            # Written out, for the presets themselves import torch.
+            autocompletion=lambda: ["compact", "paper", "cnn-ps"],
+        ),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings (TOML, or a run's config.json).")
@@ -36,7 +42,11 @@ def train(
     ] = None,
     start_from: Annotated[
         str | None,
-        typer.Option(metavar="WEIGHTS", help="Begin with these weights, a shipped name or a file."),
+        typer.Option(
+            metavar="WEIGHTS",
+            help="Begin with these weights, a shipped name or a file.",
+            autocompletion=complete_weights,
+        ),
     ] = None,
     generator_weight: Annotated[
         float | None,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import struct
 from collections.abc import Sequence
-from importlib import resources
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -22,8 +21,8 @@ from splinecli.evaluation.statistics import (
     trial_averages,
 )
 from splinecli.evaluation.tables import best_cells, heading, lights_in_words, table_rows
+from splinecli.templates import render
 
-_TEMPLATE = resources.files("splinecli") / "assets" / "report.html"
 _MOST_SENTENCES = 3  # of three methods; the pairs of more are read faster in a matrix
 _MINUS = "\N{MINUS SIGN}"
 
@@ -52,27 +51,18 @@ def html_report(
         figures: captions, which are the images' alternative texts too, and PNG.
         notes: sentences about the captures and the run.
     """
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(_TEMPLATE.read_text("utf-8"))
     first = evaluations[0]
-    return (
-        template.render(
-            title=f"{_count(len(first.methods), 'method')} on {_count(len(first.captures), 'capture')}",
-            protocol=_protocol(evaluations),
-            notes=notes,
-            skipped=list(dict.fromkeys((s.capture, s.reason) for e in evaluations for s in e.skipped)),
-            summary=_summary(evaluations) if len(evaluations) > 1 else None,
-            several_methods=len(first.methods) > 1,
-            sections=[_section(evaluation) for evaluation in evaluations],
-            figures=[_figure(caption, png) for caption, png in figures],
-            significance=SIGNIFICANCE,
-            version=__version__,
-        ).rstrip()
-        + "\n"
+    return render(
+        "report.html",
+        title=f"{_count(len(first.methods), 'method')} on {_count(len(first.captures), 'capture')}",
+        protocol=_protocol(evaluations),
+        notes=notes,
+        skipped=list(dict.fromkeys((s.capture, s.reason) for e in evaluations for s in e.skipped)),
+        summary=_summary(evaluations) if len(evaluations) > 1 else None,
+        several_methods=len(first.methods) > 1,
+        sections=[_section(evaluation) for evaluation in evaluations],
+        figures=[_figure(caption, png) for caption, png in figures],
+        significance=SIGNIFICANCE,
     )
 
 

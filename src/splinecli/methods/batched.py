@@ -78,13 +78,18 @@ def estimate_in_batches(
     batch_size: int,
     device: str,
     dtype: torch.dtype,
+    columns: int = 3,
 ) -> NDArray[np.float32]:
-    """What `solve` makes of the observations as they are: unit normals (P, 3), or zero, which becomes (0, 0, 1)."""
+    """What `solve` makes of the observations as they are: unit normals (P, 3), or zero, which becomes (0, 0, 1).
+
+    Args:
+        columns: that `solve` gives: the normal's three, and others behind them, which are kept as they are.
+    """
     lights = torch.as_tensor(light_directions, dtype=dtype, device=device)
-    normals = np.empty((len(observations), 3), np.float32)
+    results = np.empty((len(observations), columns), np.float32)
     for start in range(0, len(observations), batch_size):
         batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)
         found = solve(batch, lights)
-        found[~found.any(dim=1)] = found.new_tensor(TOWARDS_CAMERA)
-        normals[start : start + batch_size] = found.cpu().numpy()
-    return normals
+        found[~found[:, :3].any(dim=1), :3] = found.new_tensor(TOWARDS_CAMERA)
+        results[start : start + batch_size] = found.cpu().numpy()
+    return results

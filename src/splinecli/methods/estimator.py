@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,3 +39,32 @@ class Estimator(Protocol):
         A pixel that no light reaches has no normal; it gets (0, 0, 1), the least surprising one.
         """
         ...
+
+
+CONFIDENT_DEG = 5.0
+"""Confidence is the probability that a normal is off by no more than this."""
+
+
+@runtime_checkable
+class ConfidentEstimator(Estimator, Protocol):
+    """An estimator that may know how sure it is.
+
+    tells_confidence: whether it does; with other weights it may not.
+    """
+
+    @property
+    def tells_confidence(self) -> bool: ...
+
+    def estimate_with_confidence(
+        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Normals (P, 3) as `estimate` gives them, and the probability (P,) that each is within CONFIDENT_DEG.
+
+        0 for a pixel that no light reaches.
+        """
+        ...
+
+
+def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:
+    """Whether the estimator knows how sure it is."""
+    return isinstance(estimator, ConfidentEstimator) and estimator.tells_confidence

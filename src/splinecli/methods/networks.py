@@ -11,6 +11,8 @@ from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
+from splinecli.methods.estimator import CONFIDENT_DEG
+from splinecli.networks.error_head import probability_within
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
 
@@ -69,6 +71,27 @@ class NetworkEstimator:
         self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
+        return self._in_batches(observations, light_directions)[:, :3]
+
+    @property
+    def tells_confidence(self) -> bool:
+        return self.network.config.error_head
+
+    def estimate_with_confidence(
+        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Unit normals (P, 3), and the probability (P,) that each is within CONFIDENT_DEG, averaged over the views.
+
+        Raises UsageError where the weights have no error head.
+        """
+        if not self.tells_confidence:
+            raise UsageError(f"the weights {self.weights['name']!r} do not tell how sure they are")
+        found = self._in_batches(observations, light_directions)
+        return found[:, :3], found[:, 3]
+
+    def _in_batches(
+        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
         return estimate_in_batches(
             self._average_views,
             observations,
@@ -76,16 +99,21 @@ class NetworkEstimator:
             batch_size=self.batch_size,
             device=self.device,
             dtype=torch.float32,
+            columns=4,
         )
 
     def _average_views(self, batch: Tensor, lights: Tensor) -> Tensor:
+        """Normals and confidence (P, 4), the latter 0 without an error head."""
+        total = batch.new_zeros(len(batch), 4)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            total = sum(
-                (self.network(batch, lights, turn_deg=turn, mirror=mirror) for turn, mirror in self._views),
-                start=torch.zeros((), device=lights.device),
-            )
-        unit = torch.nn.functional.normalize(total, dim=-1)
-        return unit.masked_fill(batch.amax(dim=1, keepdim=True) <= 0, 0)
+            for turn, mirror in self._views:
+                normals, error = self.network.normals_with_error(batch, lights, turn_deg=turn, mirror=mirror)
+                total[:, :3] += normals
+                if error is not None:
+                    total[:, 3] += probability_within(error, CONFIDENT_DEG)
+        unit = torch.nn.functional.normalize(total[:, :3], dim=-1)
+        found = torch.cat((unit, total[:, 3:] / len(self._views)), dim=1)
+        return found.masked_fill(batch.amax(dim=1, keepdim=True) <= 0, 0)
 
     @torch.inference_mode()
     def maps(
