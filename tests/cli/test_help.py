@@ -1,14 +1,20 @@
-"""Help, man page and README come from one source, and starting up stays cheap."""
+"""Help, man pages and README come from one source, and starting up stays cheap."""
 
 from __future__ import annotations
 
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 
-from splinecli.cli.man import man_page
+from splinecli.batch import INDEX
+from splinecli.cli.app import app
+from splinecli.cli.man import EXAMPLES, FILES, man_pages
+from splinecli.outputs import OWN_FILES
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -23,18 +29,50 @@ def test_help_text(command, run, golden):
     golden(f"help{'_' * bool(command)}{command}.txt", result.out)
 
 
-def test_man_page_is_up_to_date():
-    """Made anew by `python -m splinecli.cli.man > man/splinecli.1`."""
-    assert (REPOSITORY / "man/splinecli.1").read_text("utf-8") == man_page()
+def test_man_pages_are_up_to_date():
+    """Made anew by `python -m splinecli.cli.man man`; a page of what is no command any more is to be removed."""
+    found = {path.name: path.read_text("utf-8") for path in (REPOSITORY / "man").iterdir()}
+    assert found == man_pages()
 
 
-def test_man_page_names_every_option(run):
-    page = man_page().replace("\\-", "-")
-    for command in COMMANDS:
-        options = [word for word in run(command, "--help").out.split() if word.startswith("--")]
-        assert options
-        for option in options:
-            assert option.rstrip(",.;") in page
+def test_every_command_has_a_man_page():
+    assert man_pages().keys() == {"splinecli.1", *(f"splinecli-{command}.1" for command in COMMANDS)}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_man_page_names_every_option(command, run):
+    page = man_pages()[f"splinecli-{command}.1"].replace("\\-", "-")
+    options = [word for word in run(command, "--help").out.split() if word.startswith("--")]
+    assert options
+    for option in options:
+        assert option.rstrip(",.;") in page
+
+
+@pytest.mark.skipif(shutil.which("groff") is None, reason="no groff to check the man pages with")
+def test_man_pages_are_typeset_without_warnings():
+    for name, page in man_pages().items():
+        # -ww: all warnings; -z: no output but those.
+        done = subprocess.run(["groff", "-man", "-ww", "-z"], input=page, capture_output=True, text=True)
+        assert (name, done.returncode, done.stderr) == (name, 0, "")
+
+
+def test_man_page_names_what_infer_writes():
+    named = " ".join(part for row in FILES for part in row)
+    assert [name for name in (*OWN_FILES, INDEX) if name not in named] == []
+
+
+@pytest.mark.parametrize("example", [example for example, _ in EXAMPLES])
+def test_examples_of_the_man_pages_are_valid(example, run, tmp_path, monkeypatch):
+    _, command, *args = shlex.split(example)
+    typer.main.get_command(app).commands[command].make_context(command, list(args))
+    if command not in ("prepare", "train"):  # these would begin
+        monkeypatch.chdir(tmp_path)
+        # Past all that is checked about the command line, up to files that are not there.
+        assert run(command, *args).code in (3, 4)
+
+
+def test_every_command_has_an_example():
+    assert {shlex.split(example)[1] for example, _ in EXAMPLES} == set(COMMANDS)
 
 
 def test_readme_holds_the_help(run):
