@@ -23,9 +23,11 @@ run() {
 run spline-net-1 --preset compact --generator-weight 3 --steps 15357
 run spline-net-2 --preset compact --generator-weight 2 --steps 12294 --param learning_rate=1e-3 \
   --start-from "$folder/spline-net-1/weights.safetensors"
+run spline-net-3 --preset compact --generator-weight 2 --steps 7000 --param learning_rate=1e-3 \
+  --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-2/weights.safetensors"
 run cnn-ps-1 --preset cnn-ps --generator-weight 3 --steps 8136
 run cnn-ps-2 --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
   --start-from "$folder/cnn-ps-1/weights.safetensors"
 
-echo "$folder/spline-net-2/weights.safetensors"
+echo "$folder/spline-net-3/weights.safetensors"
 echo "$folder/cnn-ps-2/weights.safetensors"

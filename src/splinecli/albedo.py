@@ -47,7 +47,12 @@ def albedo_map(
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
     for position, index in enumerate(capture.light_indices):
         cosine = (normals @ lights[position]) * counts[:, position]
-        total += cosine[:, None] * read(index)
+        colours = read(index)
+        if capture.light_strengths is not None:
+            colours /= np.float32(capture.light_strengths[position])
+        # Restored observations are brighter than their colours, which are saturated: the others tell better.
+        cosine *= np.where(colours.mean(axis=1) < 0.99 * capture.observations[:, position], 0.03, 1)
+        total += cosine[:, None] * colours
         squares += cosine * cosine
         if progress is not None:
             progress()

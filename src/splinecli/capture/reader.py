@@ -20,9 +20,13 @@ from splinecli.capture.ground_truth import UPSIDE_DOWN, read_ground_truth
 from splinecli.capture.images import read_boundary, read_mask
 from splinecli.capture.layout import StrPath, find_capture_files
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.light_strengths import find_light_strengths
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.saturation import find_saturated, restore_saturated
 from splinecli.errors import InputError
+
+EQUAL = "equal"
+"""In place of a file of intensities: all lights are equally strong."""
 
 SATURATED_SHARE = 0.01
 """The share of saturated observations above which the capture carries a warning."""
@@ -38,7 +42,8 @@ class CaptureSource:
     Args:
         files: its files.
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
-        light_intensities: (F, 3) float64, RGB; ones where no file gives them.
+        light_intensities: (F, 3) float64, RGB; ones where nothing gives them.
+        knows_intensities: whether anything does.
         warnings: sentences a user should read.
         development: how the images' values become linear light.
         found_mask: (H, W) bool, instead of one among the files; see find_mask.
@@ -50,6 +55,7 @@ class CaptureSource:
     warnings: tuple[str, ...] = ()
     development: Development = AS_STORED
     found_mask: NDArray[np.bool_] | None = None
+    knows_intensities: bool = True
 
     @property
     def n_lights(self) -> int:
@@ -60,7 +66,7 @@ class CaptureSource:
         light_indices: Sequence[int] | None = None,
         progress: Callable[[], object] | None = None,
         *,
-        restore: bool = False,
+        mend: bool = False,
     ) -> Capture:
         """The capture under the chosen lights (all of them for None), in the order given.
 
@@ -70,7 +76,9 @@ class CaptureSource:
         Args:
             light_indices: zero-based.
             progress: called once after each image.
-            restore: put estimates in the place of saturated observations (see restore_saturated).
+            mend: put right what photographs of one's own often have wrong: estimate the lights' strengths where no
+                file gives them and they are plainly unequal (see find_light_strengths), and put estimates in the place
+                of saturated observations (see restore_saturated).
 
         Raises:
             UsageError: an index is out of range, comes twice, or there are fewer than three.
@@ -117,14 +125,19 @@ class CaptureSource:
             stored = None  # let go before the next is decoded: one full image at a time
             if progress is not None:
                 progress()
-        if restore and len(saturated):
-            restore_saturated(observations, saturated, self.light_directions[list(indices)])
+        directions, strengths = self.light_directions[list(indices)], None
+        if mend and not self.knows_intensities:
+            strengths = find_light_strengths(observations, saturated if len(saturated) else None, directions)
+            if strengths is not None:
+                observations /= strengths.astype(np.float32)
+        if mend and len(saturated):
+            restore_saturated(observations, saturated, directions)
         n_saturated = np.count_nonzero(saturated)
         n_black = len(observations) - np.count_nonzero(observations.any(axis=1))
         return Capture(
             name=self.files.name,
             observations=observations,
-            light_directions=self.light_directions[list(indices)],
+            light_directions=directions,
             light_indices=indices,
             mask=mask,
             ground_truth=ground_truth,
@@ -132,7 +145,9 @@ class CaptureSource:
                 *self.warnings,
                 *_warnings(n_saturated / observations.size, n_black / len(observations), n_8_bit),
                 *((UPSIDE_DOWN,) if upside_down else ()),
+                *(() if strengths is None else (_strengths_in_words(strengths),)),
             ),
+            light_strengths=strengths,
         )
 
     def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
@@ -206,14 +221,20 @@ def open_capture(
     """Find a capture's files and read its lights; files named here go before those that the folder holds.
 
     Args:
+        intensities: a file, or EQUAL.
         development: how the images' values become linear light; where it names no ambient image, one called `ambient`
             in the folder is taken off.
 
     Raises:
         InputError: the folder holds no capture (see find_capture_files) or a light file is wrong.
     """
+    equal = intensities is not None and str(intensities) == EQUAL
     files = find_capture_files(
-        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+        folder,
+        lights=lights,
+        intensities=None if equal else intensities,
+        mask=mask,
+        ground_truth=ground_truth,
     )
     path = files.light_directions
     strengths: NDArray[np.float64] | None = None
@@ -230,11 +251,13 @@ def open_capture(
             warnings = (f"The lights of {path.name} were matched to the images by {how}.",)
     else:
         directions = read_light_directions(path, len(files.images))
-    if files.light_intensities is None and strengths is None:
-        check_exposures(files.images)
-    if files.light_intensities is not None:
+    if equal:
+        strengths = np.ones((len(files.images), 3))
+    elif files.light_intensities is not None:
         strengths = read_light_intensities(files.light_intensities, len(files.images))
+    known = strengths is not None
     if strengths is None:
+        check_exposures(files.images)
         strengths = np.ones((len(files.images), 3))
     if development.ambient is None and (found := find_named(files.folder, AMBIENT)) is not None:
         development = replace(development, ambient=found)
@@ -245,7 +268,7 @@ def open_capture(
             "The images look display-encoded (JPEG, or PNG that says so) but are taken to be linear;"
             " --transfer srgb undoes sRGB's curve.",
         )
-    return CaptureSource(files, directions, strengths, warnings, development)
+    return CaptureSource(files, directions, strengths, warnings, development, knows_intensities=known)
 
 
 def read_capture(
@@ -291,6 +314,14 @@ def _warnings(saturated_share: float, black_share: float, n_8_bit: int) -> tuple
     if n_8_bit:
         warnings.append("The images have 8 bits; 16-bit linear images give better normals.")
     return tuple(warnings)
+
+
+def _strengths_in_words(strengths: NDArray[np.float64]) -> str:
+    return (
+        f"The lights look unequally strong, from {strengths.min():.2f} to {strengths.max():.2f} times their mean, and"
+        f" what the images tell of it was used; --intensities FILE gives the strengths, --intensities {EQUAL} takes"
+        " them for equal."
+    )
 
 
 def _check_mask_size(mask: NDArray[np.bool_], shape: tuple[int, ...], path: Path, image: Path) -> None:

@@ -36,6 +36,8 @@ class Capture:
         mask: (H, W) bool with P true pixels.
         ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
         warnings: sentences a user should read.
+        light_strengths: (F,) float64, what the observations were divided by beyond what the capture's files say, where
+            it was found from the images; else None.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
@@ -49,6 +51,7 @@ class Capture:
     mask: NDArray[np.bool_]
     ground_truth: NDArray[np.float32] | None = None
     warnings: tuple[str, ...] = ()
+    light_strengths: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -87,6 +90,7 @@ class Capture:
             observations=self.observations[:, chosen],
             light_directions=self.light_directions[chosen],
             light_indices=tuple(self.light_indices[i] for i in chosen),
+            light_strengths=None if self.light_strengths is None else self.light_strengths[chosen],
         )
 
     def _check_lights(self) -> None:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.robust_fit import absolute_weights, predict, shadow_weights
+
 ITERATIONS = 100
 STEP = 1.6
 """Restored values go this share of the way to the fit's at each iteration: beyond it, which saves half of them."""
@@ -14,7 +16,6 @@ STEP = 1.6
 BRIGHTEST = 8.0
 """No observation is restored to more than this many times the pixel's brightest as stored."""
 
-_SHADOW_SHARE = 0.05
 _TILE_PIXELS = 32_768
 
 
@@ -54,15 +55,12 @@ def _restored(
     scale[scale <= 0] = 1
     lowest = stored / scale.astype(np.float64)
     values = lowest.copy()
-    # Shadows count for next to nothing.
-    lit = np.where(lowest < _SHADOW_SHARE, 1e-3, 1.0)
-    weight = lit
-    products = (lights[:, :, None] * lights[:, None, :]).reshape(len(lights), 9)
+    lit = shadow_weights(lowest)
+    weights = lit
     for _ in range(ITERATIONS):
-        matrix = (weight @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
-        fitted = np.linalg.solve(matrix, ((weight * values) @ lights)[..., None])[..., 0] @ lights.T
-        further = np.clip(values + STEP * (fitted - values), lowest, BRIGHTEST)
+        predicted = predict(values, weights, lights)
+        further = np.clip(values + STEP * (predicted - values), lowest, BRIGHTEST)
         values = np.where(saturated, further, lowest)
-        weight = lit / (np.abs(fitted - values) + 0.02)
+        weights = lit * absolute_weights(predicted - values)
     restored: NDArray[np.float64] = values * scale
     return restored

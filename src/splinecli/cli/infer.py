@@ -46,7 +46,11 @@ def infer(
         typer.Option(metavar="FILE", help="Light directions, a line x y z for each image (z to the camera)."),
     ] = None,
     intensities: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Light intensities, a line r g b for each image.")
+        Path | None,
+        typer.Option(
+            metavar="FILE|equal",
+            help="Light intensities, a line r g b for each image. [default: equal, unless they plainly are not]",
+        ),
     ] = None,
     mask: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Picture that is bright on the object. [default: all]")

@@ -67,7 +67,7 @@ class Job:
         chosen = self._choose_lights(source)
         count = source.n_lights if chosen is None else len(chosen)
         with self.talk.progress(f"{source.files.name}: reading", count) as advance:
-            capture = source.read(chosen, progress=lambda: advance(1), restore=True)
+            capture = source.read(chosen, progress=lambda: advance(1), mend=True)
         return source, capture, time.perf_counter() - started
 
     def estimate(self, source: CaptureSource, capture: Capture, read_seconds: float) -> dict[str, Any]:

@@ -129,7 +129,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
         ("capture", f"{report['capture']} ({report['layout']})"),
         ("images", f"{report['images']}: {kinds}"),
         ("lights", f"{report['light_directions']}, {low:.0f} to {high:.0f} degrees above the picture's plane"),
-        ("intensities", report["light_intensities"] or "none: all lights count as equally strong"),
+        ("intensities", report["light_intensities"] or "none: equal, unless the images plainly say otherwise"),
         ("mask", f"{report['mask'] or 'none: every pixel counts'} ({report['n_pixels']} pixels)"),
         ("ground truth", report["ground_truth"] or "none"),
         ("exposure", f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of full scale, at most"

@@ -1,0 +1,95 @@
+"""How strong the lights were, from the photographs of the object itself, where that is plain to see.
+
+Under known directions, the pixels of a surface that is mostly matte and turns many ways tell the lights' strengths up
+to one factor: D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric stereo", TPAMI 2018. Here the
+alternation (normals, then strengths) is robust: least absolute deviations and medians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.robust_fit import Array, absolute_weights, predict, shadow_weights
+
+FEWEST_LIGHTS = 5
+"""Each light is an unknown more; four would follow any strengths."""
+
+PLAIN = 0.5
+"""Strengths are believed where they leave at most this share of the residual that equal ones do..."""
+
+MISFIT = 0.02
+"""... and equal ones leave more than this, as a share of a pixel's brightest observation, in the median.
+
+With six or ten lights of DiLiGenT's Ball and Cat, their measured strengths withheld, and of PSBox's cat, 46 of 48 draws
+are told to be unequal; of uw's sphere and horse and of path-traced objects, metals and bowls among them, none of 224.
+Ten strengths are then off by 1.5 % on Ball and 3 % on Cat, where equal ones would be by half.
+"""
+
+_PIXELS, _ROUNDS, _FITS = 2000, 200, 5
+_LIT = 0.3  # of a pixel's brightest prediction; darker ones may be shadows
+_STEP = 1.5  # beyond what each round finds, which saves a third of them
+
+
+def find_light_strengths(
+    observations: NDArray[np.float32], missing: NDArray[np.bool_] | None, light_directions: Array
+) -> Array | None:
+    """Strengths (F,) with a mean of 1, or None where the lights may well be equally strong, or nothing tells.
+
+    Args:
+        observations: (P, F), each light's share of its strength not taken out.
+        missing: (P, F), observations that do not count, such as saturated ones.
+        light_directions: (F, 3), unit.
+    """
+    n_lights = len(light_directions)
+    if n_lights < FEWEST_LIGHTS:
+        return None
+    lit = np.flatnonzero(observations.any(axis=1))
+    chosen = lit[np.linspace(0, len(lit) - 1, min(_PIXELS, len(lit))).astype(int)] if len(lit) else lit
+    known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
+    told = known.sum(axis=1) >= FEWEST_LIGHTS
+    known, values = known[told], observations[chosen[told]].astype(np.float64)
+    if len(values) < 10 * n_lights:
+        return None
+    values /= values.max(axis=1, keepdims=True)
+    equal = np.ones(n_lights)
+    before = _residual(values, _fit(values, known, equal, light_directions), known)
+    if before <= MISFIT:
+        return None
+    strengths = equal
+    for _ in range(_ROUNDS):
+        predicted = _fit(values, known, strengths, light_directions)
+        counts = known & (predicted > _LIT * predicted.max(axis=1, keepdims=True))
+        if (counts.sum(axis=0) < 10).any():
+            return None
+        ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
+        found: Array = np.nanmedian(ratios, axis=0)
+        if not (found > 0).all():
+            return None
+        change = found / strengths
+        strengths = strengths * change**_STEP
+        strengths /= strengths.mean()
+        if np.abs(np.log(change)).max() < 1e-4:
+            break
+    after = _residual(values / strengths, _fit(values, known, strengths, light_directions), known)
+    return strengths if after < PLAIN * before else None
+
+
+def _fit(values: Array, known: NDArray[np.bool_], strengths: Array, lights: Array) -> Array:
+    """What matte pixels of these values over strengths show under lights of strength 1."""
+    observed = values / strengths
+    largest = observed.max(axis=1, keepdims=True)
+    observed = observed / largest
+    lit = shadow_weights(observed) * known
+    weights = lit
+    for _ in range(_FITS):
+        predicted = predict(observed, weights, lights)
+        weights = lit * absolute_weights(observed - predicted)
+    fitted: Array = predicted * largest
+    return fitted
+
+
+def _residual(observed: Array, predicted: Array, known: NDArray[np.bool_]) -> float:
+    """The median of |observed - predicted|, each pixel's brightest prediction 1."""
+    shares = np.abs(observed - predicted) / np.maximum(predicted.max(axis=1, keepdims=True), 1e-12)
+    return float(np.median(shares[known]))
