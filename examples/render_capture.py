@@ -1,11 +1,12 @@
-"""Render the example capture: a carved medallion under ten lights, with its exact normals.
+"""Render the example capture, a carved medallion under ten lights with its exact normals, and a mirror ball under them.
 
-    python examples/render_capture.py [FOLDER]        # default: examples/medallion
+    python examples/render_capture.py [FOLDER]        # default: examples, for medallion/ and mirror_ball/
 
 The medallion is a height field z(x, y) over the square -1..1, seen by an orthographic camera from +z (x right, y up):
 a dome with a raised rim, a ring of beads and an ammonite, a logarithmic spiral with ribs. What least squares knows
 nothing of is there on purpose: highlights, attached shadows and cast shadows. There is no interreflection and no
-noise, and nothing is random: the same files come out each time.
+noise, and nothing is random: the same files come out each time. The ball is what `splinecli calibrate` finds the
+directions of the lights from: a chrome ball on dark cloth in a dim room, photographed under each lamp.
 """
 
 from __future__ import annotations
@@ -52,6 +53,14 @@ SHADOW_EDGE = 0.012
 
 EXPOSURE = 0.75
 """Stored value, as a share of full scale, of a matte white surface that faces a lamp of strength 1."""
+
+
+BALL_SIDE, BALL_RADIUS = 240, 101.3
+BALL_PLACE = 118.6, 121.2
+"""Column and row of its centre, (0, 0) the centre of the first pixel."""
+
+LAMP_DEG = 2.5
+"""Radius of a lamp as the ball mirrors it."""
 
 
 class Rendering(NamedTuple):
@@ -192,6 +201,23 @@ def render() -> Rendering:
     return Rendering(images, directions, intensities, mask, normals[middle, middle] * mask[..., None])
 
 
+def render_ball(light: Array) -> NDArray[np.uint8]:
+    """A photograph (H, W) of the mirror ball under a light (3,), 8-bit, as a camera's JPEG or PNG would be exposed."""
+    place = (np.arange(BALL_SIDE)[:, None] + (np.arange(SAMPLES) - SAMPLES // 2) / SAMPLES).ravel()
+    x, y = np.meshgrid((place - BALL_PLACE[0]) / BALL_RADIUS, (BALL_PLACE[1] - place) / BALL_RADIUS)
+    on_ball = x**2 + y**2 < 1
+    z = np.sqrt(np.where(on_ball, 1 - x**2 - y**2, 0))
+    # Where a ray from the camera, (0, 0, -1), goes from there.
+    mirrored = np.stack((2 * z * x, 2 * z * y, 2 * z**2 - 1), axis=-1)
+    room = 0.07 + 0.05 * mirrored[..., 1] + 0.05 * (mirrored[..., 1] < -0.55)  # a floor that is lit a little
+    lamp_deg = np.degrees(np.arccos(np.clip(mirrored @ light, -1, 1)))
+    glare = 0.25 * np.exp(-((lamp_deg / 14) ** 2))
+    ball = room + glare + 8.0 * (lamp_deg < LAMP_DEG)
+    radiance = np.where(on_ball, ball, 0.015)
+    pixels = radiance.reshape(BALL_SIDE, SAMPLES, BALL_SIDE, SAMPLES).mean(axis=(1, 3))
+    return np.rint(np.clip(pixels, 0, 1) * 255).astype(np.uint8)
+
+
 def write(rendering: Rendering, folder: Path) -> None:
     """The capture as a folder that splinecli reads."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -212,4 +238,8 @@ def write_png(path: Path, pixels: NDArray[np.unsignedinteger]) -> None:
 
 
 if __name__ == "__main__":
-    write(render(), Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "medallion")
+    examples = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    write(render(), examples / "medallion")
+    (examples / "mirror_ball").mkdir(exist_ok=True)
+    for number, light in enumerate(light_rig()[0], start=1):
+        write_png(examples / "mirror_ball" / f"{number:02d}.png", render_ball(light))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,10 +20,11 @@ from splinecli.capture import find_capture_files, read_capture
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
 from splinecli.networks.weights import shipped_names
-from splinecli.normals import encode_picture
+from splinecli.normals import angle_between_deg, encode_picture, unit
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MEDALLION = EXAMPLES / "medallion"
+TUTORIAL = EXAMPLES.parent / "docs/tutorial.md"
 ONE_COUNT = 1  # of 65535: libraries of mathematics differ in the last digit, and rounding then in one count
 
 needs_weights = pytest.mark.skipif("spline-net" not in shipped_names(), reason="the package ships no weights")
@@ -44,6 +46,49 @@ def script() -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_the_stored_balls_are_what_the_script_renders(script):
+    for number, light in enumerate(script.light_rig()[0], start=1):
+        stored = read_png(EXAMPLES / f"mirror_ball/{number:02d}.png")
+        assert (stored.dtype, stored.shape) == (np.uint8, (script.BALL_SIDE, script.BALL_SIDE))
+        assert counts_apart(stored, script.render_ball(light)) <= ONE_COUNT, f"ball {number}"
+
+
+@needs_weights
+def test_the_tutorial(tmp_path):
+    """Its commands, in its order, lead from photographs to a mesh; what it says they print is what they print."""
+    text = TUTORIAL.read_text("utf-8")
+    (tmp_path / "examples").symlink_to(EXAMPLES)
+    commands = [
+        line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()
+    ]
+    assert len(commands) <= 6
+    said = ""
+    for command in commands:
+        done = subprocess.run(
+            command.replace("splinecli", f"'{sys.executable}' -m splinecli"),
+            shell=True, cwd=tmp_path, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, (command, done.stderr)
+        said += " ".join((done.stdout + done.stderr).split()) + " "
+    for quoted in (
+        "38 to 72 degrees above the picture's plane",
+        "brightest 1 % from 30 to 57 % of full scale",
+        "unequally strong, from 0.68 to 1.37 times their mean",
+        "out/photographs: 11836 pixels, 10 lights, spline-net",
+    ):
+        assert quoted in said
+        assert quoted in text
+    out = tmp_path / "out/photographs"
+    assert (out / "mesh.ply").stat().st_size > 100_000
+    # "1.8 degrees off on average, as they are with the true lights, strengths and mask"
+    truth = read_png(MEDALLION / "normals_gt.png") / 65_535 * 2 - 1
+    mask = read_png(MEDALLION / "mask.png") > 0
+    error_deg = angle_between_deg(np.load(out / "normals.npy")[mask], unit(truth[mask]))
+    assert error_deg.mean() == pytest.approx(1.8, abs=0.1)
+    for picture in re.findall(r"pictures/[a-z]+\.png", text):
+        assert (TUTORIAL.parent / picture).is_file()
 
 
 @pytest.fixture(scope="module")

@@ -280,12 +280,13 @@ def read_capture(
     ground_truth: StrPath | None = None,
     light_indices: Sequence[int] | None = None,
     progress: Callable[[], object] | None = None,
+    mend: bool = False,
 ) -> Capture:
-    """Open a capture and read it: open_capture and CaptureSource.read, which see."""
+    """Open a capture and read it: open_capture and CaptureSource.read, which see. `infer` reads with `mend`."""
     source = open_capture(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
     )
-    return source.read(light_indices, progress)
+    return source.read(light_indices, progress, mend=mend)
 
 
 def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
