@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Convention = Literal["opengl", "directx"]
 
 # A picture's background may be gray, the code of the zero vector: a real normal is never so short.
-_SHORTEST_IN_PICTURE = 0.5
+SHORTEST_IN_PICTURE = 0.5
 
 _Float = TypeVar("_Float", bound=np.floating)
 
@@ -61,6 +61,6 @@ def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     """Unit normals (..., 3) from an 8- or 16-bit RGB picture (y up); black and mid-gray become zero vectors."""
     vectors = picture.astype(np.float64) * 2 / np.iinfo(picture.dtype).max - 1
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    is_normal = picture.any(axis=-1, keepdims=True) & (length > _SHORTEST_IN_PICTURE)
+    is_normal = picture.any(axis=-1, keepdims=True) & (length > SHORTEST_IN_PICTURE)
     decoded: NDArray[np.float64] = np.divide(vectors, length, out=np.zeros_like(vectors), where=is_normal)
     return decoded

@@ -49,6 +49,13 @@ def test_strengths_from_a_card(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-4)
 
 
+def test_photographs_for_a_screen(tmp_path: Path) -> None:
+    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * STRENGTHS)[:, None, None]
+    folder = write(tmp_path / "card", images ** (1 / 2.2), None)
+    found = light_strengths(find_ball_files(folder), LIGHTS, "card", gamma=2.2)
+    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-3)
+
+
 def test_saturated_pixels_do_not_count(tmp_path: Path) -> None:
     images = ball_images()
     cut = (images * 1.7).clip(0, 1)

@@ -11,7 +11,7 @@ import scipy.io
 import tifffile
 from numpy.typing import NDArray
 
-from splinecli.capture import read_normals
+from splinecli.capture import read_normal_map, read_normals
 from splinecli.capture.ground_truth import read_ground_truth
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, encode_picture, unit
@@ -165,6 +165,16 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
 def test_no_normal_inside_the_mask(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found no normal inside the mask, expected at least one"):
         read_normals(write(tmp_path / "a.npy", np.zeros((*SHAPE, 3))), SHAPE, MASK)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> None:
+    picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
+    path = write_image("photograph.png", picture)
+    with pytest.raises(
+        InputError, match=r"found 3\d % of the pixels to be unit vectors.* no picture of normals"
+    ):
+        read_normal_map(path)
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -12,7 +12,9 @@ from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.images import read_mask, to_linear
+from splinecli.capture.saturation import find_saturated
 from splinecli.errors import InputError
+from splinecli.transfer import decode_transfer
 
 Target = Literal["ball", "card"]
 
@@ -23,7 +25,7 @@ _FEWEST_PIXELS = 50
 
 
 def light_strengths(
-    files: BallFiles, light_directions: NDArray[np.float64], target: Target
+    files: BallFiles, light_directions: NDArray[np.float64], target: Target, *, gamma: float | None = 1.0
 ) -> NDArray[np.float64]:
     """Strengths (F, 3), RGB, whose mean is 1: the median of I / (n.l) over the target's pixels, by Lambert's law.
 
@@ -31,6 +33,7 @@ def light_strengths(
         files: photographs of the target, one a light; its mask says where it is. A card may fill the picture.
         light_directions: (F, 3), unit.
         target: a matte ball, or a matte card that faces the camera, normal (0, 0, 1).
+        gamma: of the photographs' transfer curve, as in Development.
 
     Raises:
         InputError: the numbers disagree, an image cannot be read, or a light leaves the target dark or overexposed.
@@ -56,22 +59,22 @@ def light_strengths(
     else:
         normals = np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     strengths = [
-        _strength(path, mask, normals @ light)
+        _strength(path, mask, normals @ light, gamma)
         for path, light in zip(files.images, light_directions, strict=True)
     ]
     relative: NDArray[np.float64] = np.array(strengths) / np.mean(strengths)
     return relative
 
 
-def _strength(path: Path, mask: NDArray[np.bool_], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+def _strength(
+    path: Path, mask: NDArray[np.bool_], cosine: NDArray[np.float64], gamma: float | None
+) -> NDArray[np.float64]:
     stored = decode_image(path)
     if stored.shape[:2] != mask.shape:
         raise InputError("the image is not of the others' size", path=path)
     pixels = stored[mask]
-    usable = cosine > STEEPEST
-    if stored.dtype.kind == "u":
-        usable &= (pixels < np.iinfo(stored.dtype).max).all(axis=1)
-    values = to_linear(pixels[usable], path)
+    usable = (cosine > STEEPEST) & ~find_saturated(pixels)
+    values = decode_transfer(to_linear(pixels[usable], path), gamma)
     ratio = (
         np.median(values / cosine[usable, None], axis=0) if usable.sum() >= _FEWEST_PIXELS else np.zeros(1)
     )

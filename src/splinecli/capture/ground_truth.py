@@ -14,7 +14,7 @@ from splinecli.capture.decoding import decode_image
 from splinecli.capture.paths import find_mode
 from splinecli.capture.text_files import read_number_rows
 from splinecli.errors import InputError
-from splinecli.normals import decode_picture
+from splinecli.normals import SHORTEST_IN_PICTURE, decode_picture
 
 StrPath = str | os.PathLike[str]
 
@@ -22,6 +22,8 @@ UPSIDE_DOWN = "The rows of the ground truth are in the wrong order; it was turne
 """The warning of a capture whose ground truth was."""
 
 _CLEARLY_BETTER = 0.02  # of the mask's pixels
+_LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or JPEG
+_FEWEST_UNIT = 0.6  # of a picture of normals; of photographs a third are of such length by chance
 
 _MAT_KEY = "Normal_gt"
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
@@ -110,6 +112,8 @@ def read_ground_truth(
             path=path,
         )
     is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
+    if is_picture:
+        _check_lengths(stored, mask, path)
     if stored.dtype.kind not in "fiu":
         raise InputError(f"found ground truth of type {stored.dtype}, expected real numbers", path=path)
     upside_down = suffix == ".txt" and _is_upside_down(stored, mask)
@@ -123,6 +127,24 @@ def read_ground_truth(
     if not normals.any():
         raise InputError("found no normal inside the mask, expected at least one", path=path)
     return normals, upside_down
+
+
+def _check_lengths(picture: NDArray[Any], mask: NDArray[np.bool_], path: Path) -> None:
+    """Raise InputError for a picture (H, W, 3) whose colours are no directions, such as a photograph."""
+    colours = picture[mask & picture.any(axis=2)][:: max(1, mask.sum() // _BLOCK)]
+    if not len(colours):
+        return
+    length = np.linalg.norm(colours.astype(np.float32) * (2 / np.iinfo(picture.dtype).max) - 1, axis=1)
+    # Half of it may be gray background, whose length is 0.
+    share = float(
+        (np.abs(length - 1) < _LENGTH_TOLERANCE).sum() / max(1, (length > SHORTEST_IN_PICTURE).sum())
+    )
+    if share < _FEWEST_UNIT:
+        raise InputError(
+            f"found {100 * share:.0f} % of the pixels to be unit vectors, (colour * 2 - 1), expected nearly all:"
+            " this is no picture of normals",
+            path=path,
+        )
 
 
 def _is_upside_down(stored: NDArray[Any], mask: NDArray[np.bool_]) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from splinecli.cli.options import JsonOption, QuietOption
+from splinecli.cli.options import JsonOption, QuietOption, TransferOption
 from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
@@ -53,6 +53,7 @@ def calibrate(
     gray_card: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Photographs of a matte card that faces the camera.")
     ] = None,
+    transfer: TransferOption = "linear",
     compare: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Say how far the light directions in this text file are off."),
@@ -76,8 +77,10 @@ def calibrate(
     from splinecli.capture.light_files import read_light_directions
     from splinecli.files import check_free, write_bytes, write_text
     from splinecli.outputs import encode_png
+    from splinecli.transfer import parse_transfer
 
     talk = Talk(quiet=quiet)
+    gamma = parse_transfer(transfer)
     if gray_ball and gray_card:
         raise UsageError("--gray-ball and --gray-card exclude each other")
     circles = _for_each("--circle", [_parse_circle(text) for text in circle or []], len(balls))
@@ -95,14 +98,18 @@ def calibrate(
     strengths = None
     if gray_files is not None:
         strengths = light_strengths(
-            gray_files, lights.directions, "ball" if gray_ball is not None else "card"
+            gray_files, lights.directions, "ball" if gray_ball is not None else "card", gamma=gamma
         )
     known = None if compare is None else read_light_directions(compare, len(lights.directions))
     report = _report(lights, strengths, known)
-    if gray_files is not None and any(is_display_encoded(image) for image in gray_files.images):
+    if (
+        gamma == 1
+        and gray_files is not None
+        and any(is_display_encoded(image) for image in gray_files.images)
+    ):
         report["warnings"].append(
-            "The photographs of the gray target look display-encoded (JPEG, or PNG that says so);"
-            " strengths need linear ones."
+            "The photographs of the gray target look display-encoded (JPEG, or PNG that says so) but are taken to be"
+            " linear; --transfer srgb undoes sRGB's curve."
         )
     output.mkdir(parents=True, exist_ok=True)
     write_text(output / DIRECTIONS, _rows(lights.directions))
