@@ -10,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import Array, absolute_weights, predict, shadow_weights
+from splinecli.capture.robust_fit import absolute_weights, predict, shadow_weights
+
+Array = NDArray[np.float64]
 
 FEWEST_LIGHTS = 5
 """Each light is an unknown more; four would follow any strengths."""
@@ -26,7 +28,8 @@ are told to be unequal; of uw's sphere and horse and of path-traced objects, met
 Ten strengths are then off by 1.5 % on Ball and 3 % on Cat, where equal ones would be by half.
 """
 
-_PIXELS, _ROUNDS, _FITS = 2000, 200, 5
+_ROUNDS, _FITS = 200, 5
+_OBSERVATIONS, _FEWEST_PIXELS, _MOST_PIXELS = 100_000, 100, 2000
 _LIT = 0.3  # of a pixel's brightest prediction; darker ones may be shadows
 _STEP = 1.5  # beyond what each round finds, which saves a third of them
 
@@ -45,11 +48,12 @@ def find_light_strengths(
     if n_lights < FEWEST_LIGHTS:
         return None
     lit = np.flatnonzero(observations.any(axis=1))
-    chosen = lit[np.linspace(0, len(lit) - 1, min(_PIXELS, len(lit))).astype(int)] if len(lit) else lit
+    number = min(len(lit), _MOST_PIXELS, _OBSERVATIONS // n_lights)
+    chosen = lit[np.linspace(0, len(lit) - 1, number).astype(int)] if len(lit) else lit
     known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
     told = known.sum(axis=1) >= FEWEST_LIGHTS
     known, values = known[told], observations[chosen[told]].astype(np.float64)
-    if len(values) < 10 * n_lights:
+    if len(values) < _FEWEST_PIXELS:
         return None
     values /= values.max(axis=1, keepdims=True)
     equal = np.ones(n_lights)

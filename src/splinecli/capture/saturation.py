@@ -16,7 +16,7 @@ STEP = 1.6
 BRIGHTEST = 8.0
 """No observation is restored to more than this many times the pixel's brightest as stored."""
 
-_TILE_PIXELS = 32_768
+_TILE_PIXELS = 8192
 
 
 def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
@@ -42,25 +42,27 @@ def restore_saturated(
         saturated: (P, F).
         light_directions: (F, 3), unit.
     """
+    lights = light_directions.astype(np.float32)
     rows = np.flatnonzero(saturated.any(axis=1) & ~saturated.all(axis=1))
     for start in range(0, len(rows), _TILE_PIXELS):
         tile = rows[start : start + _TILE_PIXELS]
-        observations[tile] = _restored(observations[tile], saturated[tile], light_directions)
+        observations[tile] = _restored(observations[tile], saturated[tile], lights)
 
 
 def _restored(
-    stored: NDArray[np.float32], saturated: NDArray[np.bool_], lights: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    stored: NDArray[np.float32], saturated: NDArray[np.bool_], lights: NDArray[np.float32]
+) -> NDArray[np.float32]:
     scale = stored.max(axis=1, keepdims=True)
     scale[scale <= 0] = 1
-    lowest = stored / scale.astype(np.float64)
-    values = lowest.copy()
+    lowest = stored / scale
+    values = lowest
     lit = shadow_weights(lowest)
     weights = lit
     for _ in range(ITERATIONS):
         predicted = predict(values, weights, lights)
-        further = np.clip(values + STEP * (predicted - values), lowest, BRIGHTEST)
+        further = np.clip(values + np.float32(STEP) * (predicted - values), lowest, BRIGHTEST)
         values = np.where(saturated, further, lowest)
         weights = lit * absolute_weights(predicted - values)
-    restored: NDArray[np.float64] = values * scale
+    # Not below what is stored, by a rounding either.
+    restored: NDArray[np.float32] = np.where(saturated, np.maximum(values * scale, stored), stored)
     return restored
