@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -40,6 +41,36 @@ def scene(tmp_path: Path):
     np.savetxt(tmp_path / "light_intensities.txt", STRENGTHS)
     cv2.imwrite(str(tmp_path / "mask.png"), inside.astype(np.uint8) * 255)
     return tmp_path, normals, albedo
+
+
+def test_restored_pixels_do_not_spoil_it(scene):
+    """Overexposed, stored colours are too dark; the others tell the albedo."""
+    folder, normals, albedo = scene
+    for path in folder.glob("[0-9].png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
+        cv2.imwrite(str(path), np.minimum(2.5 * picture, 65_535).astype(np.uint16))
+    source = open_capture(folder)
+    capture = source.read(mend=True)
+    stored = source.read().observations
+    inside = normals.any(axis=2)
+    found = albedo_map(source, capture, normals)[inside] / (2.5 * albedo[inside])
+    touched = (capture.observations > stored).any(axis=1)
+    assert 0.2 < touched.mean() < 0.9
+    # Highlights and shadows are in it, as below.
+    assert np.median(found[touched]) == pytest.approx(1, abs=0.02)
+    assert np.quantile(found, 0.99) < 1.5
+
+
+def test_strengths_that_were_estimated_count(scene):
+    folder, normals, _ = scene
+    source = open_capture(folder)
+    capture = source.read()
+    twice = replace(
+        capture, observations=capture.observations / 2, light_strengths=np.full(capture.n_lights, 2.0)
+    )
+    np.testing.assert_allclose(
+        albedo_map(source, twice, normals), albedo_map(source, capture, normals) / 2, rtol=1e-5
+    )
 
 
 def test_albedo_in_colour(scene):

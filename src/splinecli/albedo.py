@@ -51,9 +51,10 @@ def albedo_map(
         if capture.light_strengths is not None:
             colours /= np.float32(capture.light_strengths[position])
         # Restored observations are brighter than their colours, which are saturated: the others tell better.
-        cosine *= np.where(colours.mean(axis=1) < 0.99 * capture.observations[:, position], 0.03, 1)
-        total += cosine[:, None] * colours
-        squares += cosine * cosine
+        restored = colours.mean(axis=1) < 0.99 * capture.observations[:, position]
+        weight = cosine * np.where(restored, np.float32(1e-3), np.float32(1))
+        total += weight[:, None] * colours
+        squares += weight * cosine
         if progress is not None:
             progress()
     albedo = np.zeros((*capture.mask.shape, 3), np.float32)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from splinecli.errors import OutputError
-from splinecli.outputs import NORMALS, PAGE
+from splinecli.outputs import NORMALS, PAGE, REPORT
 from splinecli.templates import render
 
 INDEX = "index.html"
@@ -51,7 +53,8 @@ def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
     """A page that shows the captures' normal maps and links their files, to lie beside their folders."""
     rows = []
     for report in reports:
-        folder, files = quote(report["capture"]), report.get("files", [])
+        # As bytes: a folder's name need not be text.
+        folder, files = quote(os.fsencode(report["capture"])), report.get("files", [])
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
         rows.append(
             {
@@ -64,12 +67,33 @@ def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
     return render("index.html", title=f"{len(reports)} captures", rows=rows)
 
 
+def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Mapping[str, Any]]:
+    """The reports, and those of other captures whose results lie in the folder, by name."""
+    names = {report["capture"] for report in reports}
+    earlier = []
+    for path in sorted(folder.glob(f"*/{REPORT}")):
+        try:
+            report = json.loads(path.read_text("utf-8"))
+            row_of(report)  # raises where it is none
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+        if report["capture"] == path.parent.name not in names:
+            earlier.append(report)
+    return [*reports, *earlier]
+
+
+def has_index(folder: Path) -> bool:
+    """Whether the folder holds an index.html that splinecli wrote."""
+    try:
+        return _OURS in (folder / INDEX).read_bytes()
+    except OSError:
+        return False
+
+
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
     """Raise OutputError where the folder holds an index.html that splinecli did not write and may not replace."""
     path = folder / INDEX
-    try:
-        if overwrite or not path.exists() or _OURS in path.read_bytes():
-            return
-    except OSError:
-        pass
-    raise OutputError("was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o")
+    if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
+        raise OutputError(
+            "was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o"
+        )

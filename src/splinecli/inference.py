@@ -59,14 +59,14 @@ def estimate_normals(
     normals = np.empty((capture.n_pixels, 3), np.float32)
     confidence = np.empty(capture.n_pixels, np.float32) if tells_confidence(estimator) else None
     for start in range(0, capture.n_pixels, tile_pixels):
-        tile = capture.observations[start : start + tile_pixels]
-        rows = slice(start, start + len(tile))
-        if confidence is None or not tells_confidence(estimator):
-            normals[rows] = estimator.estimate(tile, capture.light_directions)
-        else:
+        rows = slice(start, start + tile_pixels)
+        tile = capture.observations[rows]
+        if confidence is not None and tells_confidence(estimator):
             normals[rows], confidence[rows] = estimator.estimate_with_confidence(
                 tile, capture.light_directions
             )
+        else:
+            normals[rows] = estimator.estimate(tile, capture.light_directions)
         if progress is not None:
             progress(len(tile))
     seconds = time.perf_counter() - started

@@ -26,7 +26,7 @@ from splinecli.transfer import encode_srgb
 
 NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
 ERROR_MAP = "error_map.png"
-REPORT, PAGE, MASK = "report.json", "page.html", "mask.png"
+REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
 CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
 MAPS = {
@@ -41,7 +41,7 @@ OWN_FILES = (
     *(name for names in MAPS.values() for name in names),
     *SURFACE_FILES.values(),
     SURFACE_REPORT,
-    MASK,
+    FOUND_MASK,
     PAGE,
     REPORT,
 )
@@ -177,7 +177,7 @@ def write_confidence(confidence_map: NDArray[np.float32], folder: Path) -> None:
 
 def write_mask(mask: NDArray[np.bool_], folder: Path) -> None:
     """A mask (H, W) as a black and white picture."""
-    (folder / MASK).write_bytes(encode_png(mask * np.uint8(255)))
+    (folder / FOUND_MASK).write_bytes(encode_png(mask * np.uint8(255)))
 
 
 def write_preview(estimate: NormalEstimate, folder: Path) -> None:
@@ -235,7 +235,8 @@ def _publish(stage: Path, folder: Path) -> None:
     earlier.mkdir()
     try:
         for name in OWN_FILES:
-            if (folder / name).exists():
+            # A mask that was found before may have been mended since, and be what this run has read.
+            if (folder / name).exists() and (name != FOUND_MASK or name in new):
                 (folder / name).replace(earlier / name)
         for name in new:
             (stage / name).replace(folder / name)

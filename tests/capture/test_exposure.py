@@ -63,6 +63,12 @@ def test_mixed_exposures_are_refused(tmp_path: Path) -> None:
     assert open_capture(folder).n_lights == 3
 
 
+def test_equal_lamps_do_not_make_equal_exposures(tmp_path: Path) -> None:
+    folder = capture(tmp_path / "mixed", (1, 60), (1, 60), (1, 30))
+    with pytest.raises(InputError, match="found an exposure of"):
+        open_capture(folder, intensities="equal")
+
+
 def test_exposures_that_are_one(tmp_path: Path) -> None:
     open_capture(capture(tmp_path / "rounded", (1, 60), (10, 610), None))
     folder = capture(tmp_path / "balanced", (1, 60), (1, 60), (1, 60))

@@ -17,8 +17,11 @@ import numpy as np
 import pytest
 import tifffile
 
+from splinecli.capture.capture_files import NOT_PHOTOGRAPHS
+from splinecli.capture.image_lists import IMAGE_SUFFIXES
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.normals import angle_between_deg, decode_picture
+from splinecli.outputs import OWN_FILES
 
 PIXELS = 448
 
@@ -118,7 +121,8 @@ def test_how_sure_the_network_is(capture, run):
     confidence, report = np.load(out / "confidence.npy"), read_report(out)
     assert (confidence.dtype, confidence.shape) == (np.float32, mask.shape)
     assert not confidence[~mask].any()
-    # A matte sphere is the easiest there is, and no error is over a degree.
+    # A matte sphere is the easiest there is.
+    assert report["angular_error_deg"]["under_5"] == 1
     assert 0.7 < confidence[mask].mean() < 1
     assert report["expected_under_5"] == pytest.approx(confidence[mask].mean(), abs=1e-4)
     picture = cv2.imread(str(out / "confidence.png"), cv2.IMREAD_UNCHANGED)
@@ -144,17 +148,19 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.where(mask > 0, picture, 300).astype(np.uint16))
     assert run("infer", capture, "--method", "ls", "--auto-mask").code == 0
-    assert "mask.png" not in read_report(Path("out/sphere"))["files"]  # the capture's own goes first
+    assert "found_mask.png" not in read_report(Path("out/sphere"))["files"]  # the capture's own goes first
     (capture / "mask.png").unlink()
     assert run("infer", capture, "--method", "ls", "--auto-mask", "--overwrite").code == 0
     report = read_report(Path("out/sphere"))
-    found = cv2.imread("out/sphere/mask.png", cv2.IMREAD_UNCHANGED)
-    assert ("mask.png" in report["files"], report["n_pixels"]) == (True, np.count_nonzero(found))
+    found = cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED)
+    assert ("found_mask.png" in report["files"], report["n_pixels"]) == (True, np.count_nonzero(found))
     assert (found != mask).mean() < 0.02  # corners are rounded
     # What was written is a mask that the next call reads.
-    again = run("infer", capture, "--method", "ls", "--mask", "out/sphere/mask.png", "-o", "again", "--json")
+    again = run(
+        "infer", capture, "--method", "ls", "--mask", "out/sphere/found_mask.png", "-o", "again", "--json"
+    )
     assert json.loads(again.out)["n_pixels"] == report["n_pixels"]
-    both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/mask.png", "--overwrite")
+    both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite")
     assert (both.code, "exclude each other" in both.err) == (2, True)
     for path in capture.glob("image*.png"):
         cv2.imwrite(str(path), np.full(mask.shape, 30_000, np.uint16))
@@ -200,6 +206,41 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     assert all((Path("out") / unquote(link)).is_file() for link in links)
     assert "found neither PNG, TIFF nor JPEG" in index
     assert run("infer", *captures).code == 3  # our own index is replaced
+    # Later results in the same place join it, and those of a single capture, too.
+    make_capture("fourth")
+    make_capture("fifth")
+    assert run("infer", "fourth", "a b", "--method", "ls", "--overwrite").code == 0
+    assert run("infer", "fifth", "--method", "ls").code == 0
+    links = re.findall(r'href="([^"]+)"', Path("out/index.html").read_text("utf-8"))
+    assert {f"{name}/normals.npy" for name in ("sphere", "a%20b", "fourth", "fifth")} <= set(links)
+    assert len([link for link in links if link == "a%20b/normals.npy"]) == 1
+    Path("place/index.html").mkdir(parents=True)
+    assert run("infer", capture, "fourth", "--method", "ls", "-o", "place", "--overwrite").code == 5
+
+
+def test_names_that_are_no_text(capture, make_capture, run):
+    odd = make_capture("odd").rename(os.fsdecode(b"x\xff"))
+    assert run("infer", capture, odd, "--method", "ls").code == 0
+    assert 'href="x%FF/normals.npy"' in Path("out/index.html").read_text("utf-8")
+
+
+def test_no_picture_of_ours_is_a_photograph():
+    pictures = {Path(name).stem for name in OWN_FILES if Path(name).suffix in IMAGE_SUFFIXES}
+    assert pictures <= NOT_PHOTOGRAPHS
+
+
+def test_a_mended_mask_stays(capture, run):
+    """A mask that was found, painted over, and given to the next call, which replaces the other results."""
+    (capture / "mask.png").unlink()
+    assert run("infer", capture, "--method", "ls", "--auto-mask", "--light-indices", "0,1,2,3").code in (0, 3)
+    Path("out/sphere").mkdir(parents=True, exist_ok=True)
+    painted = np.zeros((24, 24), np.uint8)
+    painted[5:15, 5:15] = 255
+    cv2.imwrite("out/sphere/found_mask.png", painted)
+    mended = ("--mask", "out/sphere/found_mask.png", "--overwrite")
+    assert run("infer", capture, "--method", "ls", *mended).code == 0
+    assert read_report(Path("out/sphere"))["n_pixels"] == 100
+    np.testing.assert_array_equal(cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted)
 
 
 def test_photographs_with_a_curve_and_ambient_light(capture, run):

@@ -58,6 +58,26 @@ def test_forms_of_normal_maps(run, arguments):
     assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
 
 
+@pytest.mark.parametrize("where", ["mask", "alpha"])
+def test_a_background_that_is_not_black(run, where):
+    normals, heights, inside = sphere()
+    picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(np.uint16)[
+        ..., ::-1
+    ]
+    cut = inside.astype(np.uint16) * 65_535
+    cv2.imwrite("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
+    cv2.imwrite("mask.png", cut)
+    arguments = ["integrate", "white.png", "-o", "out", "--format", "npy"]
+    if where == "mask":
+        refused = run(*arguments)
+        assert (refused.code, "this is no picture of normals" in refused.err) == (3, True)
+        arguments += ["--mask", "mask.png"]
+    assert run(*arguments).code == 0
+    depth = np.load("out/depth.npy")
+    assert np.array_equal(np.isfinite(depth), inside)
+    assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
+
+
 def test_results_of_infer_stay_together(run, capture):
     assert run("infer", str(capture), "--method", "ls", "-o", "results").code == 0
     folder = Path("results") / capture.name

@@ -21,7 +21,7 @@ def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
     error = torch.tensor([[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64)
     expected = stats.fisk(shape, scale=median_deg)
     for limit_deg in (0.1, 5.0, 60.0):
-        assert probability_within(error, limit_deg).item() == pytest.approx(expected.cdf(limit_deg))
+        assert probability_within(error, limit_deg).item() == pytest.approx(expected.cdf(limit_deg + 0.1))
     angles_deg = np.array([0.3, 4.0, 50.0])
     # Of the angle's logarithm, a tenth of a degree added.
     found = error_surprise(error, torch.from_numpy(np.radians(angles_deg)))

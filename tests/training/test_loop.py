@@ -254,8 +254,12 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
         f"ne_net.error_head.layers.{layer}.{kind}" for layer in (0, 2) for kind in ("weight", "bias")
     }
     assert all(torch.equal(last.state_dict()[name], value) for name, value in first.state_dict().items())
-    with pytest.raises(ModelError, match=r"expected network\.error_head = true"):
-        replace(tiny, updates="error_head")
+    # Trained further, the networks lose it.
+    further = replace(tiny, start_from=str(tmp_path / "second" / WEIGHTS))
+    assert set(Trainer(further, tmp_path / "third", CPU).network.state_dict()) == set(first.state_dict())
+    for settings in ({"updates": "error_head"}, {"network": config.network}):
+        with pytest.raises(ModelError, match="an error head is trained by 'error_head' alone"):
+            replace(tiny, **settings)
 
 
 def test_weights_of_another_network_cannot_begin_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:

@@ -16,13 +16,13 @@ def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
 
     Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) on lightness, the cube root, by
     which dark parts of an object are nearer to its bright ones than to the background; then the largest connected
-    part, its holes filled.
+    part, its holes filled. It cannot tell an object from a background that is as bright.
 
     Args:
         brightness: (H, W), linear: the mean over all lights.
 
     Raises:
-        InputError: nothing stands out, or nearly everything does.
+        InputError: next to nothing stands out, or nearly everything does.
     """
     import cv2
 

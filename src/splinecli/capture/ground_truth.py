@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.decoding import decode_image
+from splinecli.capture.decoding import decode_image, decode_with_alpha
 from splinecli.capture.paths import find_mode
 from splinecli.capture.text_files import read_number_rows
 from splinecli.errors import InputError
@@ -38,29 +38,42 @@ def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_])
     return read_ground_truth(path, shape, mask)[0]
 
 
-def read_normal_map(path: StrPath) -> NDArray[np.float32]:
-    """A normal map (H, W, 3) of any size, in one of the forms of read_ground_truth but text.
+def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+    """A normal map (H, W, 3) of any size, in one of the forms of read_ground_truth but text; zero where there is none.
+
+    Args:
+        mask: (H, W), true where normals are wanted. Where a picture's alpha channel cuts something out, that is left
+            out, too.
 
     Raises:
-        InputError: the file cannot be read, or holds no normal map.
+        InputError: the file cannot be read, holds no normal map, or is not of the mask's size.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     mode = find_mode(path)
     if mode is None or not stat.S_ISREG(mode):
         raise InputError("the normal map does not exist or is no file", path=path)
+    alpha = None
     if suffix == ".mat":
         stored = _read_mat(path)
     elif suffix == ".npy":
         stored = _read_npy(path)
     else:
-        stored = decode_image(path)
+        stored, alpha = decode_with_alpha(path)
     if stored.ndim != 3 or stored.shape[2] != 3:
         raise InputError(
             f"found an array of {_times(stored.shape)}, expected a normal map, H x W x 3", path=path
         )
-    shape = (stored.shape[0], stored.shape[1])
-    return read_ground_truth(path, shape, np.ones(shape, np.bool_))[0]
+    wanted = np.ones(stored.shape[:2], np.bool_) if mask is None else mask
+    if wanted.shape != stored.shape[:2]:
+        raise InputError(
+            f"found a normal map of {stored.shape[1]} x {stored.shape[0]} pixels,"
+            f" expected {wanted.shape[1]} x {wanted.shape[0]} as the mask",
+            path=path,
+        )
+    if alpha is not None:
+        wanted = wanted & (alpha > alpha.max() / 2)
+    return _to_normals(stored, suffix, wanted, path)
 
 
 def read_ground_truth(
@@ -111,22 +124,29 @@ def read_ground_truth(
             f"found ground truth of {_times(stored.shape)}, expected {_times((*shape, 3))} like the images",
             path=path,
         )
-    is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
-    if is_picture:
-        _check_lengths(stored, mask, path)
-    if stored.dtype.kind not in "fiu":
-        raise InputError(f"found ground truth of type {stored.dtype}, expected real numbers", path=path)
     upside_down = suffix == ".txt" and _is_upside_down(stored, mask)
     if upside_down:
         stored = stored[::-1]
-    normals = np.zeros((*shape, 3), np.float32)
+    return _to_normals(stored, suffix, mask, path), upside_down
+
+
+def _to_normals(
+    stored: NDArray[Any], suffix: str, mask: NDArray[np.bool_], path: Path
+) -> NDArray[np.float32]:
+    """What a file of this suffix stores (H, W, 3) as unit vectors, zero outside the mask (H, W). Raises InputError."""
+    if stored.dtype.kind not in "fiu":
+        raise InputError(f"found normals of type {stored.dtype}, expected real numbers", path=path)
+    is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
+    if is_picture:
+        _check_lengths(stored, mask, path)
+    normals = np.zeros(stored.shape, np.float32)
     rows, columns = np.nonzero(mask)
     for start in range(0, len(rows), _BLOCK):
         place = rows[start : start + _BLOCK], columns[start : start + _BLOCK]
         normals[place] = decode_picture(stored[place]) if is_picture else _unit_or_zero(stored[place])
     if not normals.any():
         raise InputError("found no normal inside the mask, expected at least one", path=path)
-    return normals, upside_down
+    return normals
 
 
 def _check_lengths(picture: NDArray[Any], mask: NDArray[np.bool_], path: Path) -> None:
@@ -144,6 +164,7 @@ def _check_lengths(picture: NDArray[Any], mask: NDArray[np.bool_], path: Path) -
             f"found {100 * share:.0f} % of the pixels to be unit vectors, (colour * 2 - 1), expected nearly all:"
             " this is no picture of normals",
             path=path,
+            hint="Where its background is not black, a mask says so",
         )
 
 

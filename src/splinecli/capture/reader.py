@@ -162,9 +162,16 @@ class CaptureSource:
             path = self.files.images[index]
             stored = decode_image(path)
             _check_mask_size(mask, stored.shape[:2], path, path)
-            return np.asarray(develop(stored[mask], path, index) / self.light_intensities[index], np.float32)
+            return self._colours(develop, stored[mask], index)
 
         return read
+
+    def _colours(self, develop: Developer, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
+        linear = develop(pixels, self.files.images[index], index)
+        # In float32 and in place: of 24 megapixels, anything else is felt.
+        colours = np.array(np.broadcast_to(linear, (len(linear), 3)), np.float32)
+        colours /= self.light_intensities[index].astype(np.float32)
+        return colours
 
     def find_mask(self, progress: Callable[[], object] | None = None) -> CaptureSource:
         """The same capture with a mask made from all its images (see find_object); the same where it has one.
@@ -173,14 +180,18 @@ class CaptureSource:
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
-        whole = np.ones(decode_image(self.files.images[0]).shape[:2], np.bool_)
-        read = self.colours(whole)
-        total = np.zeros(whole.size, np.float32)
-        for index in range(self.n_lights):
-            total += read(index).mean(axis=1)
+        develop = None
+        for index, path in enumerate(self.files.images):
+            stored = decode_image(path)
+            if develop is None:
+                shape = stored.shape[:2]
+                develop = Developer(self.development, np.ones(shape, np.bool_), self.n_lights)
+                total = np.zeros(shape[0] * shape[1], np.float32)
+            _check_mask_size(develop.mask, stored.shape[:2], path, path)
+            total += self._colours(develop, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
             if progress is not None:
                 progress()
-        return replace(self, found_mask=find_object(total.reshape(whole.shape)))
+        return replace(self, found_mask=find_object(total.reshape(shape)))
 
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """The mask of images of this shape, (H, W); all of it where the capture has none. Raises InputError."""
@@ -252,10 +263,10 @@ def open_capture(
     else:
         directions = read_light_directions(path, len(files.images))
     if equal:
-        strengths = np.ones((len(files.images), 3))
+        strengths = None
     elif files.light_intensities is not None:
         strengths = read_light_intensities(files.light_intensities, len(files.images))
-    known = strengths is not None
+    known = equal or strengths is not None
     if strengths is None:
         check_exposures(files.images)
         strengths = np.ones((len(files.images), 3))

@@ -60,6 +60,8 @@ class Capture:
         object.__setattr__(self, "light_indices", tuple(operator.index(i) for i in self.light_indices))
         object.__setattr__(self, "mask", np.asarray(self.mask, np.bool_))
         object.__setattr__(self, "warnings", tuple(self.warnings))
+        if self.light_strengths is not None:
+            object.__setattr__(self, "light_strengths", np.asarray(self.light_strengths, np.float64))
         self._check_lights()
         self._check_observations()
         if self.ground_truth is not None:
@@ -103,6 +105,10 @@ class Capture:
             raise InputError(
                 f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}",
                 hint="A normal has three unknowns, so three images under different lights are the fewest",
+            )
+        if self.light_strengths is not None and self.light_strengths.shape != (len(lights),):
+            raise InputError(
+                f"{self.name}: light strengths of shape {self.light_strengths.shape}, expected ({len(lights)},)"
             )
         if not np.isfinite(lights).all():
             raise InputError(f"{self.name}: a light direction is not finite")

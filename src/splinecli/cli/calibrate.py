@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from splinecli.cli.options import JsonOption, QuietOption, TransferOption
+from splinecli.cli.options import JsonOption, QuietOption
 from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
@@ -53,7 +53,10 @@ def calibrate(
     gray_card: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Photographs of a matte card that faces the camera.")
     ] = None,
-    transfer: TransferOption = "linear",
+    transfer: Annotated[
+        str,
+        typer.Option(metavar="CURVE", help="Of the gray target's photographs: linear, srgb or gamma:G."),
+    ] = "linear",
     compare: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Say how far the light directions in this text file are off."),

@@ -58,7 +58,7 @@ def infer(
     auto_mask: Annotated[
         bool,
         typer.Option(
-            "--auto-mask", help="Find the object where there is no mask; mask.png says what was found."
+            "--auto-mask", help="Find the object where there is no mask; found_mask.png is what was found."
         ),
     ] = False,
     ground_truth: Annotated[
@@ -128,11 +128,11 @@ def infer(
     truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished
     before with the same options are left as they are. OUT/index.html links the results of several.
     """
-    from splinecli.batch import check_index_free
+    from splinecli.batch import INDEX, check_index_free, has_index, index_page, with_earlier
     from splinecli.capture import capture_name
     from splinecli.capture.record import check_light_indices
     from splinecli.evaluation.draws import check_draw_settings
-    from splinecli.files import check_free
+    from splinecli.files import check_free, write_text
     from splinecli.methods import MethodOptions, check_method
     from splinecli.outputs import MAPS, NORMALS, OWN_FILES, finished_report
 
@@ -198,6 +198,8 @@ def infer(
         options=MethodOptions(weights, rotations, batch_size, device.value, precision.value),
         talk=Talk(quiet=quiet),
     )
+    if "confidence" in job.maps:
+        _ = job.estimator  # refuses methods that do not tell it before anything is read
     reports, exit_code = [], 0
     for folder in captures:
         if folder in finished:
@@ -217,19 +219,18 @@ def infer(
             if not (quiet or as_json):
                 print(_summary(report, output))
         reports.append(report)
+    if len(captures) > 1 or has_index(output):
+        write_text(output / INDEX, index_page(with_earlier(reports, output)))
     if len(captures) > 1:
-        _conclude(reports, len(finished), output, job.talk)
+        _say_how_it_went(reports, len(finished), output, job.talk)
     if as_json:
         print(json.dumps(reports[0] if len(captures) == 1 else reports, indent=2))
     return exit_code
 
 
-def _conclude(reports: Sequence[dict[str, Any]], n_finished: int, output: Path, talk: Talk) -> None:
-    """Write the page that links several captures' results, and say how they went."""
-    from splinecli.batch import HEADER, INDEX, index_page, row_of
-    from splinecli.files import write_text
+def _say_how_it_went(reports: Sequence[dict[str, Any]], n_finished: int, output: Path, talk: Talk) -> None:
+    from splinecli.batch import HEADER, INDEX, row_of
 
-    write_text(output / INDEX, index_page(reports))
     good = [row_of(report) for report in reports if "error" not in report]
     if good:
         columns = [column for column in zip(HEADER, *good, strict=True) if any(column[1:])]

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource, Development
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator, MethodOptions
+    from splinecli.normals import Convention
 
 
-@dataclass
+@dataclass(frozen=True)
 class Job:
     """What the command line asked for, the same for every capture."""
 
@@ -32,7 +33,7 @@ class Job:
     surface: bool
     html: bool
     asked: dict[str, Any]
-    convention: Any
+    convention: Convention
     n_lights: int | None
     seed: int
     light_indices: list[int] | None

@@ -82,7 +82,7 @@ def integrate(
     """
     import numpy as np
 
-    from splinecli.capture import read_normal_map
+    from splinecli.capture import read_mask, read_normal_map
     from splinecli.files import check_free, write_text
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
@@ -91,14 +91,11 @@ def integrate(
     wanted = split_commas(formats, "--format", list(SURFACE_FILES))
     folder = output or (normals if normals.is_dir() else normals.parent)
     check_free(folder, (*(SURFACE_FILES[form] for form in wanted), SURFACE_REPORT), overwrite=overwrite)
-    normal_map = read_normal_map(_find_in(normals) if normals.is_dir() else normals)
+    given = None if mask is None else read_mask(mask)
+    normal_map = read_normal_map(_find_in(normals) if normals.is_dir() else normals, given)
     if convention is NormalConvention.directx:
         normal_map[..., 1] *= -1
     inside = np.asarray(normal_map.any(axis=2))
-    if mask is not None:
-        inside = inside & _read_mask(mask, inside.shape)
-        if not inside.any():
-            raise InputError("the mask holds no pixel with a normal", path=mask)
     matrix = None if camera_matrix is None else _read_matrix(camera_matrix)
     vertex_colours = None if colours is None else _read_colours(colours, inside.shape)
     started = time.perf_counter()
@@ -149,14 +146,6 @@ def _find_in(folder: Path) -> Path:
         path=folder,
         hint="Give a folder that 'splinecli infer' wrote",
     )
-
-
-def _read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    from splinecli.capture import read_mask
-
-    found = read_mask(path)
-    _check_size("mask", found.shape, shape, path)
-    return found
 
 
 def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:

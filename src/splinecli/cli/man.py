@@ -40,7 +40,7 @@ FILES = (
     ("OUT/NAME/normals.npy", "Normal map, float32, H x W x 3, zero outside the mask."),
     ("OUT/NAME/normals_8bit.png, normals.tiff", "With --format png8, tiff: the same in 8 bits, in float32."),
     ("OUT/NAME/error_map.png", "Angular error with a colour bar, where there is ground truth."),
-    ("OUT/NAME/mask.png", "With --auto-mask: the mask that was found."),
+    ("OUT/NAME/found_mask.png", "With --auto-mask: the mask that was found."),
     ("OUT/NAME/albedo.png, albedo.npy", "With --maps albedo: the picture, and linear in float32."),
     (
         "OUT/NAME/confidence.png, confidence.npy",
@@ -117,7 +117,7 @@ def man_pages() -> dict[str, str]:
     pages = {"splinecli.1": _overview(group, context, commands)}
     for name, command in commands.items():
         own_context = command.context_class(command, info_name=name, parent=context)
-        pages[f"{_page_name(name)}.1"] = _command_page_name(name, command, own_context, commands)
+        pages[f"{_page_name(name)}.1"] = _command_page(name, command, own_context, commands)
     return pages
 
 
@@ -137,7 +137,7 @@ def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
     return _page_text([*lines, *_examples(""), *_see_also(commands)])
 
 
-def _command_page_name(name: str, command: Any, context: Any, commands: dict[str, Any]) -> str:
+def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any]) -> str:
     summary = _paragraphs(command.help)[0].rstrip(".")
     lines = [
         # In NAME stands no sentence: no capital, no full stop.

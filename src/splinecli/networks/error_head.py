@@ -13,8 +13,9 @@ HIDDEN = 64
 class ErrorHead(nn.Module):
     """NE-Net's hidden features (P, C) and its normals -> a log-logistic distribution of the error (P, 2).
 
-    The first number is the logarithm of the median error in radians, the second that of the distribution's shape:
-    the larger, the surer. The networks are fixed while this is trained, so that it costs the normals nothing.
+    The first number is the logarithm of the median error in radians (_MORE_DEG added), the second that of the
+    distribution's shape: the larger, the surer. The networks are fixed while this is trained, so that it costs the
+    normals nothing.
     """
 
     def __init__(self, features: int, normals: int) -> None:
@@ -29,15 +30,18 @@ class ErrorHead(nn.Module):
         return error.float()
 
 
+_MORE_DEG = 0.1
+"""Added to all errors: nobody needs to know that one is a hundredth of a degree and not a thousandth."""
+
+
 def error_surprise(error: Tensor, angle: Tensor) -> Tensor:
-    """Minus the log-likelihood (P,) of angular errors (P,) in radians under ErrorHead's distributions (P, 2)."""
+    """Minus the log-likelihood (P,) of the logarithms of errors (P,) in radians under distributions (P, 2)."""
     median, shape = error.unbind(-1)
-    # A tenth of a degree more: nobody needs to know that an error is a hundredth and not a thousandth.
-    z = shape.exp() * ((angle + math.radians(0.1)).log() - median)
+    z = shape.exp() * ((angle + math.radians(_MORE_DEG)).log() - median)
     return z + 2 * nn.functional.softplus(-z) - shape
 
 
 def probability_within(error: Tensor, limit_deg: float) -> Tensor:
     """The probability (P,) that a pixel's normal is off by no more than so many degrees."""
     median, shape = error.unbind(-1)
-    return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg)) - median))
+    return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg + _MORE_DEG)) - median))

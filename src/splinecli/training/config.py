@@ -97,9 +97,10 @@ class TrainingConfig:
             raise ModelError(
                 "training setting 'updates' is 'alternating'; without a LI-Net there is nothing to alternate with"
             )
-        if self.updates == "error_head" and not self.network.error_head:
+        if (self.updates == "error_head") != self.network.error_head:
             raise ModelError(
-                "training setting 'updates' is 'error_head'; expected network.error_head = true with it"
+                f"training settings 'updates' and 'network.error_head' are {self.updates!r} and"
+                f" {self.network.error_head}; an error head is trained by 'error_head' alone, which needs one"
             )
         if not sum(self.sources.values()) > 0:
             raise ModelError("training setting 'sources' gives no source a weight above 0")

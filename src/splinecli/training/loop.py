@@ -58,18 +58,15 @@ def stream_seed(seed: int, step: int, stream: int) -> int:
 def _start_from(weights: str, network: SplineNet) -> None:
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
-    # A network without an error head may grow one.
-    grows = wanted["error_head"] and not found["error_head"]
-    differing = [
-        name for name in wanted if wanted[name] != found[name] and not (grows and name == "error_head")
-    ]
+    # A network may grow an error head, and loses the one it has where it is trained further.
+    differing = [name for name in wanted if wanted[name] != found[name] and name != "error_head"]
     if differing:
         name = differing[0]
         raise ModelError(
             f"the weights {weights!r} are of a network with {name} = {found[name]!r}, the run's has {wanted[name]!r}",
             hint="Choose the preset, or the settings network.*, that the weights were trained with",
         )
-    network.load_state_dict(loaded.state_dict(), strict=not grows)
+    network.load_state_dict(loaded.state_dict(), strict=wanted["error_head"] == found["error_head"])
 
 
 class Trainer:
