@@ -84,6 +84,10 @@ def calibrate(
 
     talk = Talk(quiet=quiet)
     gamma = parse_transfer(transfer)
+    if gamma != 1 and not (gray_ball or gray_card):
+        raise UsageError(
+            "--transfer is of the photographs of --gray-ball or --gray-card; mirror balls need none"
+        )
     if gray_ball and gray_card:
         raise UsageError("--gray-ball and --gray-card exclude each other")
     circles = _for_each("--circle", [_parse_circle(text) for text in circle or []], len(balls))
