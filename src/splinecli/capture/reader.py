@@ -108,12 +108,7 @@ class CaptureSource:
             path = self.files.images[index]
             if stored is None:
                 stored = decode_image(path)
-            if stored.shape[:2] != mask.shape:
-                raise InputError(
-                    f"found an image of {_size(stored.shape)} pixels,"
-                    f" expected {_size(mask.shape)} as in {first_path.name}",
-                    path=path,
-                )
+            _check_image_size(stored, mask, path, first_path)
             pixels = stored[mask]
             here = find_saturated(pixels)
             if here.any():
@@ -161,7 +156,7 @@ class CaptureSource:
         def read(index: int) -> NDArray[np.float32]:
             path = self.files.images[index]
             stored = decode_image(path)
-            _check_mask_size(mask, stored.shape[:2], path, path)
+            _check_image_size(stored, mask, path, self.files.images[0])
             return self._colours(develop, stored[mask], index)
 
         return read
@@ -187,7 +182,7 @@ class CaptureSource:
                 shape = stored.shape[:2]
                 develop = Developer(self.development, np.ones(shape, np.bool_), self.n_lights)
                 total = np.zeros(shape[0] * shape[1], np.float32)
-            _check_mask_size(develop.mask, stored.shape[:2], path, path)
+            _check_image_size(stored, develop.mask, path, self.files.images[0])
             total += self._colours(develop, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
             if progress is not None:
                 progress()
@@ -334,6 +329,14 @@ def _strengths_in_words(strengths: NDArray[np.float64]) -> str:
         f" what the images tell of it was used; --intensities FILE gives the strengths, --intensities {EQUAL} takes"
         " them for equal."
     )
+
+
+def _check_image_size(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path, first: Path) -> None:
+    if stored.shape[:2] != mask.shape:
+        raise InputError(
+            f"found an image of {_size(stored.shape)} pixels, expected {_size(mask.shape)} as in {first.name}",
+            path=path,
+        )
 
 
 def _check_mask_size(mask: NDArray[np.bool_], shape: tuple[int, ...], path: Path, image: Path) -> None:
