@@ -56,6 +56,14 @@ def test_photographs_for_a_screen(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-3)
 
 
+def test_ambient_light_is_taken_off(tmp_path: Path) -> None:
+    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * STRENGTHS)[:, None, None]
+    folder = write(tmp_path / "card", images + 0.1, None)
+    cv2.imwrite(str(folder / "ambient.png"), np.full((20, 30, 3), round(0.1 * 65535), np.uint16))
+    found = light_strengths(find_ball_files(folder), LIGHTS, "card")
+    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-3)
+
+
 def test_saturated_pixels_do_not_count(tmp_path: Path) -> None:
     images = ball_images()
     cut = (images * 1.7).clip(0, 1)

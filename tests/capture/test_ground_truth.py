@@ -172,7 +172,7 @@ def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> No
     picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
     path = write_image("photograph.png", picture)
     with pytest.raises(
-        InputError, match=r"found 3\d % of the pixels to be unit vectors.* no picture of normals"
+        InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are no normals"
     ):
         read_normal_map(path)
 

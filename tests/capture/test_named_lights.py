@@ -198,3 +198,20 @@ def test_several_light_files(write_folder: WriteFolder) -> None:
         (folder / name).write_text(f"5\n{rows(NAMES)}")
     with pytest.raises(InputError, match=r"found 2 light files: a\.lp, b\.lp"):
         open_capture(folder)
+
+
+def test_umlauts_of_older_programs_and_images_that_are_not_named(write_folder: WriteFolder) -> None:
+    names = ["schräg 1.png", "schräg 2.png", "schräg 3.png", "schräg 4.png", "rest.png"]
+    folder = write_folder("umlauts", names)
+    lines = rows(names).split("\n")[:4]
+    (folder / "capture.lp").write_bytes("\n".join(["4", *lines]).encode("latin-1"))
+    source = open_capture(folder)
+    assert [path.name for path in source.files.images] == names[:4]
+    assert any("names 4 of the 5 images; the others are left out" in warning for warning in source.warnings)
+
+
+def test_psbox_with_calibrated_lights_alone(write_folder: WriteFolder, tmp_path: Path) -> None:
+    folder = write_folder("kitten/Objects", [f"{number}.png" for number in range(5)]).parent
+    (tmp_path / "lights.txt").write_text(rows(), "utf-8")
+    source = open_capture(folder, lights=tmp_path / "lights.txt")
+    assert (source.files.layout, source.files.name, source.n_lights) == ("PSBox", "kitten", 5)

@@ -68,3 +68,15 @@ def test_no_capture(run, tmp_path):
     result = run("info", tmp_path / "nowhere")
     assert (result.code, result.out) == (3, "")
     assert "the folder does not exist" in result.err
+
+
+def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
+    before = (capture / "image1.png").read_bytes()
+    for name in ("image1.png", "sky.png"):
+        result = run("info", capture, "--plot", capture / name)
+        assert (result.code, "would lie among the photographs" in result.err) == (2, True)
+    assert (capture / "image1.png").read_bytes() == before
+    (tmp_path / "mine.png").write_bytes(b"mine")
+    assert run("info", capture, "--plot", tmp_path / "mine.png").code == 5
+    assert (tmp_path / "mine.png").read_bytes() == b"mine"
+    assert run("info", capture, "--plot", tmp_path / "mine.png", "--overwrite").code == 0

@@ -58,6 +58,23 @@ def test_forms_of_normal_maps(run, arguments):
     assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
 
 
+@pytest.mark.parametrize("form", ["png", "png8"])
+def test_a_folder_tells_how_it_was_written(run, capture, form):
+    for convention in ("opengl", "directx"):
+        arguments = ["--method", "ls", "--format", form, "--convention", convention, "-o", convention]
+        assert run("infer", capture, *arguments).code == 0
+        assert run("integrate", f"{convention}/sphere", "--format", "npy").code == 0
+    here, there = (np.load(f"{convention}/sphere/depth.npy") for convention in ("opengl", "directx"))
+    np.testing.assert_allclose(here, there, atol=0.2)
+    assert np.nanmax(here) - np.nanmin(here) > 1
+
+
+def test_an_array_of_something_else(run):
+    np.save("albedo.npy", np.random.default_rng(0).uniform(0, 0.4, (*SHAPE, 3)).astype(np.float32))
+    result = run("integrate", "albedo.npy", "-o", "out")
+    assert (result.code, "these are no normals" in result.err) == (3, True)
+
+
 @pytest.mark.parametrize("where", ["mask", "alpha"])
 def test_a_background_that_is_not_black(run, where):
     normals, heights, inside = sphere()
@@ -70,7 +87,7 @@ def test_a_background_that_is_not_black(run, where):
     arguments = ["integrate", "white.png", "-o", "out", "--format", "npy"]
     if where == "mask":
         refused = run(*arguments)
-        assert (refused.code, "this is no picture of normals" in refused.err) == (3, True)
+        assert (refused.code, "these are no normals" in refused.err) == (3, True)
         arguments += ["--mask", "mask.png"]
     assert run(*arguments).code == 0
     depth = np.load("out/depth.npy")

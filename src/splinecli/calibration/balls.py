@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
-from splinecli.capture.capture_files import FILENAMES, MASK, find_named
+from splinecli.capture.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
 from splinecli.capture.decoding import decode_image
 from splinecli.capture.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.capture.images import read_mask, to_linear
@@ -21,7 +21,7 @@ from splinecli.normals import angle_between_deg, unit
 REFERENCES = ("ref", "reference")
 """Stems of a picture that shows a ball's outline and is no photograph of a light."""
 
-_NO_LIGHTS = frozenset({*REFERENCES, "mask", "ambient"})
+_NO_LIGHTS = NOT_PHOTOGRAPHS | set(REFERENCES)
 
 
 @dataclass(frozen=True, eq=False)

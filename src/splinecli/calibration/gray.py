@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
+from splinecli.capture.capture_files import AMBIENT, find_named
 from splinecli.capture.decoding import decode_image
-from splinecli.capture.images import read_mask, to_linear
+from splinecli.capture.development import Developer, Development
+from splinecli.capture.exposure import check_exposures
+from splinecli.capture.images import read_mask
 from splinecli.capture.saturation import find_saturated
 from splinecli.errors import InputError
-from splinecli.transfer import decode_transfer
 
 Target = Literal["ball", "card"]
 
@@ -30,7 +32,8 @@ def light_strengths(
     """Strengths (F, 3), RGB, whose mean is 1: the median of I / (n.l) over the target's pixels, by Lambert's law.
 
     Args:
-        files: photographs of the target, one a light; its mask says where it is. A card may fill the picture.
+        files: photographs of the target, one a light; its mask says where it is. A card may fill the picture. An image
+            called `ambient` in their folder is taken off.
         light_directions: (F, 3), unit.
         target: a matte ball, or a matte card that faces the camera, normal (0, 0, 1).
         gamma: of the photographs' transfer curve, as in Development.
@@ -58,23 +61,24 @@ def light_strengths(
         normals = circle.normals(x.astype(np.float64), y.astype(np.float64))
     else:
         normals = np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
+    check_exposures(files.images)
+    development = Development(gamma, find_named(files.folder, AMBIENT))
+    develop = Developer(development, mask, len(files.images))
     strengths = [
-        _strength(path, mask, normals @ light, gamma)
-        for path, light in zip(files.images, light_directions, strict=True)
+        _strength(path, develop, index, normals @ light)
+        for index, (path, light) in enumerate(zip(files.images, light_directions, strict=True))
     ]
     relative: NDArray[np.float64] = np.array(strengths) / np.mean(strengths)
     return relative
 
 
-def _strength(
-    path: Path, mask: NDArray[np.bool_], cosine: NDArray[np.float64], gamma: float | None
-) -> NDArray[np.float64]:
+def _strength(path: Path, develop: Developer, index: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     stored = decode_image(path)
-    if stored.shape[:2] != mask.shape:
+    if stored.shape[:2] != develop.mask.shape:
         raise InputError("the image is not of the others' size", path=path)
-    pixels = stored[mask]
+    pixels = stored[develop.mask]
     usable = (cosine > STEEPEST) & ~find_saturated(pixels)
-    values = decode_transfer(to_linear(pixels[usable], path), gamma)
+    values = develop(pixels, path, index)[usable]
     ratio = (
         np.median(values / cosine[usable, None], axis=0) if usable.sum() >= _FEWEST_PIXELS else np.zeros(1)
     )

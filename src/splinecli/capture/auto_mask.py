@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError
 
-_SMALLEST, _LARGEST = 0.001, 0.98
+_SMALLEST, _LARGEST = 0.005, 0.98
 """Shares of the picture; a mask beyond them has found no object."""
 
 

@@ -29,7 +29,17 @@ GROUND_TRUTH = tuple(
 NOT_PHOTOGRAPHS = frozenset(
     {Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)}
     # What splinecli itself writes, should its output folder be the capture's own.
-    | {"normals", "normals_8bit", "error_map", "albedo", "confidence", "preview", "depth", "found_mask"}
+    | {
+        "normals",
+        "normals_8bit",
+        "error_map",
+        "albedo",
+        "confidence",
+        "preview",
+        "depth",
+        "found_mask",
+        "calibration",
+    }
 )
 """Lower-case stems of pictures in a capture's folder that are no photographs."""
 

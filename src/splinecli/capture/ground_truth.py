@@ -73,7 +73,7 @@ def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | None = None) -> NDA
         )
     if alpha is not None:
         wanted = wanted & (alpha > alpha.max() / 2)
-    return _to_normals(stored, suffix, wanted, path)
+    return _to_normals(stored, wanted, path, is_picture=suffix != ".mat", check=True)
 
 
 def read_ground_truth(
@@ -127,17 +127,24 @@ def read_ground_truth(
     upside_down = suffix == ".txt" and _is_upside_down(stored, mask)
     if upside_down:
         stored = stored[::-1]
-    return _to_normals(stored, suffix, mask, path), upside_down
+    return _to_normals(stored, mask, path, is_picture=suffix in _MAY_HOLD_PICTURE), upside_down
 
 
 def _to_normals(
-    stored: NDArray[Any], suffix: str, mask: NDArray[np.bool_], path: Path
+    stored: NDArray[Any], mask: NDArray[np.bool_], path: Path, *, is_picture: bool, check: bool = False
 ) -> NDArray[np.float32]:
-    """What a file of this suffix stores (H, W, 3) as unit vectors, zero outside the mask (H, W). Raises InputError."""
+    """What a file stores (H, W, 3) as unit vectors, zero outside the mask (H, W).
+
+    Args:
+        is_picture: whether unsigned integers are a picture's colours.
+        check: whether floating-point values must be of about unit length, too, as colours must be.
+
+    Raises InputError.
+    """
     if stored.dtype.kind not in "fiu":
         raise InputError(f"found normals of type {stored.dtype}, expected real numbers", path=path)
-    is_picture = suffix in _MAY_HOLD_PICTURE and stored.dtype.kind == "u"
-    if is_picture:
+    is_picture = is_picture and stored.dtype.kind == "u"
+    if is_picture or check:
         _check_lengths(stored, mask, path)
     normals = np.zeros(stored.shape, np.float32)
     rows, columns = np.nonzero(mask)
@@ -149,22 +156,23 @@ def _to_normals(
     return normals
 
 
-def _check_lengths(picture: NDArray[Any], mask: NDArray[np.bool_], path: Path) -> None:
-    """Raise InputError for a picture (H, W, 3) whose colours are no directions, such as a photograph."""
-    colours = picture[mask & picture.any(axis=2)][:: max(1, mask.sum() // _BLOCK)]
-    if not len(colours):
+def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) -> None:
+    """Raise InputError for colours or vectors (H, W, 3) that are no directions, such as those of a photograph."""
+    vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float32)
+    if stored.dtype.kind == "u":
+        vectors = vectors * (2 / np.iinfo(stored.dtype).max) - 1
+    length = np.linalg.norm(vectors[np.isfinite(vectors).all(axis=1)], axis=1)
+    # Half of a picture may be gray background, whose length is 0.
+    usable = length > SHORTEST_IN_PICTURE if stored.dtype.kind == "u" else length > 0
+    if not usable.any():
         return
-    length = np.linalg.norm(colours.astype(np.float32) * (2 / np.iinfo(picture.dtype).max) - 1, axis=1)
-    # Half of it may be gray background, whose length is 0.
-    share = float(
-        (np.abs(length - 1) < _LENGTH_TOLERANCE).sum() / max(1, (length > SHORTEST_IN_PICTURE).sum())
-    )
+    share = float((np.abs(length[usable] - 1) < _LENGTH_TOLERANCE).mean())
     if share < _FEWEST_UNIT:
         raise InputError(
-            f"found {100 * share:.0f} % of the pixels to be unit vectors, (colour * 2 - 1), expected nearly all:"
-            " this is no picture of normals",
+            f"found {100 * share:.0f} % of the pixels to be unit vectors (of a picture colour * 2 - 1), expected nearly"
+            " all: these are no normals",
             path=path,
-            hint="Where its background is not black, a mask says so",
+            hint="Where the background is not black, a mask says so",
         )
 
 

@@ -84,7 +84,8 @@ def read_named_lights(path: Path) -> NamedLights:
 
 def _read_lp(path: Path) -> NamedLights:
     """RTI: a first line with the number of lights, then `file name x y z` a line; names may hold spaces."""
-    content = [(line, text.strip()) for line, text in enumerate(read_lines(path), start=1) if text.strip()]
+    stored = read_lines(path, else_latin_1=True)
+    content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
         raise InputError("the file is empty, expected the number of lights on the first line", path=path)
     (first, count), *rows = content

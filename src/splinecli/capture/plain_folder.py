@@ -38,7 +38,8 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
         raise InputError(
             f"the folder holds {len(images)} images but no light file ({LIGHT_FILES})",
             path=folder,
-            hint="Pass --lights FILE, with one line x y z for each image",
+            hint="Pass --lights FILE, with one line x y z for each image; photographs of a mirror ball tell it to"
+            " 'splinecli calibrate'",
         )
     return CaptureFiles(
         layout="plain folder",

@@ -9,6 +9,7 @@ from splinecli.capture.capture_files import (
     GROUND_TRUTH,
     LIGHT_INTENSITIES,
     MASK,
+    NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
     find_named,
@@ -23,8 +24,8 @@ _OBJECTS = "Objects"
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     """The capture's files, or None for another layout; InputError where Objects/ holds no images."""
-    lights = find_named(folder, _LIGHT_DIRECTIONS)
-    images = list_objects(folder, leave_out=overrides.named())
+    lights = overrides.lights or find_named(folder, _LIGHT_DIRECTIONS)
+    images = list_objects(folder, leave_out=overrides.named(), lights=lights)
     if lights is None or images is None:
         return None
     check_not_empty(images, folder / _OBJECTS)
@@ -33,16 +34,22 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
         name=folder_name(folder),
         folder=folder,
         images=images,
-        light_directions=overrides.lights or lights,
+        light_directions=lights,
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
         mask=overrides.mask or find_named(folder, MASK),
         ground_truth=overrides.ground_truth or find_named(folder, GROUND_TRUTH),
     )
 
 
-def list_objects(folder: Path, *, leave_out: Collection[Path] = ()) -> tuple[Path, ...] | None:
-    """The images of Objects/, without files that mean something else; None for another layout."""
+def list_objects(
+    folder: Path, *, leave_out: Collection[Path] = (), lights: Path | None = None
+) -> tuple[Path, ...] | None:
+    """The images of Objects/, without files that mean something else; None for another layout.
+
+    Args:
+        lights: a file of lights, where one is named; else the folder has to hold one.
+    """
     objects = folder / _OBJECTS
-    if find_named(folder, _LIGHT_DIRECTIONS) is None or not is_folder(objects):
+    if (lights or find_named(folder, _LIGHT_DIRECTIONS)) is None or not is_folder(objects):
         return None
-    return list_images(objects, leave_out_stems=(), leave_out=leave_out)
+    return list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=leave_out)

@@ -186,7 +186,10 @@ class CaptureSource:
             total += self._colours(develop, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
             if progress is not None:
                 progress()
-        return replace(self, found_mask=find_object(total.reshape(shape)))
+        try:
+            return replace(self, found_mask=find_object(total.reshape(shape)))
+        except InputError as error:
+            raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
 
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """The mask of images of this shape, (H, W); all of it where the capture has none. Raises InputError."""
@@ -252,9 +255,13 @@ def open_capture(
         if len(flats) == len(files.images) > 1:  # they lie in the order of the folder's images
             flat_of = dict(zip(files.images, flats, strict=True))
             development = replace(development, flat_field=tuple(flat_of[image] for image in images))
+        if len(images) < len(files.images):
+            warnings += (
+                f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out.",
+            )
         files, directions, strengths = replace(files, images=images), named.directions, named.intensities
         if how != "name":
-            warnings = (f"The lights of {path.name} were matched to the images by {how}.",)
+            warnings += (f"The lights of {path.name} were matched to the images by {how}.",)
     else:
         directions = read_light_directions(path, len(files.images))
     if equal:
@@ -265,7 +272,8 @@ def open_capture(
     if strengths is None:
         check_exposures(files.images)
         strengths = np.ones((len(files.images), 3))
-    if development.ambient is None and (found := find_named(files.folder, AMBIENT)) is not None:
+    found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
+    if development.ambient is None and found is not None:
         development = replace(development, ambient=found)
         warnings += (f"The light of {found.name} was taken off all images.",)
     files = replace(files, ambient=development.ambient)

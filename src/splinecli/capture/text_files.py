@@ -52,8 +52,12 @@ def columns(count: int) -> str:
     return f"{count} column" + ("" if count == 1 else "s")
 
 
-def read_lines(path: Path) -> list[str]:
-    """The lines of a UTF-8 file, with or without a byte order mark; InputError where it cannot be read."""
+def read_lines(path: Path, *, else_latin_1: bool = False) -> list[str]:
+    """The lines of a UTF-8 file, with or without a byte order mark; InputError where it cannot be read.
+
+    Args:
+        else_latin_1: whether a file that is not UTF-8 is taken for Latin-1, as older programs on Windows write.
+    """
     try:
         return path.read_text(encoding="utf-8-sig").split("\n")
     except FileNotFoundError:
@@ -61,6 +65,8 @@ def read_lines(path: Path) -> list[str]:
     except IsADirectoryError:
         raise InputError("found a folder, expected a text file", path=path) from None
     except UnicodeDecodeError:
+        if else_latin_1:
+            return path.read_text(encoding="latin-1").split("\n")
         raise InputError(
             "the file is not UTF-8 text", path=path, hint="Save it as plain UTF-8 text"
         ) from None

@@ -120,7 +120,9 @@ def calibrate(
         )
     output.mkdir(parents=True, exist_ok=True)
     write_text(output / DIRECTIONS, _rows(lights.directions))
-    if strengths is not None:
+    if strengths is None:
+        (output / INTENSITIES).unlink(missing_ok=True)  # of earlier lights
+    else:
         write_text(output / INTENSITIES, _rows(strengths))
     write_bytes(output / PICTURE, encode_png(calibration_picture(lights.balls)))
     write_text(output / REPORT, json.dumps(report, indent=2) + "\n")

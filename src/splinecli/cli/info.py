@@ -17,6 +17,7 @@ from splinecli.cli.options import (
     parse_development,
 )
 from splinecli.cli.talk import Talk
+from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
     from splinecli.capture.summary import CaptureSummary
@@ -42,6 +43,7 @@ def info(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also draw where the lights stand, as a PNG.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier plot.")] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -52,7 +54,7 @@ def info(
     """
     from splinecli.capture import open_capture
     from splinecli.capture.summary import summarise_capture
-    from splinecli.files import write_bytes
+    from splinecli.files import check_free, write_bytes
 
     source = open_capture(
         capture,
@@ -62,6 +64,10 @@ def info(
         ground_truth=ground_truth,
         development=parse_development(transfer, ambient, flat_field),
     )
+    if plot is not None:
+        if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
+            raise UsageError(f"{plot} would lie among the photographs, and count as one the next time")
+        check_free(plot.parent, [plot.name], overwrite=overwrite)
     talk = Talk(quiet=quiet)
     with talk.progress("reading", len(source.files.images)) as advance:
         summary = summarise_capture(source, progress=lambda: advance(1))

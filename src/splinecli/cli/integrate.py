@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-NORMALS = ("normals.npy", "normals.tiff", "normals.png")
+NORMALS = ("normals.npy", "normals.tiff", "normals.png", "normals_8bit.png")
 
 
 def integrate(
@@ -92,8 +92,9 @@ def integrate(
     folder = output or (normals if normals.is_dir() else normals.parent)
     check_free(folder, (*(SURFACE_FILES[form] for form in wanted), SURFACE_REPORT), overwrite=overwrite)
     given = None if mask is None else read_mask(mask)
-    normal_map = read_normal_map(_find_in(normals) if normals.is_dir() else normals, given)
-    if convention is NormalConvention.directx:
+    path = _find_in(normals) if normals.is_dir() else normals
+    normal_map = read_normal_map(path, given)
+    if convention is NormalConvention.directx or (path != normals and _is_directx(path)):
         normal_map[..., 1] *= -1
     inside = np.asarray(normal_map.any(axis=2))
     matrix = None if camera_matrix is None else _read_matrix(camera_matrix)
@@ -146,6 +147,15 @@ def _find_in(folder: Path) -> Path:
         path=folder,
         hint="Give a folder that 'splinecli infer' wrote",
     )
+
+
+def _is_directx(path: Path) -> bool:
+    """Whether a picture of infer's has green for y down, as the report beside it says."""
+    try:
+        report = json.loads((path.parent / "report.json").read_text("utf-8"))
+        return path.suffix == ".png" and report["options"]["convention"] == "directx"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
