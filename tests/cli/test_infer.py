@@ -412,7 +412,8 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     assert run("infer", *captures, "--method", "ls").code == 0
     Path("others").mkdir()
     Path("others/sphere").symlink_to(Path("third").absolute())
-    assert run("infer", "others/sphere", "second", "--method", "ls").code == 5  # another object of that name
+    other = run("infer", "others/sphere", "second", "--method", "ls")  # another object of that name
+    assert (other.code, "out/sphere: holds results already, but of other options" in other.err) == (5, True)
     (Path("out/second/normals.png")).unlink()
     assert run("infer", *captures, "--method", "ls").code == 5
     assert run("infer", *captures, "--method", "ls", "--overwrite").code == 0

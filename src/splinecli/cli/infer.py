@@ -34,7 +34,7 @@ from splinecli.cli.options import (
     split_commas,
 )
 from splinecli.cli.talk import Talk
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, OutputError, UsageError
 
 
 def infer(
@@ -134,7 +134,7 @@ def infer(
     from splinecli.evaluation.draws import check_draw_settings
     from splinecli.files import check_free, write_text
     from splinecli.methods import MethodOptions, check_method
-    from splinecli.outputs import MAPS, NORMALS, OWN_FILES, finished_report
+    from splinecli.outputs import MAPS, NORMALS, OWN_FILES, REPORT, finished_report
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
@@ -177,6 +177,12 @@ def infer(
             else finished_report(target, options, partial(inputs_of, folder))
         )
         if report is None:
+            if len(captures) > 1 and not overwrite and (target / REPORT).is_file():
+                raise OutputError(
+                    "holds results already, but of other options, other inputs or another version",
+                    path=target,
+                    hint="Add --overwrite to make all anew, or choose another place with -o",
+                )
             check_free(target, OWN_FILES, overwrite=overwrite)
         else:
             finished[folder] = report
