@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from html_page import HtmlPage
 from splinecli.normals import angle_between_deg, unit
 from splinecli.outputs import albedo_picture
 from splinecli.page import LONGEST_SIDE, result_page
@@ -58,34 +58,8 @@ def sphere(side: int = SIDE) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     return (np.stack((x, y, z), axis=2) * mask[..., None]).astype(np.float32), mask
 
 
-class Page(HTMLParser):
-    """Attributes by tag and text by the tag around it; fails where an end tag closes another tag."""
-
-    VOID = ("meta", "link", "img", "input", "br")
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: dict[str, list[str]] = {}
-        self.feed(html)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if data.strip() and self.open:
-            self.text.setdefault(self.open[-1], []).append(" ".join(data.split()))
+class Page(HtmlPage):
+    """What a page holds, and its pictures decoded."""
 
     @property
     def facts(self) -> dict[str, str]:

@@ -5,45 +5,23 @@ from __future__ import annotations
 import base64
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
 
+from html_page import HtmlPage
 from splinecli import __version__
 from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.report import html_report
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
 WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()
-VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
-class Page(HTMLParser):
-    """Text and attributes by tag; fails where an end tag closes nothing or another tag."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: dict[str, list[str]] = {}
-        self.feed(html)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if data.strip() and self.open:
-            self.text.setdefault(self.open[-1], []).append(" ".join(data.split()))
+class Page(HtmlPage):
+    """A report, its tags by name."""
 
     def all_of(self, tag: str) -> list[dict[str, str | None]]:
         return [attributes for name, attributes in self.tags if name == tag]

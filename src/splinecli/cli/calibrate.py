@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from splinecli.cli.options import JsonOption, QuietOption
+from splinecli.cli.options import JsonOption, OverwriteOption, QuietOption
 from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
@@ -61,7 +61,7 @@ def calibrate(
         Path | None,
         typer.Option(metavar="FILE", help="Say how far the light directions in this text file are off."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")] = False,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:

@@ -20,6 +20,7 @@ from splinecli.cli.options import (
     FlatFieldOption,
     JsonOption,
     NormalConvention,
+    OverwriteOption,
     Precision,
     PrecisionOption,
     QuietOption,
@@ -117,7 +118,7 @@ def infer(
     convention: Annotated[
         NormalConvention, typer.Option(help="Green of the PNG: opengl is y up, directx is y down.")
     ] = NormalConvention.opengl,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")] = False,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from splinecli.cli.options import JsonOption, NormalConvention, QuietOption, complete_list, split_commas
+from splinecli.cli.options import (
+    JsonOption,
+    NormalConvention,
+    OverwriteOption,
+    QuietOption,
+    complete_list,
+    split_commas,
+)
 from splinecli.cli.talk import Talk
 from splinecli.errors import InputError
 
@@ -17,7 +24,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-NORMALS = ("normals.npy", "normals.tiff", "normals.png", "normals_8bit.png")
+FORMS = ("npy", "tiff", "png", "png8")
+"""Of the normal maps that infer writes, the exact ones first."""
 
 
 def integrate(
@@ -70,7 +78,7 @@ def integrate(
     convention: Annotated[
         NormalConvention, typer.Option(help="Green of a picture: opengl is y up, directx is y down.")
     ] = NormalConvention.opengl,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")] = False,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -139,11 +147,14 @@ def integrate(
 
 
 def _find_in(folder: Path) -> Path:
-    for name in NORMALS:
+    from splinecli.outputs import NORMALS
+
+    names = [NORMALS[form] for form in FORMS]
+    for name in names:
         if (folder / name).is_file():
             return folder / name
     raise InputError(
-        f"holds no normal map ({', '.join(NORMALS)})",
+        f"holds no normal map ({', '.join(names)})",
         path=folder,
         hint="Give a folder that 'splinecli infer' wrote",
     )
@@ -151,8 +162,10 @@ def _find_in(folder: Path) -> Path:
 
 def _is_directx(path: Path) -> bool:
     """Whether a picture of infer's has green for y down, as the report beside it says."""
+    from splinecli.outputs import REPORT
+
     try:
-        report = json.loads((path.parent / "report.json").read_text("utf-8"))
+        report = json.loads((path.parent / REPORT).read_text("utf-8"))
         return path.suffix == ".png" and report["options"]["convention"] == "directx"
     except (OSError, ValueError, KeyError, TypeError):
         return False

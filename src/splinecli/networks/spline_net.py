@@ -15,7 +15,7 @@ The compact size differs from the paper's in four ways, all of them about learni
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -169,19 +169,9 @@ class SplineNet(nn.Module):
             raw, error = self.ne_net(torch.cat((*seen, *interpolated), dim=1), normals)
         return nn.functional.normalize(raw.float(), dim=-1), error
 
-    def forward(
-        self,
-        observations: Tensor,
-        light_directions: Tensor,
-        valid: Tensor | None = None,
-        *,
-        turn_deg: float | Tensor = 0.0,
-        mirror: bool = False,
-    ) -> Tensor:
+    def forward(self, *pixels: Any, **view: Any) -> Tensor:
         """Unit normals (P, 3) in the capture's frame; arguments as in `look`."""
-        return self.normals_with_error(
-            observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror
-        )[0]
+        return self.normals_with_error(*pixels, **view)[0]
 
     def normals_with_error(
         self,
@@ -192,7 +182,10 @@ class SplineNet(nn.Module):
         turn_deg: float | Tensor = 0.0,
         mirror: bool = False,
     ) -> tuple[Tensor, Tensor | None]:
-        """Unit normals (P, 3) in the capture's frame, and what the error head says (P, 2), None without one."""
+        """Unit normals (P, 3) in the capture's frame, and what the error head says (P, 2), None without one.
+
+        Arguments as in `look`.
+        """
         # Only the convolutions may run in bfloat16: the fit and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):
             views = self.look(observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror)
