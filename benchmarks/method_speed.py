@@ -14,7 +14,7 @@ import time
 import numpy as np
 
 from splinecli.capture import open_capture
-from splinecli.evaluation.draws import draw_lights
+from splinecli.capture.lights.draws import draw_lights
 from splinecli.methods import make_estimator, method_names
 
 N_LIGHTS = 10

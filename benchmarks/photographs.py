@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
-from splinecli.capture.light_strengths import find_light_strengths
-from splinecli.capture.saturation import restore_saturated
-from splinecli.evaluation.draws import draw_lights
+from splinecli.capture.restore.light_intensities import find_light_strengths
+from splinecli.capture.restore.saturation import restore_saturated
+from splinecli.capture.lights.draws import draw_lights
 from splinecli.methods.estimator import CONFIDENT_DEG
 from splinecli.networks.error_head import probability_within
 from splinecli.networks.spline_net import SplineNet

@@ -11,15 +11,18 @@ import splinecli
 ROOMS = [
     {"__main__"},
     {"cli"},
-    {"page", "batch"},
-    {"outputs"},
-    {"evaluation", "training"},
+    {"pipeline"},
+    {"evaluation"},
+    {"results"},
+    {"training"},
+    {"pictures"},
+    {"pixel_sets"},
     {"synthesis", "inference"},
-    {"methods", "metrics", "albedo"},
+    {"methods", "metrics"},
     {"networks", "devices"},
     {"fits", "calibration"},
     {"capture", "observation_map", "surface"},
-    {"normals", "files", "transfer", "templates"},
+    {"normals", "files", "transfer"},
     {"errors", "__init__"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.picture import calibration_picture
+from splinecli.pictures.calibration import calibration_picture
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg

@@ -11,7 +11,7 @@ import pytest
 from splinecli.cli.options import complete_list
 from splinecli.methods import method_names
 from splinecli.networks.weights import shipped_names
-from splinecli.outputs import MAPS, NORMALS
+from splinecli.results.files import MAPS, NORMALS
 from splinecli.surface.surface_files import SURFACE_FILES
 from splinecli.training.config import PRESETS
 

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import tifffile
 
-from splinecli.capture.capture_files import NOT_PHOTOGRAPHS
-from splinecli.capture.image_lists import IMAGE_SUFFIXES
+from splinecli.capture.layouts.capture_files import NOT_PHOTOGRAPHS
+from splinecli.capture.layouts.image_lists import IMAGE_SUFFIXES
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.normals import angle_between_deg, decode_picture
-from splinecli.outputs import OWN_FILES
+from splinecli.results.files import OWN_FILES
 
 PIXELS = 448
 
@@ -487,7 +487,7 @@ def test_interrupted_while_writing(capture, run, monkeypatch):
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("splinecli.outputs.encode_png", interrupt)
+    monkeypatch.setattr("splinecli.results.files.encode_png", interrupt)
     assert run("infer", capture, "--method", "ls").code == 130
     assert list(Path("out").iterdir()) == []
 

@@ -60,7 +60,7 @@ def settings() -> dict[str, Any]:
 
 def write_set(folder: str, *, finished: bool = True) -> None:
     """Matte pixels in three scenes under 14 lights."""
-    from splinecli.training.pixel_sets import Pixels, PixelSetWriter
+    from splinecli.pixel_sets.store import Pixels, PixelSetWriter
 
     random = np.random.default_rng(0)
     writer = PixelSetWriter(Path(folder))

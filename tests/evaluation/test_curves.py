@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.evaluation.curves import light_noise_curves, lights_curves
-from splinecli.evaluation.plotting import method_looks
+from splinecli.pictures.plotting import method_looks
 from splinecli.evaluation.records import Evaluation, Protocol, Result
 from splinecli.methods import method_names
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.evaluation.protocol import Protocol, evaluate
+from splinecli.evaluation.run import Protocol, evaluate
 from splinecli.methods import make_estimator
 
 # MAE in degrees on Ball and Cat: DiLiGenT's benchmark for all 96 lights; for ten, Zheng et al. (ICCV 2019), table 2.

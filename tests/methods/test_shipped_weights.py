@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from splinecli.capture import read_capture
-from splinecli.evaluation.draws import draw_lights
+from splinecli.capture.lights.draws import draw_lights
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import CONFIDENT_DEG, tells_confidence
 from splinecli.networks.error_head import probability_within

@@ -14,7 +14,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training import loop
 from splinecli.training.config import TrainingConfig
-from splinecli.training.pixel_sets import Pixels, PixelSet, PixelSetWriter
+from splinecli.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
 from splinecli.training.records import Records
 
 MakeSet = Callable[..., PixelSet]

@@ -39,7 +39,7 @@ from splinecli.training.loop import (
     stream_seed,
 )
 from splinecli.training.objective import compute_losses
-from splinecli.training.pixel_sets import PixelSet
+from splinecli.pixel_sets.store import PixelSet
 from splinecli.training.records import METRICS, Metrics, read_metrics
 from splinecli.training.validation import validation_deg
 

@@ -15,7 +15,7 @@ from splinecli.synthesis.batches import CaptureConfig, PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training import sources
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.pixel_sets import Entry, PixelSet
+from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.training.sources import (
     FILL_STEPS,
     MixedSource,

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
-from splinecli.capture.capture_files import AMBIENT, find_named
-from splinecli.capture.decoding import decode_image
-from splinecli.capture.development import Developer, Development
-from splinecli.capture.exposure import check_exposures
-from splinecli.capture.images import read_mask
-from splinecli.capture.saturation import find_saturated
+from splinecli.capture.layouts.capture_files import AMBIENT, find_named
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.linearise import Developer, Development
+from splinecli.capture.formats.exposure import check_exposures
+from splinecli.capture.formats.images import read_mask
+from splinecli.capture.restore.saturation import find_saturated
 from splinecli.errors import InputError
 
 Target = Literal["ball", "card"]

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import named_lights
-from splinecli.capture.auto_mask import find_object
-from splinecli.capture.capture_files import AMBIENT, CaptureFiles, find_named
-from splinecli.capture.decoding import decode_image
-from splinecli.capture.development import AS_STORED, Developer, Development, is_display_encoded
-from splinecli.capture.exposure import check_exposures
-from splinecli.capture.ground_truth import UPSIDE_DOWN, read_ground_truth
-from splinecli.capture.images import read_boundary, read_mask
-from splinecli.capture.layout import StrPath, find_capture_files
-from splinecli.capture.light_files import read_light_directions, read_light_intensities
-from splinecli.capture.light_strengths import find_light_strengths
+from splinecli.capture.lights import named_lights
+from splinecli.capture.restore.auto_mask import find_object
+from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.linearise import AS_STORED, Developer, Development, is_display_encoded
+from splinecli.capture.formats.exposure import check_exposures
+from splinecli.capture.formats.normal_files import UPSIDE_DOWN, read_ground_truth
+from splinecli.capture.formats.images import read_boundary, read_mask
+from splinecli.capture.layouts.registry import StrPath, find_capture_files
+from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.restore.light_intensities import find_light_strengths
 from splinecli.capture.record import Capture, check_light_indices
-from splinecli.capture.saturation import find_saturated, restore_saturated
+from splinecli.capture.restore.saturation import find_saturated, restore_saturated
 from splinecli.errors import InputError
 
 EQUAL = "equal"

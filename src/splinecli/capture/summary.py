@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.decoding import decode_image
-from splinecli.capture.development import Developer
-from splinecli.capture.images import to_linear
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.linearise import Developer
+from splinecli.capture.formats.images import to_linear
 from splinecli.capture.reader import SATURATED_SHARE, CaptureSource
-from splinecli.capture.saturation import find_saturated
+from splinecli.capture.restore.saturation import find_saturated
 
 DARK = 0.05
 """An image whose 99 % quantile lies below this share of full scale is called dark."""

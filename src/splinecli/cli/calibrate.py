@@ -75,11 +75,11 @@ def calibrate(
     """
     from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
     from splinecli.calibration.gray import light_strengths
-    from splinecli.calibration.picture import calibration_picture
-    from splinecli.capture.development import is_display_encoded
-    from splinecli.capture.light_files import read_light_directions
+    from splinecli.pictures.calibration import calibration_picture
+    from splinecli.capture.linearise import is_display_encoded
+    from splinecli.capture.lights.light_files import read_light_directions
     from splinecli.files import check_free, write_bytes, write_text
-    from splinecli.outputs import encode_png
+    from splinecli.results.files import encode_png
     from splinecli.transfer import parse_transfer
 
     talk = Talk(quiet=quiet)

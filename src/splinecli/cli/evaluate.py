@@ -115,7 +115,7 @@ def evaluate(
     passed over; the exit code is then 3.
     """
     from splinecli.capture import find_captures
-    from splinecli.evaluation.protocol import TrialStore, evaluate_all
+    from splinecli.evaluation.run import TrialStore, evaluate_all
     from splinecli.evaluation.records import Protocol
     from splinecli.evaluation.report import html_report
     from splinecli.files import check_writable, held_folder, write_text
@@ -233,7 +233,7 @@ def _draw_figures(
 ) -> tuple[list[CaptureFigure], list[str]]:
     """Of the captures that were scored under the first protocol; and what stood in the way of the others."""
     from splinecli.evaluation.capture_figures import capture_figures, file_stems
-    from splinecli.evaluation.protocol import distinct_names
+    from splinecli.evaluation.run import distinct_names
 
     first = evaluations[0]
     named = {name: folder for folder, name in distinct_names(captures).items() if name in first.captures}

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from splinecli.cli.infer_job import Job, inputs_sha256
+from splinecli.pipeline.infer import Job, inputs_sha256
 from splinecli.cli.options import (
     AmbientOption,
     BatchSizeOption,
@@ -129,13 +129,13 @@ def infer(
     truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished
     before with the same options are left as they are. OUT/index.html links the results of several.
     """
-    from splinecli.batch import INDEX, check_index_free, has_index, index_page, with_earlier
+    from splinecli.results.index import INDEX, check_index_free, has_index, index_page, with_earlier
     from splinecli.capture import capture_name
     from splinecli.capture.record import check_light_indices
-    from splinecli.evaluation.draws import check_draw_settings
+    from splinecli.capture.lights.draws import check_draw_settings
     from splinecli.files import check_free, write_text
     from splinecli.methods import MethodOptions, check_method
-    from splinecli.outputs import MAPS, NORMALS, OWN_FILES, REPORT, finished_report
+    from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, finished_report
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
@@ -236,7 +236,7 @@ def infer(
 
 
 def _say_how_it_went(reports: Sequence[dict[str, Any]], n_finished: int, output: Path, talk: Talk) -> None:
-    from splinecli.batch import HEADER, INDEX, row_of
+    from splinecli.results.index import HEADER, INDEX, row_of
 
     good = [row_of(report) for report in reports if "error" not in report]
     if good:

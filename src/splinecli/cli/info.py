@@ -72,7 +72,7 @@ def info(
     with talk.progress("reading", len(source.files.images)) as advance:
         summary = summarise_capture(source, progress=lambda: advance(1))
     if plot is not None:
-        from splinecli.evaluation.sky_plot import sky_plot
+        from splinecli.pictures.light_sky import sky_plot
 
         write_bytes(plot, sky_plot(source.light_directions, source.files.name))
     report = _report(summary)

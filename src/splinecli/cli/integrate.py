@@ -147,7 +147,7 @@ def integrate(
 
 
 def _find_in(folder: Path) -> Path:
-    from splinecli.outputs import NORMALS
+    from splinecli.results.files import NORMALS
 
     names = [NORMALS[form] for form in FORMS]
     for name in names:
@@ -162,7 +162,7 @@ def _find_in(folder: Path) -> Path:
 
 def _is_directx(path: Path) -> bool:
     """Whether a picture of infer's has green for y down, as the report beside it says."""
-    from splinecli.outputs import REPORT
+    from splinecli.results.files import REPORT
 
     try:
         report = json.loads((path.parent / REPORT).read_text("utf-8"))
@@ -194,7 +194,7 @@ def _check_size(what: str, found: tuple[int, ...], expected: tuple[int, ...], pa
 
 
 def _read_matrix(path: Path) -> NDArray[np.float64]:
-    from splinecli.capture.text_files import read_number_rows
+    from splinecli.capture.formats.text import read_number_rows
 
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):

@@ -147,7 +147,7 @@ def parse_indices(text: str, option: str) -> list[int]:
 def parse_development(transfer: str, ambient: Path | None, flat_field: Path | None) -> Development:
     """What --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
     from splinecli.capture import Development
-    from splinecli.capture.image_lists import check_not_empty, list_images
+    from splinecli.capture.layouts.image_lists import check_not_empty, list_images
     from splinecli.transfer import parse_transfer
 
     flats = (

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError
-from splinecli.evaluation.method_maps import method_maps
-from splinecli.evaluation.observation_map_figure import observation_map_figure
-from splinecli.evaluation.protocol import first_trial, see_trial
+from splinecli.pictures.method_maps import method_maps
+from splinecli.pictures.observation_maps import observation_map_figure
+from splinecli.evaluation.run import first_trial, see_trial
 from splinecli.evaluation.records import Protocol
 from splinecli.evaluation.tables import heading
 from splinecli.inference import NormalEstimate, estimate_normals

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from splinecli.evaluation.plotting import method_looks, png_bytes
+from splinecli.pictures.plotting import method_looks, png_bytes
 from splinecli.evaluation.records import Evaluation
 from splinecli.evaluation.statistics import AVERAGE, trial_averages
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from splinecli.capture import Capture
-from splinecli.capture.ground_truth import UPSIDE_DOWN
+from splinecli.capture.formats.normal_files import UPSIDE_DOWN
 from splinecli.evaluation.records import Protocol
 
 DAMAGED_IMAGES = {"bearPNG": 20}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splinecli.errors import UsageError
-from splinecli.evaluation.draws import check_draw_settings
+from splinecli.capture.lights.draws import check_draw_settings
 from splinecli.evaluation.light_noise import LARGEST_SIGMA_DEG
 
 

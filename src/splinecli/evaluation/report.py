@@ -21,7 +21,7 @@ from splinecli.evaluation.statistics import (
     trial_averages,
 )
 from splinecli.evaluation.tables import best_cells, heading, lights_in_words, table_rows
-from splinecli.templates import render
+from splinecli.results.templates import render
 
 _MOST_SENTENCES = 3  # of three methods; the pairs of more are read faster in a matrix
 _MINUS = "\N{MINUS SIGN}"

@@ -11,7 +11,7 @@ from typing import Any
 
 from splinecli import __version__
 from splinecli.capture import CaptureFiles
-from splinecli.evaluation.draws import Draw
+from splinecli.capture.lights.draws import Draw
 from splinecli.evaluation.records import Protocol
 from splinecli.files import file_sha256, refusals_as_output_errors
 from splinecli.methods import Estimator

@@ -19,7 +19,7 @@ from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, joi
 from splinecli.synthesis.lights import draw_light_counts
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.pixel_sets import Entry, PixelSet, open_pixel_set
+from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
 
 FILL_STEPS = 3
 """Gaps of a dense map are interpolated up to so many cells from a light."""

@@ -1,0 +1,176 @@
+"""PNG, JPEG and TIFF files as pixels, exactly as stored, and RAW files; damaged ones are refused, never half read.
+
+OpenCV fills what is missing of a truncated file with gray and only mutters on stderr, so the container is
+checked before it is decoded, and what the C libraries say is kept off stderr and read instead.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+import threading
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.raw import RAW_SUFFIXES, decode_raw
+from splinecli.capture.formats.tiff import decode_tiff
+from splinecli.errors import InputError
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8\xff"
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+# In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill); anything else ends it.
+_END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# What libpng and libjpeg say of pixels that they could not read.
+_DAMAGE = re.compile(
+    r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE
+)
+
+_STDERR_LOCK = threading.Lock()
+
+
+def decode_image(path: Path) -> NDArray[Any]:
+    """The pixels of a PNG, JPEG or TIFF file as stored: (H, W, C), C 1 or 3 (RGB), alpha dropped.
+
+    The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). The
+    format is told by content, not by name, but for RAW files, which are developed (see decode_raw). An EXIF
+    orientation is ignored: all images of a capture share one pixel grid.
+
+    Raises:
+        InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy.
+    """
+    return decode_with_alpha(path)[0]
+
+
+def decode_with_alpha(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """The pixels as decode_image gives them, and the alpha channel (H, W), None where there is none."""
+    data = _read_bytes(path)
+    if data and path.suffix.lower() in RAW_SUFFIXES:
+        pixels = decode_raw(data, path, native_stderr)
+    elif data.startswith(_TIFF):
+        pixels = decode_tiff(path, lambda: _decode_with_opencv(data, path))
+    elif data.startswith(_PNG):
+        _check_png(data, path)
+        pixels = _decode_with_opencv(data, path)
+    elif data.startswith(_JPEG):
+        _check_jpeg(data, path)
+        pixels = _decode_with_opencv(data, path)
+    else:
+        raise InputError("the file is empty" if not data else "found neither PNG, TIFF nor JPEG", path=path)
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.shape[2] not in (1, 2, 3, 4):
+        raise InputError(f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path=path)
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * np.uint8(255)
+    if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
+        raise InputError(
+            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones",
+            path=path,
+            hint="Save the image with 16 bits",
+        )
+    if pixels.shape[2] in (2, 4):
+        return pixels[:, :, :-1], pixels[:, :, -1]
+    return pixels, None
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError("the file does not exist", path=path) from None
+    except IsADirectoryError:
+        raise InputError("found a folder, expected an image", path=path) from None
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+
+
+def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
+    """(H, W) or (H, W, C), colour in RGB or RGBA order."""
+    import cv2
+
+    with native_stderr() as said:
+        try:
+            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
+            pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            pixels = None
+    if pixels is None or _DAMAGE.search("".join(said)):
+        raise InputError("the image is damaged and cannot be read", path=path, hint="Copy or export it again")
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        return pixels[:, :, ::-1]  # BGR becomes RGB: a view, since a copy of a large image is felt
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        return pixels[:, :, [2, 1, 0, 3]]
+    return pixels
+
+
+def _check_png(data: bytes, path: Path) -> None:
+    """Walk the chunks: each whole with its checksum, the last one IEND."""
+    position, view = len(_PNG), memoryview(data)
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], "big")
+        body, end = position + 4, position + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise InputError(
+                "the PNG is damaged (a checksum is wrong)", path=path, hint="Copy or export it again"
+            )
+        if data[body : body + 4] == b"IEND":
+            return
+        position = end
+    raise InputError("the PNG is truncated", path=path, hint="Copy or export it again")
+
+
+def _check_jpeg(data: bytes, path: Path) -> None:
+    """Walk the segments to the end-of-image marker; what follows it (a second picture) is left alone."""
+    position = 2
+    while position + 2 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xD9:
+            return
+        if marker == 0xFF:  # fill
+            position += 1
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == 0xDA:  # a scan: the compressed pixels follow its header, without a length
+            following = _END_OF_SCAN.search(data, position)
+            if following is None:
+                break
+            position = following.start()
+    raise InputError("the JPEG is truncated", path=path, hint="Copy or export it again")
+
+
+@contextmanager
+def native_stderr() -> Iterator[list[str]]:
+    """Keep what C libraries print away from stderr; the list holds it after the block.
+
+    It swaps file descriptor 2, which belongs to the whole process, so one thread at a time, and only around
+    decoding.
+    """
+    said: list[str] = []
+    with _STDERR_LOCK, tempfile.TemporaryFile() as store:
+        try:
+            if sys.stderr is not None:
+                sys.stderr.flush()
+            kept = os.dup(2)
+        except (OSError, ValueError):  # no stderr at all: nothing to protect
+            yield said
+            return
+        try:
+            os.dup2(store.fileno(), 2)
+            yield said
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            store.seek(0)
+            said.append(store.read(1 << 16).decode(errors="replace"))

@@ -1,0 +1,1 @@
+"""Which files in a folder make a capture."""

@@ -1,0 +1,127 @@
+"""The files of one capture, and the names by which they are recognised."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splinecli.capture.layouts.image_lists import IMAGE_SUFFIXES, PICTURE_SUFFIXES, list_folder
+from splinecli.capture.paths import find_mode, is_file, resolve
+from splinecli.errors import InputError
+
+FILENAMES = "filenames.txt"
+LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt")
+NAMED_LIGHTS = (".lp", "lights.json")
+"""How the names of light files end that name the image of each light."""
+LIGHT_FILES = f"{', '.join(LIGHT_DIRECTIONS)}, *.lp or lights.json"
+"""The names of light files, for messages."""
+LIGHT_INTENSITIES = ("light_intensities.txt",)
+MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
+AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
+GROUND_TRUTH = tuple(
+    f"{stem}{suffix}"
+    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt")
+    for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
+)
+
+NOT_PHOTOGRAPHS = frozenset(
+    {Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)}
+    # What splinecli itself writes, should its output folder be the capture's own.
+    | {
+        "normals",
+        "normals_8bit",
+        "error_map",
+        "albedo",
+        "confidence",
+        "preview",
+        "depth",
+        "found_mask",
+        "calibration",
+    }
+)
+"""Lower-case stems of pictures in a capture's folder that are no photographs."""
+
+
+@dataclass(frozen=True)
+class CaptureFiles:
+    """The files of one capture; the images in the order of the lights.
+
+    Args:
+        layout: what arrangement of files it is, for people.
+        name: what the capture is called, in most layouts like its folder.
+        folder: the folder that holds the files beside the images.
+        images: one file a light.
+        light_directions: F x 3 text, or one of the files of named_lights.py, which then orders the images.
+        light_intensities: F x 3 text, or None where all lights are equally strong.
+        mask: an image, or None where every pixel counts.
+        boundaries: instead of a the mask: images whose pixels above zero together are the object.
+        ground_truth: a normal map, or None.
+        ambient: an image without any of the lights, or None.
+    """
+
+    layout: str
+    name: str
+    folder: Path
+    images: tuple[Path, ...]
+    light_directions: Path
+    light_intensities: Path | None = None
+    mask: Path | None = None
+    ground_truth: Path | None = None
+    boundaries: tuple[Path, ...] = ()
+    ambient: Path | None = None
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """Files named by the user, which go before what the folder holds."""
+
+    lights: Path | None = None
+    intensities: Path | None = None
+    mask: Path | None = None
+    ground_truth: Path | None = None
+
+    def named(self) -> tuple[Path, ...]:
+        """Those that are given. Raises InputError for one that is no file."""
+        files = tuple(
+            f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None
+        )
+        for file in files:
+            mode = find_mode(file)
+            if mode is None:
+                raise InputError("the file does not exist", path=file)
+            if not stat.S_ISREG(mode):
+                raise InputError("found a folder, expected a file", path=file)
+        return files
+
+
+def find_named(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first of the names that the folder holds, letter case aside; None for none."""
+    files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}
+    return next((files[name] for name in names if name in files), None)
+
+
+def find_lights(folder: Path) -> Path | None:
+    """The light file in the folder; None for none. InputError for several that name their images."""
+    plain = find_named(folder, LIGHT_DIRECTIONS)
+    if plain is not None:
+        return plain
+    named = [e for e in list_folder(folder) if e.name.lower().endswith(NAMED_LIGHTS) and is_file(e)]
+    if len(named) > 1:
+        raise InputError(
+            f"found {len(named)} light files: {', '.join(path.name for path in named)}",
+            path=folder,
+            hint="Choose one by --lights FILE",
+        )
+    return named[0] if named else None
+
+
+def folder_name(folder: Path) -> str:
+    """The folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
+
+    Raises:
+        InputError: the system does not tell what lies at a path with "..".
+    """
+    path = folder.absolute()
+    return (resolve(path) if ".." in path.parts else path).name or "capture"

@@ -1,0 +1,175 @@
+"""The layout of CyclesPS (Ikehata, ECCV 2018): images_<kind>/ in a folder that holds what all kinds share.
+
+As published, PRPS/<object> holds images_specular and images_metallic, PRPS_Diffuse/<object> images_diffuse,
+each with 00000.tif and so on for the lines of the object's light.txt. A capture is one such folder of images.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from splinecli.capture.layouts.capture_files import (
+    GROUND_TRUTH,
+    LIGHT_DIRECTIONS,
+    NOT_PHOTOGRAPHS,
+    CaptureFiles,
+    Overrides,
+    find_named,
+    folder_name,
+)
+from splinecli.capture.layouts.image_lists import list_folder, list_images
+from splinecli.capture.lights.light_files import read_light_directions
+from splinecli.capture.paths import is_file, is_folder, resolve
+from splinecli.errors import InputError
+
+TREES = ("PRPS", "PRPS_Diffuse")
+"""The folders of objects in the published tree."""
+
+_PREFIX = "images_"
+_LIGHTS = "light.txt"
+_BOUNDARIES = ("inboundary.png", "onboundary.png")
+_MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
+# Two of the four, so that an object is still known where some are missing, and nothing else is taken for one.
+_ENOUGH_MARKS = 2
+_NUMBERED = re.compile(r"\d{5}\.tif")
+
+
+def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+    """The capture's files, or None for another layout.
+
+    Args:
+        folder: images_<kind> in an object's folder, or an object's folder with one such folder.
+
+    Raises:
+        InputError: the object holds no or several folders of images, no light.txt or boundary masks and none
+            are named instead, or other images than its lights promise.
+    """
+    images_folder = _images_folder(folder)
+    if images_folder is None:
+        if _is_object(folder):
+            raise _not_one_folder(folder)
+        return None
+    holder = _parent(images_folder)
+    lights = overrides.lights or find_named(holder, [_LIGHTS])
+    if lights is None:
+        raise InputError(
+            f"found no {_LIGHTS}, expected the light directions of {images_folder.name}",
+            path=holder,
+            hint="Pass --lights FILE, with one line x y z for each image",
+        )
+    return CaptureFiles(
+        layout="CyclesPS",
+        name=_name(images_folder),
+        folder=holder,
+        images=_list_numbered(images_folder, len(read_light_directions(lights)), lights),
+        light_directions=lights,
+        light_intensities=overrides.intensities,
+        mask=overrides.mask,
+        boundaries=() if overrides.mask else _find_boundaries(holder),
+        ground_truth=overrides.ground_truth or find_named(holder, GROUND_TRUTH),
+    )
+
+
+def capture_name(folder: Path) -> str | None:
+    """<object>_<kind>, such as "Armadillo_specular"; None for another layout, or where it is not one capture."""
+    try:
+        images_folder = _images_folder(folder)
+    except InputError:  # reading the capture will say it
+        return None
+    return None if images_folder is None else _name(images_folder)
+
+
+def list_captures(folder: Path) -> list[Path]:
+    """The folders of images that the folder stands for: itself, or those of the object that it is; or none."""
+    if _is_images_folder(folder):
+        return [folder]
+    return _list_images_folders(folder) if _is_object(folder) else []
+
+
+def _name(images_folder: Path) -> str:
+    return f"{folder_name(_parent(images_folder))}_{folder_name(images_folder).removeprefix(_PREFIX)}"
+
+
+def _images_folder(folder: Path) -> Path | None:
+    """The folder of images that is meant; None where that is not one, or the layout another."""
+    captures = list_captures(folder) if is_folder(folder) else []
+    return captures[0] if len(captures) == 1 else None
+
+
+def _is_images_folder(folder: Path) -> bool:
+    # A light file of its own makes it a plain folder.
+    return (
+        folder_name(folder).startswith(_PREFIX)
+        and _has_marks(_parent(folder))
+        and find_named(folder, LIGHT_DIRECTIONS) is None
+    )
+
+
+def _is_object(folder: Path) -> bool:
+    if not _has_marks(folder) or find_named(folder, LIGHT_DIRECTIONS) is not None:
+        return False
+    no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
+    return bool(
+        _list_images_folders(folder)
+        # Photographs beside light.txt are a plain folder that is given --lights light.txt.
+        or not list_images(folder, leave_out_stems=no_photographs, leave_out=())
+    )
+
+
+def _has_marks(folder: Path) -> bool:
+    marks = {
+        entry.name.lower() for entry in list_folder(folder) if entry.name.lower() in _MARKS and is_file(entry)
+    }
+    return len(marks) >= _ENOUGH_MARKS
+
+
+def _list_images_folders(holder: Path) -> list[Path]:
+    return [entry for entry in list_folder(holder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+
+
+def _parent(folder: Path) -> Path:
+    # "." and ".." are their own parents to pathlib.
+    return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
+
+
+def _not_one_folder(holder: Path) -> InputError:
+    folders = _list_images_folders(holder)
+    if not folders:
+        return InputError(
+            f"found no folder of images, expected {_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse",
+            path=holder,
+        )
+    names = ", ".join(folder.name for folder in folders)
+    return InputError(
+        f"found {len(folders)} folders of images ({names}), expected one",
+        path=holder,
+        hint=f"Give one of them, such as {folders[0]}",
+    )
+
+
+def _find_boundaries(holder: Path) -> tuple[Path, ...]:
+    """Both masks: the object is their union, so that one alone would be a wrong one."""
+    found = {name: find_named(holder, [name]) for name in _BOUNDARIES}
+    missing = [name for name, path in found.items() if path is None]
+    if missing:
+        raise InputError(
+            f"found no {' and no '.join(missing)}, expected the masks whose union is the object",
+            path=holder,
+            hint="Pass --mask FILE",
+        )
+    return tuple(path for path in found.values() if path is not None)
+
+
+def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
+    """00000.tif and so on, one for each light."""
+    there = {entry.name.lower(): entry for entry in list_folder(folder)}
+    wanted = [f"{index:05}.tif" for index in range(n_lights)]
+    promised = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
+    for name in wanted:
+        if name not in there:
+            raise InputError(f"the image does not exist, expected {promised}", path=folder / name)
+    n_images = sum(bool(_NUMBERED.fullmatch(name)) for name in there)
+    if n_images != n_lights:
+        raise InputError(f"found {n_images} images, expected {promised}", path=folder)
+    return tuple(there[name] for name in wanted)

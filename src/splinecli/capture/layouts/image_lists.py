@@ -1,0 +1,117 @@
+"""Which images a folder holds, and in which order."""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from splinecli.capture.paths import find_mode, is_file, resolve
+from splinecli.capture.formats.raw import RAW_SUFFIXES
+from splinecli.capture.formats.text import read_lines
+from splinecli.errors import InputError
+
+_DEVELOPED = (".png", ".tif", ".tiff")
+_JPEG = (".jpg", ".jpeg")
+PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)
+"""Of pictures that need not be photographs, such as masks."""
+IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)
+"""Of photographs, by rank: see list_images."""
+
+_DIGITS = re.compile(r"([0-9]+)")
+
+
+def natural_key(path: Path) -> tuple[list[int | str], str]:
+    """Sort key by name with numbers by value: img2 before img10."""
+    # split() with a group alternates text and digits, so the same places hold the same types.
+    parts: list[int | str] = [
+        int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(path.name.casefold()))
+    ]
+    return parts, path.name
+
+
+def list_folder(folder: Path) -> list[Path]:
+    """What the folder holds in natural order, without hidden files (macOS leaves "._" companions of images).
+
+    Raises:
+        InputError: the folder is missing, is a file, or cannot be read.
+    """
+    mode = find_mode(folder)
+    if mode is None:
+        raise InputError("the folder does not exist", path=folder)
+    if not stat.S_ISDIR(mode):
+        raise InputError("found a file, expected a folder of images", path=folder)
+    try:
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise InputError(f"the folder cannot be read ({error.strerror})", path=folder) from None
+    return sorted(entries, key=natural_key)
+
+
+def list_images(
+    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
+) -> tuple[Path, ...]:
+    """The images of the folder in natural order, by their suffixes.
+
+    Where a RAW file and others share a stem, they are one photograph: a PNG or TIFF was developed from the RAW file
+    and counts in its place, and a JPEG is the copy that cameras put beside it and does not count.
+
+    Args:
+        leave_out_stems: lower-case names without suffix that mean something else, such as "mask".
+        leave_out: files that mean something else.
+    """
+    others = {resolve(path) for path in leave_out}
+    images = [
+        entry
+        for entry in list_folder(folder)
+        if entry.suffix.lower() in IMAGE_SUFFIXES
+        and entry.stem.lower() not in leave_out_stems
+        and is_file(entry)
+        and resolve(entry) not in others
+    ]
+    raw, developed = (
+        {image.stem.lower() for image in images if image.suffix.lower() in suffixes}
+        for suffixes in (RAW_SUFFIXES, _DEVELOPED)
+    )
+    return tuple(
+        image
+        for image in images
+        if image.stem.lower() not in raw
+        or image.suffix.lower() in (_DEVELOPED if image.stem.lower() in developed else RAW_SUFFIXES)
+    )
+
+
+def check_not_empty(images: Sequence[Path], folder: Path) -> None:
+    """Raise InputError where there are no images in the folder."""
+    if not images:
+        raise InputError(
+            "the folder holds no images", path=folder, hint="PNG, TIFF, JPEG and RAW files count as images"
+        )
+
+
+def read_image_list(path: Path) -> tuple[Path, ...]:
+    """The images that a filenames.txt names, one a line, relative to its folder.
+
+    Raises:
+        InputError: with the line, for an image that does not exist or is named twice; or the list is empty.
+    """
+    images: dict[Path, int] = {}
+    for line, text in enumerate(read_lines(path), start=1):
+        name = text.strip()
+        if not name:
+            continue
+        image = path.parent / name
+        if not is_file(image):
+            raise InputError(
+                f'the image "{name}" does not exist',
+                path=path,
+                line=line,
+                hint="Correct the name or remove the line",
+            )
+        if image in images:
+            raise InputError(f'the image "{name}" is also on line {images[image]}', path=path, line=line)
+        images[image] = line
+    if not images:
+        raise InputError("the list names no images", path=path)
+    return tuple(images)

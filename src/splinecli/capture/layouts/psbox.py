@@ -1,0 +1,55 @@
+"""The layout of PSBox (Y. Xiong): the object's images in Objects/, the light file beside that folder."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from splinecli.capture.layouts.capture_files import (
+    GROUND_TRUTH,
+    LIGHT_INTENSITIES,
+    MASK,
+    NOT_PHOTOGRAPHS,
+    CaptureFiles,
+    Overrides,
+    find_named,
+    folder_name,
+)
+from splinecli.capture.layouts.image_lists import check_not_empty, list_images
+from splinecli.capture.paths import is_folder
+
+_LIGHT_DIRECTIONS = ("light_directions.txt",)
+_OBJECTS = "Objects"
+
+
+def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+    """The capture's files, or None for another layout; InputError where Objects/ holds no images."""
+    lights = overrides.lights or find_named(folder, _LIGHT_DIRECTIONS)
+    images = list_objects(folder, leave_out=overrides.named(), lights=lights)
+    if lights is None or images is None:
+        return None
+    check_not_empty(images, folder / _OBJECTS)
+    return CaptureFiles(
+        layout="PSBox",
+        name=folder_name(folder),
+        folder=folder,
+        images=images,
+        light_directions=lights,
+        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
+        mask=overrides.mask or find_named(folder, MASK),
+        ground_truth=overrides.ground_truth or find_named(folder, GROUND_TRUTH),
+    )
+
+
+def list_objects(
+    folder: Path, *, leave_out: Collection[Path] = (), lights: Path | None = None
+) -> tuple[Path, ...] | None:
+    """The images of Objects/, without files that mean something else; None for another layout.
+
+    Args:
+        lights: a file of lights, where one is named; else the folder has to hold one.
+    """
+    objects = folder / _OBJECTS
+    if (lights or find_named(folder, _LIGHT_DIRECTIONS)) is None or not is_folder(objects):
+        return None
+    return list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=leave_out)

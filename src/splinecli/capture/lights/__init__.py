@@ -1,0 +1,1 @@
+"""Light files, and draws of lights."""

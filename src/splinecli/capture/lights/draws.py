@@ -1,0 +1,177 @@
+"""Draws of lights: which of a capture's lights a trial sees. Random ones by seed, or those of a file."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.record import FLATTEST_LIGHTS, MIN_LIGHTS
+from splinecli.capture.formats.text import read_lines
+from splinecli.errors import InputError, UsageError
+
+Draw = tuple[int, ...]
+"""Zero-based indices of lights in the whole capture."""
+
+DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
+"""First words of the seeds, so that draws, light noise and choice of pixels share no random numbers."""
+
+_REDRAWS = 1000
+_SEPARATORS = re.compile(r"[\s,;]+")
+_INDEX = re.compile(r"[0-9]{1,9}")
+
+
+def draw_lights(
+    light_directions: NDArray[np.float64], n_lights: int | None, *, trials: int = 1, seed: int = 0
+) -> list[Draw]:
+    """Random draws of lights without replacement, each in rising order.
+
+    Trial t depends on the seed, the number of lights, `n_lights` and t alone: captures with equally many
+    lights get the same draws, and more trials continue the same list. Only a draw whose lights lie in one
+    plane, which no method could solve, is drawn again. All lights together are one draw, however many trials
+    are asked for.
+
+    Args:
+        light_directions: (F, 3) unit.
+        n_lights: lights a draw, or None for all of them.
+
+    Raises:
+        UsageError: fewer than three lights, more than there are, no trials, or a negative seed.
+        InputError: no draw was found whose lights do not lie in one plane.
+    """
+    available = len(light_directions)
+    check_draw_settings(n_lights, trials, seed)
+    if n_lights is not None and n_lights > available:
+        raise UsageError(
+            f"{n_lights} lights wanted, the capture has {available}",
+            hint=f"Ask for at most {available} lights",
+        )
+    if n_lights is None or n_lights == available:
+        return [tuple(range(available))]
+    return [_draw(light_directions, n_lights, trial, seed) for trial in range(trials)]
+
+
+def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
+    """Raise UsageError where no capture could be drawn from like this."""
+    if n_lights is not None and n_lights < MIN_LIGHTS:
+        raise UsageError(f"{n_lights} lights wanted, expected at least {MIN_LIGHTS}")
+    if trials < 1:
+        raise UsageError(f"{trials} trials wanted, expected at least 1")
+    if seed < 0:
+        raise UsageError(f"the seed is {seed}, expected a whole number from 0")
+
+
+@dataclass(frozen=True)
+class DrawsFile:
+    """The draws of a file, all of the same number of lights.
+
+    Args:
+        path: the file.
+        draws: at least one, in the file's order.
+        lines: the one-based line of each.
+    """
+
+    path: Path
+    draws: tuple[Draw, ...]
+    lines: tuple[int, ...]
+
+    @property
+    def n_lights(self) -> int:
+        return len(self.draws[0])
+
+    def check_against(self, light_directions: NDArray[np.float64], *, skipped: int = 0) -> None:
+        """Raise InputError, with the line, where a draw does not fit a capture under these lights (F, 3).
+
+        skipped: lights at the start that no draw may name.
+        """
+        available = len(light_directions)
+        for draw, line in zip(self.draws, self.lines, strict=True):
+            if max(draw) >= available:
+                raise InputError(
+                    f"found light index {max(draw)}, expected 0 to {available - 1}:"
+                    f" the capture has {available} lights",
+                    path=self.path,
+                    line=line,
+                )
+            if min(draw) < skipped:
+                raise InputError(
+                    f"found light index {min(draw)}; the first {skipped} images are to be skipped",
+                    path=self.path,
+                    line=line,
+                )
+            if in_one_plane(light_directions[list(draw)]):
+                raise InputError(
+                    "the lights of this draw lie in one plane, so no normal can be found",
+                    path=self.path,
+                    line=line,
+                )
+
+
+def read_draws(path: Path) -> DrawsFile:
+    """Read a text file with a draw a line: light indices from 0, separated by spaces or commas.
+
+    "#" comments and blank lines are skipped.
+
+    Raises:
+        InputError: with the line, for a word that is no light index, an index that comes twice, fewer than
+            three lights, or another number of lights than in the first draw; also for a file without draws.
+    """
+    draws: list[Draw] = []
+    lines: list[int] = []
+    for line, text in enumerate(read_lines(path), start=1):
+        words = [word for word in _SEPARATORS.split(text.partition("#")[0]) if word]
+        if not words:
+            continue
+        draw = tuple(_light_index(word, path, line) for word in words)
+        _check_draw(draw, draws[0] if draws else draw, path, line)
+        draws.append(draw)
+        lines.append(line)
+    if not draws:
+        raise InputError("the file holds no draws, expected a line of light indices for each", path=path)
+    return DrawsFile(path, tuple(draws), tuple(lines))
+
+
+def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed: int) -> Draw:
+    generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
+    for _ in range(_REDRAWS):
+        # By uniform numbers, not Generator.choice: numpy is likelier to keep that stream over its versions.
+        chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
+        if not in_one_plane(light_directions[chosen]):
+            return tuple(chosen.tolist())
+    raise InputError(
+        f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws",
+        hint="Choose more lights, or lights that surround the viewing direction",
+    )
+
+
+def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
+    """Whether Capture would refuse these lights (F, 3)."""
+    strengths = np.linalg.svd(light_directions, compute_uv=False)
+    return bool(strengths[-1] < FLATTEST_LIGHTS * strengths[0])
+
+
+def _light_index(word: str, path: Path, line: int) -> int:
+    if _INDEX.fullmatch(word) is None:
+        raise InputError(f'found "{word[:40]}", expected a light index from 0', path=path, line=line)
+    return int(word)
+
+
+def _check_draw(draw: Draw, first: Draw, path: Path, line: int) -> None:
+    for position, index in enumerate(draw):
+        if index in draw[:position]:
+            raise InputError(
+                f"light index {index} comes twice", path=path, line=line, hint="Name each light once"
+            )
+    if len(draw) < MIN_LIGHTS:
+        raise InputError(
+            f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line
+        )
+    if len(draw) != len(first):
+        raise InputError(
+            f"found {len(draw)} light indices, expected {len(first)} as in the first draw",
+            path=path,
+            line=line,
+        )

@@ -1,0 +1,155 @@
+"""Light directions and intensities from text files: N x 3 or 3 x N, with or without a count line.
+
+Frame: x right, y up, z to the camera; a direction points from the object to the light.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.text import NumberRows, columns, read_number_rows
+from splinecli.errors import InputError
+
+StrPath = str | os.PathLike[str]
+
+
+def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray[np.float64]:
+    """Unit light directions (F, 3) float64 from a text file.
+
+    A row holds x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of
+    lights is accepted (the University of Washington's lights.txt), and so is 3 x N (PSBox), where N x 3 does
+    not fit; 3 x 3 is read as rows. Vectors need not be unit length.
+
+    Args:
+        path: the file.
+        n_images: how many lights there have to be, where that is known.
+
+    Raises:
+        InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
+            vector or a light below the horizon; also where the count disagrees with the count line or with
+            n_images.
+    """
+    table = _drop_count_line(read_number_rows(Path(path)), n_images)
+    vectors, transposed = _one_light_a_row(table, {3: "x y z"}, "light directions", n_images)
+    return unit_directions(
+        vectors,
+        table.path,
+        [table.lines[2 if transposed else light] for light in range(len(vectors))],
+        [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))],
+    )
+
+
+def unit_directions(
+    vectors: NDArray[np.float64],
+    path: Path,
+    lines: Sequence[int | None],
+    places: Sequence[str],
+) -> NDArray[np.float64]:
+    """Vectors (F, 3) at unit length.
+
+    Args:
+        path, lines, places: where each stands in its file: its line, and words that say where on it.
+
+    Raises:
+        InputError: a zero vector, or a light that is not above the horizon.
+    """
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    # Divided by the largest component first: squares of very large or small ones leave float64's range.
+    scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
+    for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
+        if not vector.any():
+            raise InputError(f"found a zero vector{place}, expected a light direction", path=path, line=line)
+        if z <= 0:
+            raise InputError(
+                f"found a light below the horizon{place} (z = {vector[2]:g}), expected z > 0",
+                path=path,
+                line=line,
+                hint="z points to the camera; the file may be in another frame",
+            )
+    return directions
+
+
+def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
+    """Light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
+
+    One number a light counts for all three channels.
+
+    Raises:
+        InputError: as read_light_directions does, and with the line for an intensity that is not above zero.
+    """
+    table = _drop_count_line(read_number_rows(Path(path)), n_images)
+    names = {3: "R G B", 1: "gray"}
+    intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
+    for light, channel in np.argwhere(intensities <= 0):
+        place = f" in column {light + 1}" if transposed else ""
+        raise InputError(
+            f"found the intensity {intensities[light, channel]:g}{place}, expected a number above 0",
+            path=table.path,
+            line=table.lines[channel if transposed else light],
+        )
+    return np.broadcast_to(intensities, (n_images, 3)).copy()
+
+
+def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
+    """The table without a first line that only counts the lights."""
+    if len(table.rows[0]) != 1 or len(table.rows) == 1:
+        return table
+    following = table.drop_first()
+    count = table.rows[0][0]
+    if all(len(row) == 1 for row in following.rows):
+        # A single column: the first number counts only where that makes the rest fit.
+        return following if len(following.rows) == count == n_images else table
+    if count in (len(following.rows), len(following.rows[0])):
+        return following
+    if not count.is_integer():
+        expected = columns(len(following.rows[0]))
+        raise InputError(
+            f"found 1 column, expected {expected} or a count", path=table.path, line=table.lines[0]
+        )
+    raise InputError(
+        f"the count line says {count:.0f}, but {len(following.rows)} rows follow",
+        path=table.path,
+        line=table.lines[0],
+        hint="Correct the count or leave it out",
+    )
+
+
+def _one_light_a_row(
+    table: NumberRows, names: dict[int, str], what: str, n_images: int | None
+) -> tuple[NDArray[np.float64], bool]:
+    """The numbers with one light a row, and whether the file has one light a column.
+
+    Args:
+        names: the numbers a light may have, each with its meaning.
+    """
+    values = table.as_array()
+    n_rows, n_columns = values.shape
+    readings = []
+    if n_columns in names:
+        readings.append((values, False))
+    if n_rows in names:
+        readings.append((values.T, True))
+    if not readings:
+        expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
+        decimal_commas = n_columns == 6 and table.texts[0].count(",") >= 3
+        raise InputError(
+            f"found {columns(n_columns)}, expected {expected}",
+            path=table.path,
+            line=table.lines[0],
+            hint="A comma separates columns; write decimals with a point" if decimal_commas else None,
+        )
+    for lights, transposed in readings:
+        if n_images is None or len(lights) == n_images:
+            return lights, transposed
+    raise InputError(
+        f"found {len(readings[0][0])} {what}, expected {n_images}, one for each image",
+        path=table.path,
+        hint="The file needs one line for each image, in the order of the images",
+    )

@@ -1,0 +1,169 @@
+"""Light files that name the image of each light: RTI's .lp and the JSON of AliceVision (Meshroom).
+
+Their names often come from another machine, with folders that do not exist here, or are mere numbers; so the images of
+the folder are matched to them by base name, then by name without suffix, then by order.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.lights.light_files import unit_directions
+from splinecli.capture.formats.text import parse_number, read_lines
+from splinecli.errors import InputError
+
+SUFFIXES = (".lp", ".json")
+_FOLDERS = re.compile(r"[/\\]")
+
+
+@dataclass(frozen=True, eq=False)
+class NamedLights:
+    """F lights, each with the name of its image.
+
+    Args:
+        path: the file.
+        names: of the images, without folders.
+        lines: of the file; None for each where lines mean nothing.
+        directions: (F, 3) float64, unit; x right, y up, z to the camera.
+        intensities: (F, 3) float64, RGB, or None where the file has none.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    lines: tuple[int | None, ...]
+    directions: NDArray[np.float64]
+    intensities: NDArray[np.float64] | None = None
+
+    def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
+        """The image of each light, and how it was found: "name", "name without suffix" or "order".
+
+        Images that no light names are left out, unless the order alone decides.
+
+        Raises:
+            InputError: two lights have one name, or neither names nor the number of images fit.
+        """
+        lines: dict[str, int | None] = {}
+        for name, line in zip(self.names, self.lines, strict=True):
+            if name.casefold() in lines:
+                raise InputError(f'a second light for the image "{name}"', path=self.path, line=line)
+            lines[name.casefold()] = line
+        keys: tuple[tuple[str, Callable[[str], str]], ...] = (
+            ("name", str.casefold),
+            ("name without suffix", lambda name: Path(name).stem.casefold()),
+        )
+        for how, key in keys:
+            by_key = {key(image.name): image for image in reversed(images)}
+            wanted = [key(name) for name in self.names]
+            if len(set(wanted)) == len(wanted) and all(name in by_key for name in wanted):
+                return tuple(by_key[name] for name in wanted), how
+        if len(images) == len(self.names):
+            return tuple(images), "order"
+        present = {image.name.casefold() for image in images}
+        missing = next((i for i, name in enumerate(self.names) if name.casefold() not in present), 0)
+        raise InputError(
+            f"found {len(self.names)} lights but {len(images)} images;"
+            f' the image "{self.names[missing]}" is not among them',
+            path=self.path,
+            line=self.lines[missing],
+            hint="Give each light's image the name that it has here, or give as many images as lights, in order",
+        )
+
+
+def read_named_lights(path: Path) -> NamedLights:
+    """Read an .lp or AliceVision JSON file, told by its suffix. Raises InputError."""
+    return _read_json(path) if path.suffix.lower() == ".json" else _read_lp(path)
+
+
+def _read_lp(path: Path) -> NamedLights:
+    """RTI: a first line with the number of lights, then `file name x y z` a line; names may hold spaces."""
+    stored = read_lines(path, else_latin_1=True)
+    content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
+    if not content:
+        raise InputError("the file is empty, expected the number of lights on the first line", path=path)
+    (first, count), *rows = content
+    if not count.isdecimal():
+        raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
+    if int(count) != len(rows):
+        raise InputError(
+            f"the first line says {int(count)} lights, but {len(rows)} lines follow",
+            path=path,
+            line=first,
+            hint="Correct the number, or restore the missing lines",
+        )
+    if not rows:
+        raise InputError("the file holds no lights", path=path, line=first)
+    names, vectors = [], []
+    for line, text in rows:
+        words = text.rsplit(maxsplit=3)
+        if len(words) < 4:
+            raise InputError(f'found "{text[:40]}", expected a file name and x y z', path=path, line=line)
+        names.append(_FOLDERS.split(words[0].strip('"'))[-1])
+        vectors.append([parse_number(word, path, line) for word in words[1:]])
+    lines = tuple(line for line, _ in rows)
+    directions = unit_directions(np.array(vectors), path, lines, [""] * len(lines))
+    return NamedLights(path, tuple(names), lines, directions)
+
+
+def _read_json(path: Path) -> NamedLights:
+    """AliceVision: {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
+
+    Its y points down and its z away from the camera.
+    """
+    try:
+        document = json.loads("\n".join(read_lines(path)))
+    except json.JSONDecodeError as error:
+        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
+    lights = document.get("lights") if isinstance(document, dict) else None
+    if not isinstance(lights, list) or not lights:
+        raise InputError('found no list "lights", expected lights as AliceVision writes them', path=path)
+    names, vectors, intensities = [], [], []
+    for number, light in enumerate(lights, start=1):
+        if not isinstance(light, dict):
+            raise InputError(f"light {number} is not an object", path=path)
+        kind = light.get("type", "directional")
+        if kind != "directional":
+            raise InputError(
+                f"light {number} is of type {kind!r}, expected 'directional'",
+                path=path,
+                hint="Calibrate for distant lights, one direction a light",
+            )
+        names.append(_FOLDERS.split(str(light.get("viewId", number)))[-1])
+        vectors.append(_three_numbers(light, "direction", number, path))
+        if "intensity" in light:
+            intensities.append(_three_numbers(light, "intensity", number, path))
+            if min(intensities[-1]) <= 0:
+                raise InputError(
+                    f"light {number} has the intensity {min(intensities[-1]):g}, expected above 0", path=path
+                )
+    if intensities and len(intensities) != len(lights):
+        raise InputError(
+            f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none", path=path
+        )
+    directions = unit_directions(
+        np.array(vectors) * (1.0, -1.0, -1.0) + 0.0,  # no -0
+        path,
+        [None] * len(lights),
+        [f" as light {number}" for number in range(1, len(lights) + 1)],
+    )
+    return NamedLights(
+        path, tuple(names), (None,) * len(names), directions, np.array(intensities) if intensities else None
+    )
+
+
+def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> list[float]:
+    values = light.get(key)
+    good = isinstance(values, list) and len(values) == 3
+    if not good or not all(
+        isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+        for value in values or ()
+    ):
+        raise InputError(f"light {number} has {key!r} {values!r}, expected three numbers", path=path)
+    return [float(value) for value in values or ()]

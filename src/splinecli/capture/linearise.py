@@ -1,0 +1,101 @@
+"""From what a camera stored to light: the transfer curve undone, ambient light taken off, falloff divided out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.images import to_linear
+from splinecli.errors import InputError
+from splinecli.transfer import decode_transfer
+
+_DARKEST_FLAT = 0.02  # of a flat field's mean: darker places do not tell the falloff
+
+
+@dataclass(frozen=True)
+class Development:
+    """How stored values become linear light.
+
+    Args:
+        gamma: of the images' transfer curve, 1 for linear ones, None for sRGB's.
+        ambient: an image under ambient light alone, taken off all others.
+        flat_field: images of something evenly white, each divided by its mean: one for each light, or one for all.
+    """
+
+    gamma: float | None = 1.0
+    ambient: Path | None = None
+    flat_field: tuple[Path, ...] = ()
+
+
+AS_STORED = Development()
+
+
+class Developer:
+    """Develops the pixels of a mask (H, W) of one capture; what all its images share is read once."""
+
+    def __init__(self, development: Development, mask: NDArray[np.bool_], n_images: int) -> None:
+        """Raises InputError: the ambient image cannot be read, or the number of flat fields does not fit."""
+        self.development = development
+        self.mask = mask
+        flats = development.flat_field
+        if len(flats) not in (0, 1, n_images):
+            raise InputError(
+                f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image",
+                path=flats[0].parent,
+            )
+        self._ambient = None if development.ambient is None else self._linear(development.ambient)
+        self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
+
+    def __call__(self, pixels: NDArray[Any], path: Path, index: int) -> NDArray[np.float32]:
+        """Linear light (P, C) of the mask's pixels (P, C) as stored in image `index`. Raises InputError."""
+        linear = decode_transfer(to_linear(pixels, path), self.development.gamma)
+        if self._ambient is not None:
+            linear = np.maximum(linear - self._ambient, 0)
+        if len(self.development.flat_field) > 1:
+            linear = linear / self._read_flat(self.development.flat_field[index])
+        elif self._flat is not None:
+            linear = linear / self._flat
+        return linear
+
+    def _read_flat(self, path: Path) -> NDArray[np.float32]:
+        linear = self._linear(path)
+        if self._ambient is not None:
+            linear = np.maximum(linear - self._ambient, 0)
+        mean = linear.mean()
+        if mean <= 0:
+            raise InputError("the flat-field image is black", path=path)
+        return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
+
+    def _linear(self, path: Path) -> NDArray[np.float32]:
+        stored = decode_image(path)
+        if stored.shape[:2] != self.mask.shape:
+            raise InputError(
+                f"found an image of {stored.shape[1]} x {stored.shape[0]} pixels,"
+                f" expected {self.mask.shape[1]} x {self.mask.shape[0]} as the others",
+                path=path,
+            )
+        return decode_transfer(to_linear(stored[self.mask], path), self.development.gamma)
+
+
+def is_display_encoded(path: Path) -> bool:
+    """Whether the file itself says that its values are meant for a screen: JPEG, or PNG with a chunk sRGB or gAMA."""
+    with path.open("rb") as file:
+        start = file.read(8)
+        if start.startswith(b"\xff\xd8\xff"):
+            return True
+        if start != b"\x89PNG\r\n\x1a\n":
+            return False
+        while len(header := file.read(8)) == 8 and header[4:] not in (b"IDAT", b"IEND"):
+            length = int.from_bytes(header[:4], "big")
+            if header[4:] == b"sRGB":
+                return True
+            if header[4:] == b"gAMA":
+                # 100000 times the exponent of the encoding: 1 means linear.
+                return int.from_bytes(file.read(4), "big") != 100_000
+            file.seek(length + 4, 1)
+    return False

@@ -1,0 +1,1 @@
+"""What photographs lack and other observations show: saturated pixels, light intensities, the mask."""

@@ -1,0 +1,63 @@
+"""The picture by which a person checks a calibration: every photograph's ball with circle, highlight and direction."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.calibration.balls import BallCalibration
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.images import to_linear
+
+Picture = NDArray[np.uint8]
+
+TILE = 200
+_MARGIN = 1.15  # of the radius
+_CAPTION = 22
+_COLUMNS = 6
+_CIRCLE, _MARK, _TEXT = (90, 200, 90), (255, 60, 60), (230, 230, 230)
+
+
+def calibration_picture(balls: tuple[BallCalibration, ...]) -> Picture:
+    """(H, W, 3) uint8 RGB: the balls below each other, their photographs in rows of six.
+
+    Green is the outline, red the highlight; the line from the centre to it points where the lamp stands, and the
+    caption holds its direction x, y, z.
+    """
+    columns = min(_COLUMNS, max(len(ball.directions) for ball in balls))
+    rows = []
+    for ball in balls:
+        tiles = [_tile(ball, number) for number in range(len(ball.directions))]
+        empty = np.zeros_like(tiles[0])
+        for start in range(0, len(tiles), columns):
+            row = tiles[start : start + columns]
+            rows.append(np.hstack(row + [empty] * (columns - len(row))))
+    return np.vstack(rows)
+
+
+def _tile(ball: BallCalibration, number: int) -> Picture:
+    path, circle, highlight = ball.files.images[number], ball.circle, ball.highlights[number]
+    values = to_linear(decode_image(path), path).mean(axis=2)
+    reach = _MARGIN * circle.radius
+    scale = TILE / (2 * reach)
+    # From the tile to the photograph, pixel centres at whole numbers in both.
+    shift = 0.5 / scale - 0.5
+    move = np.array([[1 / scale, 0, circle.x - reach + shift], [0, 1 / scale, circle.y - reach + shift]])
+    gray = cv2.warpAffine(values, move, (TILE, TILE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    # The outline of a ball in the dark is to be seen, too.
+    gray = (255 * (gray / max(float(gray.max()), 1e-9)) ** 0.4).astype(np.uint8)
+    tile = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
+
+    def place(x: float, y: float) -> tuple[int, int]:
+        return round((x - circle.x + reach) * scale), round((y - circle.y + reach) * scale)
+
+    centre, mark = place(circle.x, circle.y), place(highlight.x, highlight.y)
+    cv2.circle(tile, centre, round(circle.radius * scale), _CIRCLE, 1, cv2.LINE_AA)
+    cv2.line(tile, centre, mark, _MARK, 1, cv2.LINE_AA)
+    cv2.circle(tile, mark, 6, _MARK, 1, cv2.LINE_AA)
+    caption = np.zeros((_CAPTION, TILE, 3), np.uint8)
+    x, y, z = ball.directions[number]
+    text = f"{number + 1}:  {x:+.2f} {y:+.2f} {z:+.2f}"
+    cv2.putText(caption, text, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _TEXT, 1, cv2.LINE_AA)
+    return np.vstack((tile, caption)).astype(np.uint8)

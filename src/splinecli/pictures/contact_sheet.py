@@ -1,0 +1,70 @@
+"""A picture of what a pixel set holds: each scene's normals, and each of its entries under two lights."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.normals import encode_picture
+from splinecli.pixel_sets.store import Entry, Pixels, PixelSet
+
+TILE = 96  # pixels: shapes and materials can be told, and sixty scenes fit on a screen or two
+LARGE_TILE, FEW_SCENES = 160, 12
+MOST_SCENES = 120
+_WIDTH = 1900
+_GAMMA = 2.2
+_LIGHTS = ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63))
+
+Picture = NDArray[np.uint8]
+
+
+def contact_sheet(pixel_set: PixelSet) -> Picture:
+    """An RGB picture (H, W, 3): a strip for each scene, evenly chosen where there are more than MOST_SCENES."""
+    scenes: dict[str, list[Entry]] = {}
+    for entry in pixel_set.entries:
+        scenes.setdefault(entry.scene, []).append(entry)
+    every = -(-len(scenes) // MOST_SCENES)
+    tile = LARGE_TILE if len(scenes) <= FEW_SCENES else TILE
+    strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
+    width = max(strip.shape[1] for strip in strips)
+    across = max(1, _WIDTH // width)
+    padded = [np.pad(strip, ((2, 2), (2, width - strip.shape[1] + 6), (0, 0))) for strip in strips]
+    padded += [np.zeros_like(padded[0])] * (-len(padded) % across)
+    rows = [np.hstack(padded[start : start + across]) for start in range(0, len(padded), across)]
+    return np.vstack(rows)
+
+
+def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
+    first = pixel_set.load(entries[0])
+    tiles = [_fit(encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8), tile)]
+    for entry in entries:
+        pixels = pixel_set.load(entry)
+        tiles += [_fit(_shown(pixels, light), tile) for light in _LIGHTS]
+    return np.hstack(tiles)
+
+
+def _shown(pixels: Pixels, light: tuple[float, float, float]) -> Picture:
+    """The image under the entry's light closest to `light`, exposed for its 98th percentile."""
+    closest = int(np.argmax(pixels.light_directions @ np.array(light)))
+    values = np.asarray(pixels.observations[:, closest], np.float32)
+    exposed = (values / max(float(np.percentile(values, 98)), 1e-6)).clip(0, 1) ** (1 / _GAMMA)
+    return _on_mask(np.rint(exposed[:, None] * 255).repeat(3, axis=1), pixels.mask).astype(np.uint8)
+
+
+def _on_mask(values: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.floating]:
+    picture = np.zeros((*mask.shape, values.shape[1]), values.dtype)
+    picture[mask] = values
+    return picture
+
+
+def _fit(picture: NDArray[np.unsignedinteger], tile: int) -> Picture:
+    import cv2
+
+    height, width = picture.shape[:2]
+    scale = tile / max(height, width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    missing = (tile - size[1], tile - size[0])
+    return np.pad(
+        small, ((missing[0] // 2, -(-missing[0] // 2)), (missing[1] // 2, -(-missing[1] // 2)), (0, 0))
+    )

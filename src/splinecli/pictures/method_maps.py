@@ -1,0 +1,160 @@
+"""Normal maps and error maps of several methods side by side, as the papers show them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.pictures.error_map import TITLE, TOP_DEG, Picture, colour_errors
+from splinecli.pictures.plotting import png_bytes
+from splinecli.normals import encode_picture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MOST_WIDE = 3600  # pixels: all columns; with the gaps between them the picture stays below 4000
+_MOST_HIGH = 1200  # pixels: one map
+_ENLARGED = 240  # pixels: small maps are enlarged as far as their longer side stays within it
+_SMALLEST_CELL = 150  # pixels: the colour bar fits, and a name can be read
+_LARGEST_TEXT, _SMALLEST_TEXT = 36, 10  # pixels
+_TEXT_WIDTH = 0.62  # of its height: a character on average
+_DPI = 100
+_POINT = _DPI / 72  # pixels
+_WHITE = 255
+
+
+def method_maps(
+    ground_truth: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    normal_maps: Mapping[str, NDArray[np.floating]],
+    error_maps_deg: Mapping[str, NDArray[np.floating]],
+    *,
+    title: str,
+) -> bytes:
+    """A column for the ground truth and one for each method, its normal map above its error map; PNG.
+
+    Normals are shown as RGB = (n + 1) / 2, errors from 0 to TOP_DEG and beyond, white where there is nothing. The
+    maps are cut to the mask's bounding box; small ones are enlarged pixel by pixel, large ones averaged down, so that
+    the picture stays below 4000 pixels wide. Under each method stands its MAE, over the pixels that have errors.
+
+    Args:
+        ground_truth: (H, W, 3) unit normals, zero where there is none.
+        mask: (H, W), not empty.
+        normal_maps: (H, W, 3) by method, in the order of the columns.
+        error_maps_deg: (H, W) by method, NaN where there is none.
+    """
+    from matplotlib.figure import Figure
+
+    box = _bounding_box(mask)
+    height, width = mask[box].shape
+    scale = _scale(height, width, columns=1 + len(normal_maps))
+    truth = _resize(_colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale)
+    normals = {name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()}
+    shown_deg = {name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()}
+    errors = {name: _resize(colour_errors(shown_deg[name][box], TOP_DEG), scale) for name in normal_maps}
+    captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
+
+    cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
+    text = _text_height(cell_width, ["ground truth", *captions, *captions.values()])
+    gap, line = text // 2, 2 * text
+    errors_at = gap + line  # upwards, as matplotlib counts
+    normals_at = errors_at + cell_height + gap
+    names_at = normals_at + cell_height
+    width, height = gap + (cell_width + gap) * (1 + len(normal_maps)), names_at + 2 * line
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+
+    def show(picture: Picture, left: int, bottom: int) -> None:
+        x, y = left + (cell_width - picture.shape[1]) // 2, bottom + (cell_height - picture.shape[0]) // 2
+        figure.figimage(picture[::-1], x, y, origin="lower")
+
+    show(truth, gap, normals_at)
+    _write(figure, gap + cell_width / 2, names_at + text, "ground truth", text)
+    _draw_bar(figure, gap + cell_width, errors_at, cell_height, text)
+    for column, name in enumerate(normal_maps, start=1):
+        left = gap + column * (cell_width + gap)
+        show(normals[name], left, normals_at)
+        show(errors[name], left, errors_at)
+        _write(figure, left + cell_width / 2, names_at + text, name, text)
+        _write(figure, left + cell_width / 2, errors_at - text, captions[name], text)
+    _write(figure, width / 2, height - text, title, _text_height(width, [title], most=round(1.2 * text)))
+    return png_bytes(figure, _DPI)
+
+
+def _draw_bar(figure: Figure, right: int, bottom: int, height: int, text: int) -> None:
+    """The colours of errors upwards from 0, ending at `right`, with labels and a title at the left."""
+    inset = text // 2  # half a label stands out at either end
+    length = height - 2 * inset
+    column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
+    figure.figimage(colour_errors(column, TOP_DEG), right - text, bottom + inset, origin="lower")
+    for share, label in (
+        (0, "0"),
+        (1 / 3, f"{TOP_DEG / 3:g}"),
+        (2 / 3, f"{TOP_DEG * 2 / 3:g}"),
+        (1, f"{TOP_DEG:g}+"),
+    ):
+        y = bottom + inset + share * (length - 1)
+        _write(figure, right - 1.4 * text, y, label, text, align="right")
+    size = _text_height(height, [TITLE], most=text)
+    _write(figure, right - 4 * text, bottom + height / 2, TITLE, size, rotation=90)
+
+
+def _write(
+    figure: Figure,
+    x: float,
+    y: float,
+    words: str,
+    height: int,
+    *,
+    align: Literal["center", "right"] = "center",
+    rotation: float = 0,
+) -> None:
+    """Text with its middle at (x, y) in pixels from the bottom left."""
+    from matplotlib.transforms import IdentityTransform
+
+    figure.text(
+        x,
+        y,
+        words,
+        fontsize=height / _POINT,
+        ha=align,
+        va="center",
+        rotation=rotation,
+        transform=IdentityTransform(),
+        parse_math=False,
+    )
+
+
+def _text_height(width: int, lines: Sequence[str], *, most: int = _LARGEST_TEXT) -> int:
+    """Pixels, so that each of the lines fits into the width, and a short one does not fill it."""
+    longest = max(18, *(len(line) for line in lines))
+    return min(most, max(_SMALLEST_TEXT, int(width / (_TEXT_WIDTH * longest))))
+
+
+def _bounding_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def _scale(height: int, width: int, columns: int) -> float:
+    """A whole number from 1, or less than 1."""
+    most = min(_MOST_WIDE / columns / width, _MOST_HIGH / height)
+    return most if most < 1 else max(1, min(int(most), _ENLARGED // max(height, width)))
+
+
+def _resize(picture: Picture, scale: float) -> Picture:
+    if scale >= 1:
+        return picture.repeat(int(scale), axis=0).repeat(int(scale), axis=1)
+    import cv2
+
+    height, width = (max(1, int(side * scale)) for side in picture.shape[:2])
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _colour_normals(normals: NDArray[np.floating], known: NDArray[np.bool_]) -> Picture:
+    """RGB = (n + 1) / 2, white where not known; what stands there may be NaN."""
+    colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
+    colours[~known] = _WHITE
+    return colours

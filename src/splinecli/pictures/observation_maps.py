@@ -1,0 +1,77 @@
+"""What the networks see and guess of chosen pixels, after figure 3 of SPLINE-Net (Zheng et al., ICCV 2019)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.pictures.plotting import png_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from splinecli.observation_map import Grid
+
+_MAP_INCHES = 1.7
+_DPI = 150
+_EMPTY = "0.85"  # light gray, in no place of the colours
+_SMALL, _LARGE = 8, 9  # points
+
+
+def observation_map_figure(
+    sparse: NDArray[np.floating],
+    dense: NDArray[np.floating],
+    truth: NDArray[np.floating] | None,
+    *,
+    pixels: NDArray[np.integer],
+    error_deg: NDArray[np.floating],
+    title: str,
+    grid: Grid = "even",
+) -> bytes:
+    """A row for each of N pixels: its sparse map, LI-Net's dense map and the map of all lights; PNG.
+
+    Row 0 of a map is y = +1; a pixel's three maps are in one frame, be it the camera's or the pixel's own. Values
+    are shares of the largest observation, from 0 to 1. Empty cells are gray, the circle is the horizon.
+
+    Args:
+        sparse, dense: (N, w, w), NaN in empty cells.
+        truth: (N, w, w), NaN where none of the capture's lights fell; None to leave it out.
+        pixels: (N, 2) row and column in the image.
+        error_deg: (N,) of the estimated normals.
+        grid: how lights fell on the cells.
+    """
+    from matplotlib.figure import Figure
+
+    columns = {"sparse map": sparse, "LI-Net's dense map": dense}
+    if truth is not None:
+        columns["true map, all lights"] = truth
+    size = (_MAP_INCHES * len(columns) + 0.8, (_MAP_INCHES + 0.25) * len(sparse) + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    figure.suptitle(title, fontsize=_LARGE, parse_math=False)
+    axes = figure.subplots(len(sparse), len(columns), squeeze=False)
+    for place, (name, maps) in enumerate(columns.items()):
+        for axis, values in zip(axes[:, place], maps, strict=True):
+            image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")
+            _finish(axis, len(values), grid)
+        axes[-1, place].set_xlabel(name, fontsize=_SMALL)
+    for axis, (row, column), error in zip(axes[:, 0], pixels, error_deg, strict=True):
+        axis.set_title(f"row {row}, column {column}: {error:.1f} deg off", fontsize=_SMALL, loc="left")
+    bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
+    bar.set_label("share of the largest observation", fontsize=_SMALL)
+    bar.ax.tick_params(labelsize=_SMALL)
+    return png_bytes(figure, _DPI)
+
+
+def _finish(axes: Axes, size: int, grid: Grid) -> None:
+    from matplotlib.patches import Circle
+
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_facecolor(_EMPTY)
+    # matplotlib has cell k from k - 1/2 to k + 1/2; the authors' last column and top row are a single line.
+    centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
+    if grid == "cnn-ps":
+        centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2
+    axes.add_patch(Circle(centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False))

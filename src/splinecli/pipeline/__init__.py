@@ -1,0 +1,1 @@
+"""What a command does with one capture or many, without a terminal."""

@@ -1,0 +1,1 @@
+"""Training pixels on disk, and how they are made."""

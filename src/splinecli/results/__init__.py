@@ -1,0 +1,1 @@
+"""What `infer` leaves behind for a capture: files, albedo, pages."""

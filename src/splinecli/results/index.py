@@ -1,0 +1,99 @@
+"""Several captures' results side by side: the rows of the table on the terminal, and the page that links them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+from splinecli.errors import OutputError
+from splinecli.results.files import NORMALS, PAGE, REPORT
+from splinecli.results.templates import render
+
+INDEX = "index.html"
+_OURS = b'<meta name="generator" content="splinecli">'
+
+
+class Row(NamedTuple):
+    """What the tables say of a capture, in words; of a bad one only its name and the error."""
+
+    capture: str
+    lights: str = ""
+    pixels: str = ""
+    mae: str = ""
+    likely: str = ""
+    warnings: str = ""
+    seconds: str = ""
+    error: str = ""
+
+
+HEADER = Row("capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error")
+
+
+def row_of(report: Mapping[str, Any]) -> Row:
+    """The row of a report of the contract, or of {capture, error}."""
+    if "error" in report:
+        return Row(report["capture"], error=report["error"])
+    errors, expected = report["angular_error_deg"], report["expected_under_5"]
+    return Row(
+        report["capture"],
+        lights=str(report["n_lights"]),
+        pixels=f"{report['n_pixels']:,}",
+        mae="" if errors is None else f"{errors['mean']:.2f}°",
+        likely="" if expected is None else f"{expected:.0%}",
+        warnings=str(len(report["warnings"]) or ""),
+        seconds=f"{sum(report['seconds'].values()):.1f}",
+    )
+
+
+def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
+    """A page that shows the captures' normal maps and links their files, to lie beside their folders."""
+    rows = []
+    for report in reports:
+        # As bytes: a folder's name need not be text.
+        folder, files = quote(os.fsencode(report["capture"])), report.get("files", [])
+        picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
+        rows.append(
+            {
+                **row_of(report)._asdict(),
+                "page": f"{folder}/{PAGE}" if PAGE in files else None,
+                "picture": None if picture is None else f"{folder}/{picture}",
+                "files": [(name, f"{folder}/{quote(name)}") for name in files],
+            }
+        )
+    return render("index.html", title=f"{len(reports)} captures", rows=rows)
+
+
+def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Mapping[str, Any]]:
+    """The reports, and those of other captures whose results lie in the folder, by name."""
+    names = {report["capture"] for report in reports}
+    earlier = []
+    for path in sorted(folder.glob(f"*/{REPORT}")):
+        try:
+            report = json.loads(path.read_text("utf-8"))
+            row_of(report)  # raises where it is none
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+        if report["capture"] == path.parent.name not in names:
+            earlier.append(report)
+    return [*reports, *earlier]
+
+
+def has_index(folder: Path) -> bool:
+    """Whether the folder holds an index.html that splinecli wrote."""
+    try:
+        return _OURS in (folder / INDEX).read_bytes()
+    except OSError:
+        return False
+
+
+def check_index_free(folder: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where the folder holds an index.html that splinecli did not write and may not replace."""
+    path = folder / INDEX
+    if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
+        raise OutputError(
+            "was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o"
+        )

@@ -1,0 +1,76 @@
+"""Exposures in EXIF tags, written by Pillow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from splinecli.capture import open_capture
+from splinecli.capture.formats.exposure import Exposure, read_exposure
+from splinecli.errors import InputError
+
+EXIF = 0x8769
+
+
+def write(
+    path: Path, seconds: tuple[int, int] | None = (1, 60), f_number: float = 8.0, iso: int = 100
+) -> Path:
+    image = Image.fromarray(np.full((6, 8, 3), 90, np.uint8))
+    tags = Image.Exif()
+    tags[0x010F] = "Maker"  # without any tag of its own Pillow leaves all out
+    if seconds is not None:
+        tags.get_ifd(EXIF).update({0x829A: IFDRational(*seconds), 0x829D: f_number, 0x8827: iso})
+    image.save(path, exif=tags)
+    return path
+
+
+def capture(folder: Path, *exposures: tuple[int, int] | None) -> Path:
+    folder.mkdir(exist_ok=True)
+    for number, seconds in enumerate(exposures):
+        write(folder / f"{number}.jpg", seconds)
+    (folder / "lights.txt").write_text("0 0 1\n0.5 0 1\n0 0.5 1\n")
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_reading(tmp_path: Path, suffix: str) -> None:
+    assert read_exposure(write(tmp_path / f"a.{suffix}")) == Exposure(1 / 60, 8.0, 100)
+    assert read_exposure(write(tmp_path / f"b.{suffix}", None)) is None
+
+
+def test_files_that_do_not_say(tmp_path: Path) -> None:
+    for name, content in (
+        ("empty.jpg", b""),
+        ("broken.jpg", b"\xff\xd8\xff\xe1\0\x10Exif\0\0II"),
+        ("text.png", b"hello"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        assert read_exposure(tmp_path / name) is None
+    assert read_exposure(write(tmp_path / "zero.jpg", (0, 1))) is None
+
+
+def test_mixed_exposures_are_refused(tmp_path: Path) -> None:
+    folder = capture(tmp_path / "mixed", (1, 60), (1, 60), (1, 30))
+    message = r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s, f/8, ISO 100 as in 0\.jpg"
+    with pytest.raises(InputError, match=message):
+        open_capture(folder)
+    # Intensities say how the images compare.
+    (folder / "light_intensities.txt").write_text("1\n1\n2\n")
+    assert open_capture(folder).n_lights == 3
+
+
+def test_equal_lamps_do_not_make_equal_exposures(tmp_path: Path) -> None:
+    folder = capture(tmp_path / "mixed", (1, 60), (1, 60), (1, 30))
+    with pytest.raises(InputError, match="found an exposure of"):
+        open_capture(folder, intensities="equal")
+
+
+def test_exposures_that_are_one(tmp_path: Path) -> None:
+    open_capture(capture(tmp_path / "rounded", (1, 60), (10, 610), None))
+    folder = capture(tmp_path / "balanced", (1, 60), (1, 60), (1, 60))
+    write(folder / "1.jpg", (1, 120), iso=200)
+    open_capture(folder)

@@ -1,0 +1,197 @@
+"""Ground truth in every format against the normals that were written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import tifffile
+from numpy.typing import NDArray
+
+from splinecli.capture import read_normal_map, read_normals
+from splinecli.capture.formats.normal_files import read_ground_truth
+from splinecli.errors import InputError
+from splinecli.normals import angle_between_deg, encode_picture, unit
+
+WriteImage = Callable[..., Path]
+
+SHAPE = (4, 5)
+MASK = np.ones(SHAPE, bool)
+MASK[0] = False
+
+
+@pytest.fixture
+def normals() -> NDArray[np.float64]:
+    """(4, 5, 3) unit normals, zero at [1, 2] and outside the mask."""
+    field = (
+        unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1]) * MASK[..., None]
+    )
+    field[1, 2] = 0
+    return np.asarray(field)
+
+
+def write(path: Path, normals: NDArray[np.float64]) -> Path:
+    match path.suffix:
+        case ".mat":
+            scipy.io.savemat(path, {"Normal_gt": normals})
+        case ".npy":
+            np.save(path, normals)
+        case ".txt":
+            np.savetxt(path, normals.reshape(-1, 3), fmt="%.9f")
+        case ".tif":
+            tifffile.imwrite(path, normals.astype(np.float32), photometric="rgb")
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.txt", "a.tif"])
+@pytest.mark.parametrize("length", [1, 0.95, 40])
+def test_floating_point_sources(
+    tmp_path: Path, normals: NDArray[np.float64], name: str, length: float
+) -> None:
+    read = read_normals(write(tmp_path / name, normals * length), SHAPE, MASK)
+    assert read.dtype == np.float32
+    np.testing.assert_allclose(read, normals, atol=2e-7)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+@pytest.mark.parametrize(("bits", "error_deg"), [(16, 0.002), (8, 0.5)])  # half a step of each channel
+def test_pictures(
+    write_image: WriteImage, normals: NDArray[np.float64], name: str, bits: int, error_deg: float
+) -> None:
+    has_normal = normals.any(axis=2)
+    picture = encode_picture(normals, has_normal, bits=bits)
+    read = read_normals(write_image(name, picture), SHAPE, MASK)
+    assert not read[~has_normal].any()
+    assert angle_between_deg(read[has_normal], normals[has_normal]).max() < error_deg
+    np.testing.assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
+
+
+def test_a_gray_background_is_no_normal(write_image: WriteImage, normals: NDArray[np.float64]) -> None:
+    picture = encode_picture(normals, np.ones(SHAPE, bool), bits=8)  # zero vectors become 128, 128, 128
+    assert not read_normals(write_image("a.png", picture), SHAPE, np.ones(SHAPE, bool))[1, 2].any()
+
+
+def test_what_is_not_finite_or_outside_the_mask_is_no_ground_truth(
+    tmp_path: Path, normals: NDArray[np.float64]
+) -> None:
+    stored = normals.copy()
+    stored[0] = [0, 0, 1]
+    stored[2, 3] = [np.nan, 0, 1]
+    stored[3, 3] = [0, np.inf, 1]
+    read = read_normals(write(tmp_path / "a.npy", stored), SHAPE, MASK)
+    assert not read[0].any()
+    assert not read[[1, 2, 3], [2, 3, 3]].any()
+    assert np.count_nonzero(read.any(axis=2)) == 12
+
+
+def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"N": normals, "mask": MASK})
+    np.testing.assert_allclose(read_normals(path, SHAPE, MASK), normals, atol=1e-6)
+    scipy.io.savemat(path, {"N": normals, "M": normals})
+    with pytest.raises(
+        InputError, match="found no Normal_gt, and of other H x W x 3 arrays N, M, expected one"
+    ):
+        read_normals(path, SHAPE, MASK)
+    scipy.io.savemat(path, {"mask": MASK})
+    with pytest.raises(
+        InputError, match="found no Normal_gt, and of other H x W x 3 arrays none, expected one"
+    ):
+        read_normals(path, SHAPE, MASK)
+
+
+def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    path = tmp_path / "a.txt"
+    rows = ["{:.9f}, {:.9f}, {:.9f}".format(*row) for row in normals.reshape(-1, 3)]
+    path.write_text("\n".join(rows))
+    np.testing.assert_allclose(read_normals(path, SHAPE, MASK), normals, atol=1e-6)
+    path.write_text("\n".join([*rows[:6], "0 up 1", *rows[7:]]))
+    with pytest.raises(InputError, match=r'a\.txt:7: found "up", expected a number\.'):
+        read_normals(path, SHAPE, MASK)
+
+
+@pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.tif"])
+def test_wrong_size(tmp_path: Path, normals: NDArray[np.float64], name: str) -> None:
+    with pytest.raises(
+        InputError, match="found ground truth of 3 x 5 x 3, expected 4 x 5 x 3 like the images"
+    ):
+        read_normals(write(tmp_path / name, normals[1:]), SHAPE, MASK)
+
+
+def test_text_with_a_wrong_number_of_rows(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    path = write(tmp_path / "a.txt", normals[1:])
+    with pytest.raises(
+        InputError, match="found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"
+    ):
+        read_normals(path, SHAPE, MASK)
+
+
+def test_damaged_and_unknown_files(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_normals(tmp_path / "a.npy", SHAPE, MASK)
+    for name, message in [("a.mat", "MATLAB file is damaged"), ("a.npy", r"\.npy file is damaged")]:
+        path = write(tmp_path / name, normals)
+        path.write_bytes(path.read_bytes()[:150])
+        with pytest.raises(InputError, match=message):
+            read_normals(path, SHAPE, MASK)
+    (tmp_path / "a.exr").touch()
+    with pytest.raises(InputError, match=r'the type "\.exr", expected \.mat, \.npy, \.txt, \.png or \.tif'):
+        read_normals(tmp_path / "a.exr", SHAPE, MASK)
+
+
+def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    # As in the normal.txt of DiLiGenT's Harvest: the rows alone, the vectors are right.
+    path = write(tmp_path / "normal.txt", normals[::-1])
+    read, upside_down = read_ground_truth(path, SHAPE, MASK)
+    assert upside_down
+    np.testing.assert_allclose(read, normals, atol=2e-7)
+    assert not read_ground_truth(write(path, normals), SHAPE, MASK)[1]
+    # A mask that is its own mirror image tells nothing.
+    full = np.ones(SHAPE, bool)
+    np.testing.assert_allclose(
+        read_normals(write(path, normals[::-1]), SHAPE, full), normals[::-1], atol=2e-7
+    )
+
+
+def test_nothing_is_unpickled(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="holds no array of numbers"):
+        read_normals(tmp_path / "a.npy", SHAPE, MASK)
+
+
+def test_no_normal_inside_the_mask(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="found no normal inside the mask, expected at least one"):
+        read_normals(write(tmp_path / "a.npy", np.zeros((*SHAPE, 3))), SHAPE, MASK)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> None:
+    picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
+    path = write_image("photograph.png", picture)
+    with pytest.raises(
+        InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are no normals"
+    ):
+        read_normal_map(path)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_picture_saved_by_numpy(tmp_path: Path, normals: NDArray[np.float64], bits: int) -> None:
+    has_normal = normals.any(axis=2)
+    np.save(tmp_path / "a.npy", encode_picture(normals, has_normal, bits=bits))
+    read = read_normals(tmp_path / "a.npy", SHAPE, MASK)
+    assert not read[~has_normal].any()
+    assert angle_between_deg(read[has_normal], normals[has_normal]).max() < 0.5
+
+
+def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
+    plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
+    scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
+    np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", SHAPE, MASK), plane * MASK[..., None])
+
+
+def test_a_path_that_the_system_refuses(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be read \(File name too long\)\."):
+        read_normals(tmp_path / ("x" * 300 + ".npy"), SHAPE, MASK)

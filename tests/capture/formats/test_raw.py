@@ -1,0 +1,330 @@
+"""RAW files: DNGs written here, of known radiance, so that what LibRaw makes of them is known too."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.calibration.balls import find_ball_files
+from splinecli.capture import open_capture, read_capture
+from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.linearise import is_display_encoded
+from splinecli.capture.formats.exposure import Exposure, read_exposure
+from splinecli.capture.layouts.image_lists import list_images
+from splinecli.capture.formats.raw import _full_scale
+from splinecli.errors import InputError
+
+WHITE = 16383
+BAYER = (0, 1, 1, 2)  # R G / G B
+SHOT = (1 / 64, 8.0, 100)
+LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n"
+
+
+@pytest.fixture
+def needs_rawpy() -> None:
+    pytest.importorskip("rawpy")
+
+
+@pytest.fixture
+def without_rawpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+
+
+def directory(entries: Sequence[tuple[int, str, Any]], start: int) -> bytes:
+    """A little-endian TIFF directory at byte `start`: (tag, type, values), r and R for (un)signed rationals."""
+    kinds = {"B": 1, "s": 2, "H": 3, "I": 4, "R": 5, "r": 10}
+    after = start + 2 + 12 * len(entries) + 4
+    head, tail = struct.pack("<H", len(entries)), b""
+    for tag, kind, values in sorted(entries):
+        if kind == "s":
+            data, count = values.encode() + b"\0", len(values) + 1
+        elif kind in "Rr":
+            pair = "<ii" if kind == "r" else "<II"
+            data, count = b"".join(struct.pack(pair, round(v * 64e4), 640_000) for v in values), len(values)
+        else:
+            data, count = struct.pack(f"<{len(values)}{kind}", *values), len(values)
+        head += struct.pack("<HHI", tag, kinds[kind], count)
+        if len(data) <= 4:
+            head += data.ljust(4, b"\0")
+        else:
+            head += struct.pack("<I", after + len(tail))
+            tail += data + b"\0" * (len(data) % 2)
+    return head + bytes(4) + tail
+
+
+def write_dng(
+    path: Path,
+    sensor: NDArray[Any],
+    *,
+    white: int = WHITE,
+    black: Sequence[int] = (0, 0, 0, 0),
+    neutral: tuple[float, float, float] = (0.5, 1.0, 0.6),
+    orientation: int = 1,
+    exposure: tuple[float, float, int] | None = None,
+    magic: bytes = b"II*\0",
+) -> Path:
+    """A DNG of sensor values (H, W) behind a Bayer filter, or (H, W, C) without; black of its four places."""
+    bayer = sensor.ndim == 2
+    pixels, samples = sensor.astype("<u2").tobytes(), 1 if bayer else sensor.shape[2]
+
+    def tags(exif: int, at: int) -> list[tuple[int, str, Any]]:
+        return [
+            (254, "I", [0]), (256, "I", [sensor.shape[1]]), (257, "I", [sensor.shape[0]]),
+            (258, "H", [16] * samples), (259, "H", [1]), (262, "H", [32803 if bayer else 34892]),
+            (271, "s", "Nobody"), (272, "s", "Made Up"), (273, "I", [at]), (274, "H", [orientation]),
+            (277, "H", [samples]), (278, "I", [sensor.shape[0]]), (279, "I", [len(pixels)]),
+            (50706, "B", [1, 4, 0, 0]), (50708, "s", "Nobody Made Up"), (50717, "H", [white] * samples),
+            (50721, "r", [0.9, -0.3, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]), (50728, "R", neutral),
+            (50778, "H", [21]),
+            *([(33421, "H", [2, 2]), (33422, "B", BAYER), (50713, "H", [2, 2]), (50714, "H", black)] if bayer else []),
+            *([] if exposure is None else [(34665, "I", [exif])]),
+        ]  # fmt: skip
+
+    exif = 8 + len(directory(tags(0, 0), 8))
+    shot = b""
+    if exposure is not None:
+        seconds, f_number, iso = exposure
+        shot = directory([(33434, "R", [seconds]), (33437, "R", [f_number]), (34855, "H", [iso])], exif)
+    at = exif + len(shot)
+    path.write_bytes(magic + struct.pack("<I", 8) + directory(tags(exif, at), 8) + shot + pixels)
+    return path
+
+
+def mosaic(light: NDArray[Any], *, white: int = WHITE, black: Sequence[int] = (0, 0, 0, 0)) -> NDArray[Any]:
+    """What the sensor stores (H, W) of light (H, W) or (H, W, 3), 1 where it saturates."""
+    y, x = np.indices(light.shape[:2]) % 2
+    if light.ndim == 3:
+        light = np.take_along_axis(light, np.array(BAYER).reshape(2, 2)[y, x][..., None], 2)[..., 0]
+    dark = np.array(black).reshape(2, 2)[y, x]
+    return np.clip(np.round(dark + light * (white - dark)), 0, white).astype(np.uint16)
+
+
+def ramp(height: int = 30, width: int = 80) -> NDArray[Any]:
+    return np.broadcast_to(np.linspace(0.01, 0.45, width), (height, width)).copy()
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+@pytest.mark.parametrize("black", [(0, 0, 0, 0), (512, 512, 512, 512), (512, 516, 514, 509)])
+def test_values_are_proportional_to_light(tmp_path: Path, black: Sequence[int]) -> None:
+    light = ramp()
+    once, twice = (
+        decode_image(write_dng(tmp_path / f"{k}.dng", mosaic(k * light, black=black), black=black))
+        for k in (1, 2)
+    )
+    assert once.shape == (*light.shape, 3) and once.dtype == np.uint16
+    # The borders of a bilinear interpolation are no ramp. Rounding on the sensor is 1/2 of 16383, and its full scale
+    # is that of the highest black level: half a thousandth.
+    inner = (slice(2, -2), slice(2, -2))
+    np.testing.assert_allclose(
+        once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4
+    )
+    bright = once[inner] > 2000
+    np.testing.assert_allclose(twice[inner][bright] / once[inner][bright], 2, rtol=0.01)
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+def test_channels_are_red_green_blue_of_the_camera(tmp_path: Path) -> None:
+    light = np.broadcast_to((0.2, 0.5, 0.3), (30, 40, 3))
+    pixels = decode_image(write_dng(tmp_path / "a.dng", mosaic(light)))
+    np.testing.assert_allclose(pixels[10, 10] / 65535, (0.2, 0.5, 0.3), atol=1e-4)
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+def test_white_balance_and_orientation_of_the_shot_do_not_count(tmp_path: Path) -> None:
+    sensor = mosaic(ramp())
+    first = decode_image(write_dng(tmp_path / "a.dng", sensor))
+    for number, (neutral, orientation) in enumerate([((0.9, 1.0, 0.3), 1), ((0.5, 1.0, 0.6), 6)]):
+        other = write_dng(tmp_path / f"{number}.dng", sensor, neutral=neutral, orientation=orientation)
+        np.testing.assert_array_equal(decode_image(other), first)
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+@pytest.mark.parametrize(
+    ("white", "black"),
+    [
+        (16383, (0, 0, 0, 0)),
+        (4095, (0, 0, 0, 0)),  # 4095 * (65535 / 4095) is 65534.996 in single precision
+        (16383, (600, 600, 600, 600)),  # and this 65534
+        (15000, (512, 530, 520, 500)),
+    ],
+)
+def test_saturated_photosites_are_at_full_scale(tmp_path: Path, white: int, black: Sequence[int]) -> None:
+    light = np.full((40, 60), 0.98)
+    light[10:20, 10:20] = 1
+    light[25:35, 10:20] = 3
+    for number, dimmed in enumerate((light, np.where(light < 1, 0.3, light))):
+        pixels = decode_image(
+            write_dng(
+                tmp_path / f"{number}.dng", mosaic(dimmed, white=white, black=black), white=white, black=black
+            )
+        )
+        assert (pixels[11:19, 11:19] == 65535).all() and (pixels[26:34, 11:19] == 65535).all()
+        assert (pixels[:, 30:] < 65535).all()
+
+
+def test_full_scale_is_where_the_camera_says() -> None:
+    def full_scale(told: list[int] | None) -> int:
+        raw: Any = SimpleNamespace(
+            white_level=16383,
+            camera_white_level_per_channel=told,
+            black_level_per_channel=[510, 512, 511, 512],
+        )
+        return _full_scale(raw)
+
+    assert full_scale(None) == 16383 - 512 - 1
+    assert full_scale([15300, 15200, 15200, 15300]) == 15200 - 512 - 1
+    for other_unit in (3800, 60000):
+        assert full_scale([other_unit] * 4) == 16383 - 512 - 1
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+@pytest.mark.parametrize("colour", [(0.2, 0.5, 0.3), (0.4,)])
+def test_sensors_without_bayer_filter(tmp_path: Path, colour: tuple[float, ...]) -> None:
+    light = np.broadcast_to(colour, (30, 40, len(colour)))
+    pixels = decode_image(write_dng(tmp_path / "a.dng", np.round(light * WHITE)))
+    assert pixels.shape == light.shape
+    np.testing.assert_allclose(pixels / 65535, light, atol=1e-4)
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+def test_normals_of_a_matte_sphere(tmp_path: Path) -> None:
+    size, radius = 96, 44
+    y, x = np.indices((size, size)) - (size - 1) / 2
+    z = np.sqrt(np.clip(radius**2 - x**2 - y**2, 0, None))
+    normals = np.stack((x, -y, z), axis=2) / radius
+    mask = x**2 + y**2 < (0.8 * radius) ** 2  # within all lights' reach
+    azimuth = np.arange(8) * 2.4
+    lights = np.stack((0.5 * np.cos(azimuth), 0.5 * np.sin(azimuth), np.ones(8)), axis=1)
+    lights[::2, :2] /= 2
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    colours = np.where((x // 8 + y // 8)[..., None] % 2, (0.8, 0.3, 0.2), (0.2, 0.6, 0.7))
+    black = (512, 516, 514, 509)
+    rng = np.random.default_rng(0)
+    for number, light in enumerate(lights):
+        shading = np.where(z > 0, np.clip(normals @ light, 0, None), 0)[..., None] * colours
+        as_shot = (rng.uniform(0.3, 0.9), 1.0, rng.uniform(0.3, 0.9))
+        write_dng(tmp_path / f"{number}.dng", mosaic(shading, black=black), black=black, neutral=as_shot)
+    np.savetxt(tmp_path / "lights.txt", lights)
+    capture = read_capture(tmp_path)
+    assert capture.warnings and all("black under every light" in warning for warning in capture.warnings)
+    observations = capture.observations.reshape(size, size, 8)[mask]
+    estimate = np.linalg.lstsq(lights, observations.T.astype(np.float64), rcond=None)[0].T
+    estimate /= np.linalg.norm(estimate, axis=1, keepdims=True)
+    error = np.degrees(np.arccos(np.clip((estimate * normals[mask]).sum(axis=1), -1, 1)))
+    # Pixels are 1.3 degrees apart, more on the slopes, and interpolation mixes neighbours of two colours.
+    assert error.mean() < 0.5 and error.max() < 4
+
+
+@pytest.mark.usefixtures("without_rawpy")
+def test_rawpy_is_asked_for(tmp_path: Path) -> None:
+    path = write_dng(tmp_path / "a.nef", mosaic(ramp()))
+    message = (
+        f"{path}: camera RAW files need rawpy, which is not installed. Run pip install 'splinecli[raw]', or export the"
+        " photographs as 16-bit linear TIFF."
+    )
+    with pytest.raises(InputError) as caught:
+        decode_image(path)
+    assert str(caught.value) == message
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+@pytest.mark.parametrize("kept", [10, 200, 600, 3000])
+def test_damaged_files(tmp_path: Path, kept: int, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = write_dng(tmp_path / "whole.dng", mosaic(ramp())).read_bytes()
+    (tmp_path / "cut.dng").write_bytes(whole[:kept])
+    with pytest.raises(InputError, match=r"cut\.dng: the RAW file is damaged"):
+        decode_image(tmp_path / "cut.dng")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+def test_files_that_are_no_raw_files(tmp_path: Path) -> None:
+    (tmp_path / "text.cr2").write_text("hello\n" * 1000)
+    (tmp_path / "empty.arw").touch()
+    with pytest.raises(InputError, match=r"text\.cr2: .*damaged or of a camera that LibRaw does not know"):
+        decode_image(tmp_path / "text.cr2")
+    with pytest.raises(InputError, match=r"empty\.arw: the file is empty"):
+        decode_image(tmp_path / "empty.arw")
+    with pytest.raises(InputError, match=r"none\.arw: the file does not exist"):
+        decode_image(tmp_path / "none.arw")
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).touch()
+
+
+def names_of(images: Sequence[Path]) -> list[str]:
+    return [image.name for image in images]
+
+
+def test_one_file_of_each_photograph_counts(tmp_path: Path) -> None:
+    touch(
+        tmp_path,
+        "img2.NEF",
+        "IMG2.jpg",
+        "img10.nef",
+        "img10.tif",
+        "img10.jpg",
+        "img3.png",
+        "img3.jpg",
+        "notes.txt",
+    )
+    listed = list_images(tmp_path, leave_out_stems=(), leave_out=())
+    # Of img2 the RAW file and not the camera's copy, of img10 what was developed; without a RAW file, all count.
+    assert names_of(listed) == ["img2.NEF", "img3.jpg", "img3.png", "img10.tif"]
+
+
+def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:
+    touch(tmp_path, "ambient.NEF", "ambient.jpg", "mask.nef", "mask.png", "a.nef", "b.nef", "c.nef")
+    (tmp_path / "lights.txt").write_text(LIGHTS)
+    assert find_named(tmp_path, AMBIENT) == tmp_path / "ambient.NEF"
+    assert find_named(tmp_path, MASK) == tmp_path / "mask.png"
+    source = open_capture(tmp_path)
+    assert names_of(source.files.images) == ["a.nef", "b.nef", "c.nef"]
+    assert source.files.ambient == tmp_path / "ambient.NEF"
+    assert source.warnings == ("The light of ambient.NEF was taken off all images.",)
+
+
+def test_photographs_of_mirror_balls(tmp_path: Path) -> None:
+    touch(tmp_path, "1.cr3", "1.jpg", "2.cr3", "2.jpg", "ref.cr3", "ref.jpg", "mask.png")
+    files = find_ball_files(tmp_path)
+    assert names_of(files.images) == ["1.cr3", "2.cr3"]
+    assert files.reference == tmp_path / "ref.cr3"
+
+
+@pytest.mark.usefixtures("without_rawpy")
+def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
+    told = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
+    assert read_exposure(told) == Exposure(*SHOT)
+    assert read_exposure(write_dng(tmp_path / "b.dng", mosaic(ramp()))) is None
+    # The header of Olympus.
+    assert read_exposure(write_dng(tmp_path / "c.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")) is None
+    assert not is_display_encoded(told)
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_dng(tmp_path / "a.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")
+    assert read_exposure(path) == Exposure(*SHOT)
+    path.write_bytes(path.read_bytes()[:2000])
+    assert read_exposure(path) is None
+    assert capfd.readouterr() == ("", "")
+
+
+def test_mixed_exposures_are_refused(tmp_path: Path) -> None:
+    for number, seconds in enumerate((1 / 64, 1 / 64, 1 / 32)):
+        write_dng(tmp_path / f"{number}.nef", mosaic(ramp()), exposure=(seconds, 8.0, 100))
+    (tmp_path / "lights.txt").write_text(LIGHTS)
+    message = r"2\.nef: found an exposure of 1/32 s, f/8, ISO 100, expected 1/64 s, f/8, ISO 100 as in 0\.nef"
+    with pytest.raises(InputError, match=message):
+        open_capture(tmp_path)

@@ -1,0 +1,256 @@
+"""The layout of CyclesPS, on trees written here as they are published: what goes in comes out, value for value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from splinecli.capture import capture_name, find_captures, open_capture, read_capture
+from splinecli.errors import InputError
+from splinecli.evaluation.run import Protocol, evaluate
+from splinecli.methods import make_estimator
+
+HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
+LIGHTS = np.array([(0.1, 0.2, 0.9), (-0.7, 0.1, 0.5), (0.3, -0.6, 0.4), (0.0, 0.5, 0.6), (0.5, 0.5, 0.3)])
+
+
+def normals() -> np.ndarray:
+    """Unit normals (HEIGHT, WIDTH, 3) that no mirror image or exchange of axes maps onto each other."""
+    y, x = np.mgrid[0.5:-0.4:7j, -0.6:0.7:11j]
+    return np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+
+
+def boundaries() -> tuple[np.ndarray, np.ndarray]:
+    """The inner mask and the one of the rim, 21 and 14 of 77 pixels; neither contains the other."""
+    inner, rim = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    inner[2:5, 2:9] = 1  # any value above zero counts, whatever the largest
+    inner[3, 4] = 255
+    rim[1, 2:9] = 255
+    rim[5, 2:9] = 3
+    return inner, rim
+
+
+def write_object(folder: Path, *kinds: str, seed: int = 0, n_lights: int = 5) -> dict[str, np.ndarray]:
+    """An object as published; returns the images (F, H, W, 3) of each kind."""
+    folder.mkdir(parents=True)
+    np.savetxt(folder / "light.txt", LIGHTS[:n_lights], fmt="%.6f")
+    encoded = np.rint((normals() + 1) / 2 * 65535).astype(np.uint16)
+    tifffile.imwrite(folder / "gt_normal.tif", encoded, photometric="rgb")
+    for name, boundary in zip(("inboundary.png", "onboundary.png"), boundaries(), strict=True):
+        cv2.imwrite(str(folder / name), boundary)
+    rng = np.random.default_rng(seed)
+    written = {}
+    for kind in kinds:
+        (folder / f"images_{kind}").mkdir()
+        written[kind] = rng.integers(0, 65536, (n_lights, HEIGHT, WIDTH, 3), np.uint16)
+        for index, image in enumerate(written[kind]):
+            tifffile.imwrite(folder / f"images_{kind}/{index:05}.tif", image, photometric="rgb")
+    return written
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """The root of a tree with two objects, in all three kinds."""
+    root = tmp_path / "CyclesPS"
+    for seed, name in enumerate(("Bunny10", "Bunny9")):
+        write_object(root / "PRPS" / name, "specular", "metallic", seed=seed)
+        write_object(root / "PRPS_Diffuse" / name, "diffuse", seed=10 + seed)
+    return root
+
+
+def message(call: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as caught:
+        call()
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["specular", "metallic"])
+def test_every_value_is_what_was_written(tmp_path: Path, kind: str) -> None:
+    written = write_object(tmp_path / "Bunny", "specular", "metallic")[kind]
+    capture = read_capture(tmp_path / f"Bunny/images_{kind}")
+    assert capture.name == f"Bunny_{kind}"
+    inner, rim = boundaries()
+    mask = (inner > 0) | (rim > 0)
+    assert capture.n_pixels == 35
+    np.testing.assert_array_equal(capture.mask, mask)
+    expected = written.astype(np.float64).mean(axis=-1)[:, mask].T / 65535
+    # float32 keeps 24 bits, and three channels are added.
+    np.testing.assert_allclose(capture.observations, expected, rtol=3e-7, atol=0)
+    unit = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+    np.testing.assert_allclose(capture.light_directions, unit, rtol=1e-12)
+    # Rounded to 16 bits: half a step of 2 / 65535 on each axis.
+    assert capture.ground_truth is not None
+    np.testing.assert_allclose(capture.ground_truth[mask], normals()[mask], atol=2.5e-5)
+    assert not capture.ground_truth[~mask].any()
+
+
+def test_an_object_with_one_kind_is_that_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_object(tmp_path / "Bunny", "diffuse")
+    by_object, by_folder = read_capture(tmp_path / "Bunny"), read_capture(tmp_path / "Bunny/images_diffuse")
+    assert by_object.name == by_folder.name == "Bunny_diffuse"
+    np.testing.assert_array_equal(by_object.observations, by_folder.observations)
+    monkeypatch.chdir(tmp_path / "Bunny/images_diffuse")
+    for way in (".", "..", "../images_diffuse", "../../Bunny", str(tmp_path / "Bunny/")):
+        assert capture_name(way) == open_capture(way).files.name == "Bunny_diffuse"
+
+
+def test_an_object_with_two_kinds(tmp_path: Path) -> None:
+    folder = tmp_path / "Bunny"
+    write_object(folder, "specular", "metallic")
+    assert message(lambda: open_capture(folder)) == (
+        f"{folder}: found 2 folders of images (images_metallic, images_specular), expected one."
+        f" Give one of them, such as {folder / 'images_metallic'}."
+    )
+    assert capture_name(folder) == "Bunny"
+
+
+def test_an_object_without_images(tmp_path: Path) -> None:
+    write_object(tmp_path / "Bunny")
+    assert message(lambda: open_capture(tmp_path / "Bunny")) == (
+        f"{tmp_path / 'Bunny'}: found no folder of images,"
+        " expected images_specular, images_metallic or images_diffuse."
+    )
+
+
+def test_find_captures(tree: Path) -> None:
+    objects = [tree / "PRPS/Bunny9", tree / "PRPS/Bunny10"]
+    of_prps = [folder / f"images_{kind}" for folder in objects for kind in ("metallic", "specular")]
+    of_diffuse = [tree / f"PRPS_Diffuse/{name}/images_diffuse" for name in ("Bunny9", "Bunny10")]
+    assert find_captures(tree / "PRPS/Bunny9/images_specular") == [tree / "PRPS/Bunny9/images_specular"]
+    assert find_captures(tree / "PRPS/Bunny9") == of_prps[:2]
+    assert find_captures(tree / "PRPS") == of_prps
+    assert find_captures(tree / "PRPS_Diffuse") == of_diffuse
+    assert find_captures(tree) == of_prps + of_diffuse
+    assert f"There are captures in {tree}: give that folder." in message(lambda: find_captures(tree.parent))
+    names = [capture_name(folder) for folder in find_captures(tree)]
+    assert names[1:5] == ["Bunny9_specular", "Bunny10_metallic", "Bunny10_specular", "Bunny9_diffuse"]
+
+
+def test_evaluation_calls_the_captures_by_their_names(tree: Path) -> None:
+    result = evaluate(find_captures(tree / "PRPS"), [make_estimator("ls")], Protocol(4, trials=1))
+    assert [result.capture for result in result.results] == [
+        "Bunny9_metallic",
+        "Bunny9_specular",
+        "Bunny10_metallic",
+        "Bunny10_specular",
+    ]
+
+
+def test_a_missing_image(tmp_path: Path) -> None:
+    folder = tmp_path / "Bunny/images_specular"
+    write_object(tmp_path / "Bunny", "specular")
+    (folder / "00003.tif").unlink()
+    assert message(lambda: open_capture(folder)) == (
+        f"{folder / '00003.tif'}: the image does not exist,"
+        " expected 5 (00000.tif to 00004.tif), one for each light in light.txt."
+    )
+
+
+def test_more_images_than_lights(tmp_path: Path) -> None:
+    folder = tmp_path / "Bunny/images_specular"
+    write_object(tmp_path / "Bunny", "specular")
+    np.savetxt(tmp_path / "Bunny/light.txt", LIGHTS[:4])
+    assert message(lambda: open_capture(folder)) == (
+        f"{folder}: found 5 images, expected 4 (00000.tif to 00003.tif), one for each light in light.txt."
+    )
+
+
+def test_other_files_beside_the_images_do_not_matter(tmp_path: Path) -> None:
+    write_object(tmp_path / "Bunny", "specular")
+    for name in ("preview.tif", "._00000.tif", "Thumbs.db"):
+        (tmp_path / "Bunny/images_specular" / name).touch()
+    assert read_capture(tmp_path / "Bunny").n_lights == 5
+
+
+def test_missing_files_of_the_object(tmp_path: Path) -> None:
+    folder = tmp_path / "Bunny"
+    write_object(folder, "specular")
+    (folder / "gt_normal.tif").unlink()
+    assert read_capture(folder).ground_truth is None
+    lights = (folder / "light.txt").rename(tmp_path / "l.txt")
+    assert message(lambda: open_capture(folder / "images_specular")) == (
+        f"{folder}: found no light.txt, expected the light directions of images_specular."
+        " Pass --lights FILE, with one line x y z for each image."
+    )
+    assert read_capture(folder, lights=lights).n_lights == 5
+    lights.rename(folder / "light.txt")
+    (folder / "onboundary.png").unlink()
+    assert message(lambda: open_capture(folder)) == (
+        f"{folder}: found no onboundary.png, expected the masks whose union is the object. Pass --mask FILE."
+    )
+    mask = tmp_path / "mask.png"
+    cv2.imwrite(str(mask), boundaries()[1])
+    assert read_capture(folder, mask=mask).n_pixels == 7  # above half of the largest, as in other layouts
+
+
+def test_masks_that_do_not_fit(tmp_path: Path) -> None:
+    folder = tmp_path / "Bunny"
+    write_object(folder, "specular")
+    cv2.imwrite(str(folder / "onboundary.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    assert read_capture(folder).n_pixels == 21
+    cv2.imwrite(str(folder / "inboundary.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert message(lambda: read_capture(folder)) == (
+        f"{folder}: the mask is empty: every pixel of inboundary.png and onboundary.png is zero."
+    )
+    cv2.imwrite(str(folder / "onboundary.png"), np.ones((WIDTH, HEIGHT), np.uint8))
+    assert message(lambda: read_capture(folder)) == (
+        f"{folder / 'onboundary.png'}: found a mask of 7 x 11 pixels, expected 11 x 7 as in 00000.tif."
+    )
+
+
+def test_images_and_normals_of_another_size(tmp_path: Path) -> None:
+    folder = tmp_path / "Bunny"
+    write_object(folder, "specular")
+    tifffile.imwrite(folder / "gt_normal.tif", np.ones((WIDTH, HEIGHT, 3), np.uint16), photometric="rgb")
+    assert "found ground truth of 11 x 7 x 3, expected 7 x 11 x 3" in message(lambda: read_capture(folder))
+    (folder / "gt_normal.tif").unlink()
+    odd = folder / "images_specular/00002.tif"
+    tifffile.imwrite(odd, np.ones((WIDTH, HEIGHT, 3), np.uint16), photometric="rgb")
+    assert message(lambda: read_capture(folder)).startswith(f"{odd}: found an image of 7 x 11 pixels")
+
+
+def test_a_light_below_the_horizon(tmp_path: Path) -> None:
+    write_object(tmp_path / "Bunny", "specular")
+    (tmp_path / "Bunny/light.txt").write_text("0 0 1\n1 0 1\n0 1 1\n1 1 0\n1 1 1\n")
+    text = message(lambda: open_capture(tmp_path / "Bunny"))
+    assert text.startswith(f"{tmp_path / 'Bunny/light.txt'}:4: found a light below the horizon")
+
+
+def test_images_as_blender_packs_them(tmp_path: Path) -> None:
+    """Deflated with differences of neighbours, and with alpha."""
+    written = write_object(tmp_path / "Bunny", "specular")["specular"]
+    expected = read_capture(tmp_path / "Bunny").observations
+    for index, image in enumerate(written):
+        opaque = np.full((HEIGHT, WIDTH, 1), 65535, np.uint16)
+        tifffile.imwrite(
+            tmp_path / f"Bunny/images_specular/{index:05}.tif",
+            np.concatenate((image, opaque), axis=2),
+            photometric="rgb",
+            extrasamples=["unassalpha"],
+            compression="zlib",
+            predictor=True,
+        )
+    np.testing.assert_array_equal(read_capture(tmp_path / "Bunny").observations, expected)
+
+
+def test_what_is_no_object_of_cyclesps(tmp_path: Path) -> None:
+    # Photographs beside light.txt and a folder images_raw: --lights light.txt makes a plain folder of it.
+    plain = tmp_path / "vase"
+    write_object(plain)
+    for name in ("inboundary.png", "onboundary.png", "gt_normal.tif"):
+        (plain / name).unlink()
+    for index in range(5):
+        cv2.imwrite(str(plain / f"{index}.png"), np.ones((2, 3), np.uint16))
+    (plain / "images_raw").mkdir()
+    assert open_capture(plain, lights=plain / "light.txt").files.name == "vase"
+    # A light file of its own makes a folder of images plain.
+    write_object(tmp_path / "Bunny", "specular")
+    (tmp_path / "Bunny/light.txt").rename(tmp_path / "Bunny/images_specular/lights.txt")
+    own = open_capture(tmp_path / "Bunny/images_specular").files
+    assert (own.name, own.mask, own.boundaries) == ("images_specular", None, ())
+    assert find_captures(tmp_path / "Bunny/images_specular") == [tmp_path / "Bunny/images_specular"]

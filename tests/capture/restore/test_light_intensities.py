@@ -1,0 +1,131 @@
+"""Strengths of lights, from what they lit: against scenes and captures whose strengths are known."""
+
+from __future__ import annotations
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.capture.restore.light_intensities import find_light_strengths
+from splinecli.capture.reader import open_capture
+from splinecli.capture.lights.draws import draw_lights
+from splinecli.normals import unit
+
+STRENGTHS = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
+
+
+def lights(count: int) -> np.ndarray:
+    azimuth = np.arange(count) * 2.4
+    radius = 0.3 + 0.5 * np.arange(count) / count
+    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1)
+
+
+def sphere(directions: np.ndarray, *, shine: float = 0.0) -> np.ndarray:
+    """Observations (P, F) of a sphere with attached shadows, random albedo, noise, and highlights if any."""
+    rng = np.random.default_rng(5)
+    axis = np.linspace(-0.95, 0.95, 50)
+    x, y = (values.ravel() for values in np.meshgrid(axis, axis))
+    inside = x**2 + y**2 < 0.9
+    x, y = x[inside], y[inside]
+    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    shading = np.maximum(normals @ directions.T, 0) * rng.uniform(0.2, 1, (len(normals), 1))
+    half = unit(directions + np.array((0.0, 0.0, 1.0)))
+    shading += shine * np.maximum(normals @ half.T, 0) ** 40
+    return shading * rng.normal(1, 0.01, shading.shape).clip(0.9, 1.1)
+
+
+@pytest.mark.parametrize(("n_lights", "shine"), [(6, 0.0), (8, 0.0), (8, 0.5)])
+def test_unequal_lights_are_told(n_lights, shine):
+    directions, strengths = lights(n_lights), STRENGTHS[:n_lights]
+    observations = (sphere(directions, shine=shine) * strengths).astype(np.float32)
+    found = find_light_strengths(observations, None, directions)
+    assert found is not None
+    assert found.mean() == pytest.approx(1)
+    np.testing.assert_allclose(found, strengths / strengths.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("shine", [0.0, 0.5, 3.0])
+def test_equal_lights_are_left_alone(shine):
+    directions = lights(8)
+    assert find_light_strengths(sphere(directions, shine=shine).astype(np.float32), None, directions) is None
+
+
+def test_where_nothing_tells():
+    directions = lights(4)
+    assert (
+        find_light_strengths((sphere(directions) * STRENGTHS[:4]).astype(np.float32), None, directions)
+        is None
+    )
+    few = (sphere(lights(8)) * STRENGTHS)[:40].astype(np.float32)
+    assert find_light_strengths(few, None, lights(8)) is None
+    assert find_light_strengths(np.zeros((500, 8), np.float32), None, lights(8)) is None
+    never = (sphere(lights(8)) * STRENGTHS * (np.arange(8) != 3)).astype(
+        np.float32
+    )  # a lamp that did not flash
+    assert find_light_strengths(never, None, lights(8)) is None
+
+
+def test_saturated_observations_do_not_count():
+    directions = lights(8)
+    truth = sphere(directions) * STRENGTHS
+    stored = np.minimum(truth, 0.6).astype(np.float32)
+    found = find_light_strengths(stored, truth >= 0.6, directions)
+    assert found is not None
+    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=0.05)
+
+
+def test_a_capture_without_a_file_of_intensities(tmp_path):
+    directions = lights(8)
+    axis = np.linspace(-0.6, 0.6, 40)
+    x, y = np.meshgrid(axis, -axis)
+    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    for index in range(8):
+        picture = np.maximum(normals @ directions[index], 0) * STRENGTHS[index] * 30_000
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16))
+    np.savetxt(tmp_path / "lights.txt", directions)
+    source = open_capture(tmp_path)
+    plain, mended = source.read(), source.read(mend=True)
+    assert plain.light_strengths is None
+    assert mended.light_strengths is not None
+    low, high = STRENGTHS.min() / STRENGTHS.mean(), STRENGTHS.max() / STRENGTHS.mean()
+    (said,) = (warning for warning in mended.warnings if "unequally" in warning)
+    told = [float(number) for number in re.findall(r"\d\.\d\d", said)]
+    assert told == pytest.approx([low, high], abs=0.02)
+    np.testing.assert_allclose(mended.light_strengths, STRENGTHS / STRENGTHS.mean(), rtol=0.02)
+    np.testing.assert_allclose(mended.observations, plain.observations / mended.light_strengths, rtol=1e-5)
+    some = mended.choose_lights([6, 0, 2])
+    np.testing.assert_array_equal(some.light_strengths, mended.light_strengths[[6, 0, 2]])
+    # Who knows better is believed.
+    np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
+    assert open_capture(tmp_path).read(mend=True).light_strengths is None
+    (tmp_path / "light_intensities.txt").unlink()
+    assert open_capture(tmp_path, intensities="equal").read(mend=True).light_strengths is None
+
+
+@pytest.mark.parametrize("name", ["ballPNG", "catPNG"])
+def test_real_objects_whose_lights_were_measured(shared_data, name):
+    """Ten of DiLiGenT's lights, of which the strongest is four to six times the weakest."""
+    source = open_capture(shared_data / "DiLiGenT/pmsData" / name)
+    capture = source.read()
+    measured = source.light_intensities.mean(axis=1)
+    for chosen in draw_lights(capture.light_directions, 10, trials=3, seed=0):
+        order, directions = list(chosen), capture.light_directions[list(chosen)]
+        found = find_light_strengths(
+            (capture.observations[:, order] * measured[order]).astype(np.float32), None, directions
+        )
+        assert found is not None
+        ratio = np.log(found / measured[order])
+        # Taken for equal, they would be off by 0.4 to 0.5.
+        assert np.std(ratio) < 0.06
+
+
+@pytest.mark.parametrize("place", ["uw/gray", "uw/horse", "synth/L17/sphere_M", "synth/L17/bowl_S"])
+@pytest.mark.parametrize("n_lights", [6, 10])
+def test_real_objects_under_equal_lights(shared_data, place, n_lights):
+    capture = open_capture(shared_data / place).read()
+    for chosen in draw_lights(capture.light_directions, n_lights, trials=3, seed=0):
+        order = list(chosen)
+        observations, directions = capture.observations[:, order], capture.light_directions[order]
+        assert find_light_strengths(observations, None, directions) is None

@@ -1,0 +1,97 @@
+"""Overexposed Lambertian pixels come back as bright as they were."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.capture.reader import open_capture
+from splinecli.capture.restore.saturation import find_saturated, restore_saturated
+
+LIGHTS = np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float)
+LIGHTS /= np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+
+
+def matte(pixels: int) -> np.ndarray:
+    """Observations (pixels, 9) of matte surfaces that look to the camera, of every albedo."""
+    rng = np.random.default_rng(3)
+    normals = rng.normal(size=(pixels, 3)) * (0.3, 0.3, 0.1) + (0, 0, 1)
+    normals *= rng.uniform(0.3, 1, (pixels, 1)) / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.maximum(normals @ LIGHTS.T, 0)
+
+
+def test_matte_pixels_come_back():
+    truth = matte(500)
+    saturated = truth >= 0.6
+    stored = np.minimum(truth, 0.6).astype(np.float32)
+    restored = stored.copy()
+    restore_saturated(restored, saturated, LIGHTS)
+    np.testing.assert_array_equal(restored[~saturated], stored[~saturated])
+    assert (restored >= stored).all()
+    known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
+    assert known.sum() > 50
+    # Stored, they are off by up to 0.4; a pixel's four others tell three unknowns.
+    np.testing.assert_allclose(restored[known], truth[known], atol=0.015)
+    assert np.abs(stored - truth)[known].max() > 0.2
+
+
+def test_fewer_than_three_others_still_bound_them():
+    truth = matte(500)
+    saturated = truth >= 0.25
+    few = ((~saturated).sum(axis=1) > 0) & ((~saturated).sum(axis=1) < 3)
+    stored = np.minimum(truth, 0.25).astype(np.float32)
+    restored = stored.copy()
+    restore_saturated(restored, saturated, LIGHTS)
+    assert few.sum() > 20
+    assert np.isfinite(restored).all()
+    assert np.abs(restored - truth)[few].mean() < 0.9 * np.abs(stored - truth)[few].mean()
+
+
+def test_a_highlight_is_no_reason_to_change_the_rest():
+    truth = matte(100)
+    stored = truth.astype(np.float32)
+    stored[:, 4] = 1.5  # brighter than any matte surface
+    saturated = np.zeros(truth.shape, bool)
+    saturated[:, 4] = True
+    restored = stored.copy()
+    restore_saturated(restored, saturated, LIGHTS)
+    np.testing.assert_allclose(restored, stored, rtol=1e-6)
+
+
+def test_what_is_saturated_throughout_or_nowhere_stays():
+    stored = np.vstack([np.ones((1, 9)), matte(1), np.zeros((1, 9))]).astype(np.float32)
+    saturated = np.zeros(stored.shape, bool)
+    saturated[0] = True
+    restored = stored.copy()
+    restore_saturated(restored, saturated, LIGHTS)
+    np.testing.assert_array_equal(restored, stored)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        (np.array([[255, 3, 3], [254, 254, 254]], np.uint8), [True, False]),
+        (np.array([[65_535], [255]], np.uint16), [True, False]),
+        (np.array([[1.0], [1e9]], np.float32), [False, False]),
+    ],
+)
+def test_full_scale_is_saturated(pixels, expected):
+    assert find_saturated(pixels).tolist() == expected
+
+
+def test_a_capture_is_restored_where_that_is_asked_for(tmp_path):
+    side, truth = 10, matte(100)
+    for index in range(9):
+        picture = np.minimum(truth[:, index] / 0.6, 1) * 65_535
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16).reshape(side, side))
+    np.savetxt(tmp_path / "lights.txt", LIGHTS)
+    source = open_capture(tmp_path)
+    stored, restored = (source.read(mend=mend).observations for mend in (False, True))
+    assert stored.max() == 1
+    known = ((truth < 0.6).sum(axis=1) >= 4) & (truth >= 0.6).any(axis=1)
+    np.testing.assert_allclose(restored[known], truth[known] / 0.6, atol=0.025)
+    # Under some of the lights, those alone tell.
+    some = source.read([0, 2, 4, 6, 8], mend=True).observations
+    assert some.shape == (100, 5)
+    assert (some >= stored[:, ::2]).all()

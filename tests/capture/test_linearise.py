@@ -1,0 +1,160 @@
+"""Photographs stored in other ways than linear: all come back to the light that was there."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.results.albedo import albedo_map
+from splinecli.capture import Development, open_capture, read_capture
+from splinecli.capture.linearise import is_display_encoded
+from splinecli.errors import InputError
+
+LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
+WriteImage = Callable[..., Path]
+
+
+@pytest.fixture
+def light() -> NDArray[np.float64]:
+    """What reached the camera: four images (4, 9, 11, 3)."""
+    return np.random.default_rng(0).uniform(0.05, 0.6, (4, 9, 11, 3))
+
+
+def store(folder: Path, images: NDArray[Any]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, image in enumerate(images):
+        write(folder / f"{number}.png", image)
+    (folder / "lights.txt").write_text(LIGHTS)
+    return folder
+
+
+def write(path: Path, image: NDArray[Any]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.rint(image * 65535).astype(np.uint16)[..., ::-1])
+    return path
+
+
+def srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The published curve, IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def observed(folder: Path, **settings: Any) -> NDArray[np.float32]:
+    return open_capture(folder, development=Development(**settings)).read().observations
+
+
+def expected(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    return light.mean(axis=3).reshape(4, -1).T
+
+
+def test_transfer_curves_are_undone(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    for name, stored, gamma in (
+        ("linear", light, 1.0),
+        ("srgb", srgb(light), None),
+        ("gamma", light ** (1 / 2.2), 2.2),
+    ):
+        folder = store(tmp_path / name, stored)
+        np.testing.assert_allclose(observed(folder, gamma=gamma), expected(light), atol=3e-5)
+    assert np.abs(observed(tmp_path / "srgb") - expected(light)).max() > 0.1
+
+
+@pytest.mark.parametrize("found", [True, False], ids=["found", "named"])
+@pytest.mark.parametrize("gamma", [1.0, None])
+def test_ambient_light_is_taken_off(
+    tmp_path: Path, light: NDArray[np.float64], gamma: float | None, found: bool
+) -> None:
+    ambient = np.random.default_rng(1).uniform(0, 0.3, light.shape[1:])
+    encode = srgb if gamma is None else np.asarray
+    folder = store(tmp_path / "capture", encode(light + ambient))
+    path = write((folder if found else tmp_path) / "Ambient.png", encode(ambient))
+    settings = {} if found else {"ambient": path}
+    capture = open_capture(folder, development=Development(gamma, **settings)).read()
+    np.testing.assert_allclose(capture.observations, expected(light), atol=6e-5)
+    assert ("The light of Ambient.png was taken off all images." in capture.warnings) == found
+
+
+def test_what_is_darker_than_the_ambient_light_is_black(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    folder = store(tmp_path / "capture", light)
+    write(folder / "ambient.png", np.full(light.shape[1:], 0.3))
+    np.testing.assert_allclose(observed(folder), expected((light - 0.3).clip(0)), atol=3e-5)
+
+
+@pytest.mark.parametrize("one", [True, False], ids=["one for all", "one each"])
+def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one: bool) -> None:
+    falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
+    falloff = np.broadcast_to(falloff[:1], light.shape) if one else falloff
+    folder = store(tmp_path / "capture", light * falloff)
+    flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(1 if one else 4))
+    mean = falloff.mean(axis=(1, 2, 3), keepdims=True)
+    np.testing.assert_allclose(observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4)
+
+
+def test_flat_fields_follow_their_images_in_an_lp_file(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
+    folder = store(tmp_path / "capture", light * falloff)
+    flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(4))
+    before = observed(folder, flat_field=flats)
+    (folder / "lights.txt").unlink()
+    rows = [f"{n}.png {row}" for n, row in enumerate(LIGHTS.splitlines())]
+    (folder / "a.lp").write_text("\n".join(["4", *rows[::-1]]))
+    np.testing.assert_array_equal(observed(folder, flat_field=flats), before[:, ::-1])
+
+
+def test_the_albedo_sees_the_same_light(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    ambient = np.full(light.shape[1:], 0.1)
+    up = np.broadcast_to(np.array((0, 0, 1), np.float32), light.shape[1:])
+    normals = np.array(LIGHTS.split(), float).reshape(4, 3)
+    cosine = 1 / np.linalg.norm(normals, axis=1)
+    matte = 0.5 * light[:1] * cosine[:, None, None, None]
+    folder = store(tmp_path / "capture", matte + ambient)
+    write(folder / "ambient.png", ambient)
+    source = open_capture(folder)
+    np.testing.assert_allclose(albedo_map(source, source.read(), up), 0.5 * light[0], atol=1e-4)
+
+
+def test_files_that_do_not_fit(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    folder = store(tmp_path / "capture", light)
+    small, black = write(tmp_path / "small.png", light[0, :5]), write(tmp_path / "black.png", 0 * light[0])
+    with pytest.raises(InputError, match=r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"):
+        observed(folder, ambient=small)
+    with pytest.raises(InputError, match=r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"):
+        observed(folder, flat_field=(small,))
+    with pytest.raises(InputError, match="found 2 flat-field images, expected 1 or 4"):
+        observed(folder, flat_field=(small, small))
+    with pytest.raises(InputError, match=r"black\.png: the flat-field image is black"):
+        observed(folder, flat_field=(black,))
+
+
+def with_chunk(png: bytes, name: bytes, body: bytes) -> bytes:
+    """A PNG with one more chunk after its header."""
+    chunk = len(body).to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
+    return png[:33] + chunk + png[33:]
+
+
+def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np.float64]) -> None:
+    plain = write(tmp_path / "plain.png", light[0])
+    png = plain.read_bytes()
+    for name, content, encoded in (
+        ("plain", png, False),
+        ("srgb", with_chunk(png, b"sRGB", b"\0"), True),
+        ("gamma", with_chunk(png, b"gAMA", (45_455).to_bytes(4, "big")), True),
+        ("linear", with_chunk(png, b"gAMA", (100_000).to_bytes(4, "big")), False),
+        ("jpeg", cv2.imencode(".jpg", np.zeros((9, 11, 3), np.uint8))[1].tobytes(), True),
+        ("tiff", b"II*\0", False),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        assert is_display_encoded(path) == encoded, name
+    folder = store(tmp_path / "capture", light)
+    assert not any("display-encoded" in warning for warning in read_capture(folder).warnings)
+    (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))
+    assert any("display-encoded" in warning for warning in read_capture(folder).warnings)
+    told = open_capture(folder, development=Development(None)).warnings
+    assert not any("display-encoded" in warning for warning in told)

@@ -1,0 +1,421 @@
+"""Whole evaluations: against analytic captures, hand-computed errors, and the published errors of DiLiGenT."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import read_capture
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.capture.lights.draws import draw_lights
+from splinecli.evaluation.run import Protocol, TrialStore, evaluate, evaluate_all
+from splinecli.methods import make_estimator
+
+WriteDome = Callable[..., Path]
+N_PIXELS = 100
+
+
+class Fake:
+    """Gives the folder's truth, turned by the next of the angles; remembers what it saw."""
+
+    weights, device, precision, fingerprint = None, "cpu", "float64", "fake"
+
+    def __init__(self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake") -> None:
+        self.name = name
+        self.lights: list[NDArray[np.float64]] = []
+        self.observations: list[NDArray[np.float32]] = []
+        capture = read_capture(folder)
+        assert capture.ground_truth is not None
+        truth = capture.ground_truth[capture.mask]
+        self._truth = truth[truth.any(axis=1)].astype(np.float64)
+        self._angles = np.radians(angles_deg)
+
+    def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+        angle = self._angles[len(self.lights) % len(self._angles)]
+        self.lights.append(lights)
+        self.observations.append(observations)
+        # Perpendicular to each normal, so that turning towards it turns by the whole angle.
+        across = np.cross(self._truth, [0, 1, 0])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        normals: NDArray[np.float64] = np.cos(angle) * self._truth + np.sin(angle) * across
+        return normals
+
+
+class Constant(Fake):
+    """Gives one vector for every pixel, whatever it sees."""
+
+    def __init__(self, vector: Sequence[float]) -> None:
+        self.name, self._vector, self.lights = "constant", vector, []
+
+    def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+        self.lights.append(lights)
+        return np.tile(self._vector, (len(observations), 1))
+
+
+def test_the_truth_scores_zero(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    (result,) = evaluate([folder], [Fake(folder)], Protocol(n_lights=5, trials=4)).results
+    assert (result.method, result.capture, result.n_lights, result.trials) == ("fake", "dome", 5, 4)
+    assert result.mae_deg == pytest.approx(0, abs=1e-5)  # normals are kept in float32
+    assert result.std_deg == pytest.approx(0, abs=1e-5)
+    assert result.seconds > 0
+
+
+def test_mean_and_deviation_over_trials(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    fake = Fake(folder, angles_deg=(1, 3, 5))
+    (result,) = evaluate([folder], [fake], Protocol(n_lights=5, trials=3)).results
+    assert result.maes_deg == pytest.approx((1, 3, 5), abs=1e-4)
+    assert result.mae_deg == pytest.approx(3, abs=1e-4)
+    assert result.std_deg == pytest.approx(np.sqrt((4 + 0 + 4) / 3), abs=1e-4)
+
+
+def test_averages_are_means_over_captures(write_dome: WriteDome) -> None:
+    folders = [write_dome("a"), write_dome("b")]
+    estimators = [Fake(folders[0], (1, 2), "one"), Fake(folders[0], (10, 20), "ten")]
+    evaluation = evaluate(folders, estimators, Protocol())
+    assert evaluation.averages == {
+        "one": pytest.approx(1.5, abs=1e-4),
+        "ten": pytest.approx(15, abs=1e-4),
+    }
+    assert [(r.capture, r.method) for r in evaluation.results] == [
+        ("a", "one"),
+        ("a", "ten"),
+        ("b", "one"),
+        ("b", "ten"),
+    ]
+
+
+@pytest.mark.parametrize("n_lights", [3, 5, None])
+def test_least_squares_is_exact_on_a_dome(write_dome: WriteDome, n_lights: int | None) -> None:
+    protocol = Protocol(n_lights=n_lights, trials=5, seed=1)
+    (result,) = evaluate([write_dome()], [make_estimator("ls")], protocol).results
+    # Half a step of 16 bits against values near 0.5 is 1e-3 degrees; few lights close together enlarge it.
+    assert result.mae_deg < 0.02
+    assert result.trials == (1 if n_lights is None else 5)
+
+
+def test_all_methods_and_captures_see_the_same_draws(write_dome: WriteDome) -> None:
+    folders = [write_dome("a"), write_dome("b")]
+    first, second = Fake(folders[0], name="first"), Fake(folders[0], name="second")
+    protocol = Protocol(n_lights=4, trials=3, seed=5, light_noise_deg=3)
+    evaluate(folders, [first, second], protocol)
+    np.testing.assert_array_equal(first.lights, second.lights)
+    np.testing.assert_array_equal(first.lights[:3], first.lights[3:])
+    backwards = Fake(folders[0])
+    evaluate(folders[::-1], [backwards], protocol)
+    np.testing.assert_array_equal(first.lights, backwards.lights)
+
+
+def test_a_trial_sees_the_lights_of_its_draw(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    fake, whole = Fake(folder), read_capture(folder)
+    evaluate([folder], [fake], Protocol(n_lights=3, trials=2, seed=0))
+    draws = draw_lights(whole.light_directions, 3, trials=2, seed=0)
+    for draw, lights, observations in zip(draws, fake.lights, fake.observations, strict=True):
+        np.testing.assert_array_equal(lights, whole.light_directions[list(draw)])
+        np.testing.assert_array_equal(observations, whole.observations[:, list(draw)])
+
+
+def test_a_draws_file_goes_before_random_draws(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder = write_dome()
+    (tmp_path / "draws.txt").write_text("5 0 1\n2 3 7\n")
+    fake, whole = Fake(folder), read_capture(folder)
+    evaluation = evaluate([folder], [fake], Protocol(trials=99, draws_file=tmp_path / "draws.txt"))
+    assert (evaluation.protocol.n_lights, evaluation.protocol.trials) == (3, 2)
+    assert (evaluation.results[0].n_lights, evaluation.results[0].trials) == (3, 2)
+    np.testing.assert_array_equal(fake.observations[0], whole.observations[:, [5, 0, 1]])
+    np.testing.assert_array_equal(fake.lights[1], whole.light_directions[[2, 3, 7]])
+    with pytest.raises(UsageError, match=r"10 lights a draw wanted, the draws in .*draws\.txt have 3"):
+        evaluate([folder], [fake], Protocol(n_lights=10, draws_file=tmp_path / "draws.txt"))
+
+
+def test_a_draws_file_that_does_not_fit_a_capture(write_dome: WriteDome, tmp_path: Path) -> None:
+    (tmp_path / "draws.txt").write_text("0 1 2\n0 1 9\n")
+    folders = [write_dome("eight"), write_dome("ten", n_lights=10)]
+    protocol = Protocol(draws_file=tmp_path / "draws.txt")
+    evaluation = evaluate(folders, [make_estimator("ls")], protocol)
+    assert evaluation.captures == ("ten",)
+    assert [(s.capture, s.reason) for s in evaluation.skipped] == [
+        (
+            "eight",
+            f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights.",
+        )
+    ]
+
+
+def test_only_pixels_with_ground_truth_are_estimated(write_dome: WriteDome) -> None:
+    folder = write_dome(without_truth=4)
+    fake = Fake(folder)
+    (result,) = evaluate([folder], [fake], Protocol()).results
+    assert [len(seen) for seen in fake.observations] == [N_PIXELS - 4]
+    assert result.mae_deg == pytest.approx(0, abs=1e-5)
+
+
+def test_a_part_of_the_pixels(write_dome: WriteDome) -> None:
+    class Spy(Constant):
+        def estimate(self, observations: NDArray[Any], lights: NDArray[Any]) -> NDArray[np.float64]:
+            seen.append(observations[:, 0])
+            return super().estimate(observations, lights)
+
+    seen: list[NDArray[Any]] = []
+    folder = write_dome()
+    evaluate([folder], [Spy((0, 0, 1))], Protocol(max_pixels=20))
+    evaluate([folder], [Spy((0, 0, 1))], Protocol(max_pixels=20))
+    assert len(seen[0]) == 20
+    np.testing.assert_array_equal(seen[0], seen[1])
+
+
+def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) -> None:
+    folder = write_dome()
+    errors = [
+        evaluate([folder], [make_estimator("ls")], Protocol(trials=20, light_noise_deg=sigma)).results[0]
+        for sigma in (0, 1, 4)
+    ]
+    assert [result.trials for result in errors] == [1, 20, 20]  # all lights, other noise in each trial
+    assert len(set(errors[1].maes_deg)) == 20
+    assert errors[0].mae_deg < 0.02 < 0.2 < errors[1].mae_deg
+    # The trials' noise is the same but for its size, and small errors grow in proportion.
+    assert errors[2].mae_deg == pytest.approx(4 * errors[1].mae_deg, rel=0.1)
+
+
+def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_path: Path) -> None:
+    good, untrue, few = (
+        write_dome("good"),
+        write_dome("untrue", ground_truth=False),
+        write_dome("few", n_lights=4),
+    )
+    broken = write_dome("broken")
+    (broken / "003.png").write_bytes(b"no image")
+    folders = [untrue, good, broken, few, tmp_path / "missing"]
+    evaluation = evaluate(folders, [make_estimator("ls")], Protocol(n_lights=5, trials=10))
+    assert evaluation.captures == ("good",)
+    assert [skipped.capture for skipped in evaluation.skipped] == ["untrue", "broken", "few", "missing"]
+    reasons = [skipped.reason for skipped in evaluation.skipped]
+    assert reasons[0].startswith(f"{untrue}: no ground truth, so nothing to score against.")
+    assert str(broken / "003.png") in reasons[1]
+    assert reasons[2] == "5 lights wanted, the capture has 4. Ask for at most 4 lights."
+    assert str(tmp_path / "missing") in reasons[3]
+
+
+def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> None:
+    ls = make_estimator("ls")
+    untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
+    with pytest.raises(
+        InputError, match=r"none of the 2 captures could be scored; the first: .*untrue: no gro"
+    ):
+        evaluate([untrue, few], [ls], Protocol(n_lights=5))
+    with pytest.raises(InputError, match="untrue: no ground truth"):
+        evaluate([untrue], [ls], Protocol())
+    with pytest.raises(UsageError, match="5 lights wanted, the capture has 4"):
+        evaluate([few], [ls], Protocol(n_lights=5))
+
+
+def test_names_tell_captures_apart(write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = [write_dome("few/dome", n_lights=4), write_dome("many/dome"), write_dome("many/bowl")]
+    ls = [make_estimator("ls")]
+    assert evaluate(folders, ls, Protocol()).captures == ("few/dome", "many/dome", "many/bowl")
+    monkeypatch.chdir(folders[1])
+    assert evaluate([Path(), folders[1], folders[2]], ls, Protocol()).captures == ("dome", "bowl")
+
+
+@pytest.mark.parametrize("vector", [(0, 0, 0), (0, 0, np.nan), (0, 0, 0.5)])
+def test_normals_that_are_none_are_not_scored(write_dome: WriteDome, vector: Sequence[float]) -> None:
+    with pytest.raises(SplinecliError, match="method constant gave normals that are not unit vectors"):
+        evaluate([write_dome()], [Constant(vector)], Protocol())
+
+
+def test_progress(write_dome: WriteDome) -> None:
+    folders = [write_dome("a"), write_dome("b")]
+    seen: list[tuple[int, int]] = []
+    protocols = [Protocol(n_lights=7, trials=2), Protocol()]
+    evaluate_all(
+        folders, [make_estimator("ls")], protocols, on_progress=lambda done, total: seen.append((done, total))
+    )
+    assert [total for _, total in seen] == [6] * len(seen)
+    done = [done for done, _ in seen]
+    assert done == sorted(done)
+    assert done[-1] == 6
+
+
+@pytest.mark.parametrize("jobs", [2, 5])
+def test_trials_at_a_time_change_nothing(write_dome: WriteDome, jobs: int) -> None:
+    folders = [write_dome("a"), write_dome("b", n_lights=9)]
+    estimators = [make_estimator("ls"), make_estimator("iw12")]
+    protocols = [Protocol(4, trials=5, light_noise_deg=noise) for noise in (0, 3)]
+    one_by_one = evaluate_all(folders, estimators, protocols)
+    together = evaluate_all(folders, estimators, protocols, jobs=jobs)
+    for before, after in zip(one_by_one, together, strict=True):
+        assert [(r.method, r.capture) for r in before.results] == [
+            (r.method, r.capture) for r in after.results
+        ]
+        np.testing.assert_allclose(
+            [r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5
+        )
+
+
+def test_an_error_in_one_of_several_trials_ends_the_evaluation(write_dome: WriteDome) -> None:
+    with pytest.raises(SplinecliError, match="not unit vectors"):
+        evaluate_all([write_dome()], [Constant((0, 0, 0))], [Protocol(4, trials=9)], jobs=3)
+
+
+def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder, path = write_dome(), tmp_path / "trials.jsonl"
+    first = Fake(folder, angles_deg=(1, 2))
+    evaluate_all([folder], [first], [Protocol(4, trials=2)], store=TrialStore(path))
+    lines = path.read_text().splitlines(keepends=True)
+    # Killed while it wrote the second line.
+    path.write_text(lines[0] + lines[1][: len(lines[1]) // 2])
+    again = Fake(folder, angles_deg=(5, 6, 7))
+    evaluation = evaluate_all([folder], [again], [Protocol(4, trials=4)], store=TrialStore(path))[0]
+    assert evaluation.results[0].maes_deg == pytest.approx((1, 5, 6, 7), abs=1e-4)
+    assert len(again.lights) == 3
+    # Nothing is left to do, and nothing of the first run's was lost.
+    idle = Fake(folder, angles_deg=(90,))
+    evaluation = evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path))[0]
+    assert evaluation.results[0].maes_deg == pytest.approx((1, 5, 6, 7), abs=1e-4)
+    assert idle.lights == []
+    fresh = evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path, fresh=True))[0]
+    assert fresh.results[0].mae_deg == pytest.approx(90, abs=1e-4)
+    assert len(path.read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize("change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw"])
+def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_path: Path, change: str) -> None:
+    folder, path = write_dome(), tmp_path / "trials.jsonl"
+    settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
+    evaluate_all([folder], [Constant((0, 0, 1))], [Protocol(**settings)], store=TrialStore(path))
+    fake = Constant((0, 0, 1))
+    if change == "photograph":
+        image = cv2.imread(str(folder / "003.png"), cv2.IMREAD_UNCHANGED)
+        assert cv2.imwrite(str(folder / "003.png"), image[::-1].copy())
+    elif change == "lights":
+        lights = folder / "light_directions.txt"
+        lights.write_text(lights.read_text() + "\n")
+    elif change == "method":
+        fake.fingerprint = "other weights"
+    else:
+        name = {"seed": "seed", "pixels": "max_pixels", "noise": "light_noise_deg", "draw": "n_lights"}[
+            change
+        ]
+        settings[name] = 5
+    evaluate_all([folder], [fake], [Protocol(**settings)], store=TrialStore(path))
+    assert fake.lights
+
+
+def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: WriteDome) -> None:
+    """As out of an archive whose times were normalised: names, sizes and times of all files are the same."""
+    folders = [write_dome("u/dome"), write_dome("v/dome")]
+    for folder in folders:
+        for path in folder.iterdir():
+            content = path.read_bytes()
+            if folder is folders[1] and path.suffix == ".npy":
+                half = (len(content) - 128) // 2  # after the header of 128 bytes
+                path.write_bytes(content[:128] + content[128 + half :] + content[128 : 128 + half])
+            os.utime(path, ns=(10**18, 10**18))
+    sizes = [sorted((path.name, path.stat().st_size) for path in folder.iterdir()) for folder in folders]
+    assert sizes[0] == sizes[1]
+    first, second = evaluate(folders, [make_estimator("ls")], Protocol()).results
+    assert first.mae_deg < 0.1 < second.mae_deg
+
+
+def test_noise_that_lays_lights_into_a_plane_is_drawn_again(write_dome: WriteDome) -> None:
+    # Among so many draws of three lights there were some, and one of them ended everything.
+    protocol = Protocol(3, trials=1500, light_noise_deg=30.0, max_pixels=1)
+    assert evaluate([write_dome()], [make_estimator("ls")], protocol).results[0].trials == 1500
+
+
+def test_no_capture_is_called_like_the_average(write_dome: WriteDome) -> None:
+    folders = [write_dome("x/average"), write_dome("x/other")]
+    assert evaluate(folders, [make_estimator("ls")], Protocol()).captures == ("x/average", "x/other")
+
+
+def test_first_images_are_left_out(write_dome: WriteDome) -> None:
+    folders = [write_dome("bearPNG"), write_dome("other")]
+    fake = Fake(folders[0])
+    evaluation = evaluate(folders, [fake], Protocol(skip_first={"bearPNG": 3}))
+    assert [len(lights) for lights in fake.lights] == [5, 8]
+    np.testing.assert_array_equal(fake.observations[0], read_capture(folders[0]).observations[:, 3:])
+    assert [result.n_lights for result in evaluation.results] == [5, 8]
+    assert evaluation.notes == ("bearPNG: the first 3 images are left out.",)
+    every = Fake(folders[0])
+    evaluate(folders, [every], Protocol(skip_first={"*": 4, "other": 1}))
+    assert [len(lights) for lights in every.lights] == [4, 7]
+    with pytest.raises(
+        UsageError, match="no capture named 'cow' to skip images of; there are bearPNG, other"
+    ):
+        evaluate(folders, [fake], Protocol(skip_first={"cow": 1}))
+
+
+def test_draws_keep_to_the_images_that_are_not_left_out(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder = write_dome(n_lights=9)
+    fake = Fake(folder)
+    evaluate([folder], [fake], Protocol(4, trials=20, skip_first={"*": 3}))
+    lights = read_capture(folder).light_directions
+    seen = {tuple(light) for draw in fake.lights for light in draw}
+    assert seen == {tuple(light) for light in lights[3:]}
+    (tmp_path / "draws.txt").write_text("3 4 5\n2 4 5\n")
+    with pytest.raises(InputError, match=r"draws\.txt:2: found light index 2; the first 3 images"):
+        evaluate([folder], [fake], Protocol(draws_file=tmp_path / "draws.txt", skip_first={"*": 3}))
+
+
+def test_what_is_particular_is_noted(write_dome: WriteDome, tmp_path: Path) -> None:
+    folder, path = write_dome("bearPNG", without_truth=4), tmp_path / "trials.jsonl"
+    expected = (
+        "bearPNG: the first 20 images are known to be damaged and are used; --skip-first bearPNG=20 leaves them out.",
+        "bearPNG: 4 of 100 pixels in the mask have no ground-truth normal and are not scored.",
+    )
+    for _ in range(2):  # the second time all trials are there already
+        evaluation = evaluate_all([folder], [make_estimator("ls")], [Protocol(4)], store=TrialStore(path))[0]
+        assert evaluation.notes == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_lights": 2}, "2 lights wanted, expected at least 3."),
+        ({"trials": 0}, "0 trials wanted, expected at least 1."),
+        ({"seed": -3}, "the seed is -3, expected a whole number from 0."),
+        ({"light_noise_deg": -1.0}, "light noise of -1 degrees, expected 0 to 30."),
+        ({"light_noise_deg": float("nan")}, "light noise of nan degrees, expected 0 to 30."),
+        ({"max_pixels": 0}, "at most 0 pixels to score, expected at least 1."),
+    ],
+)
+def test_a_protocol_out_of_range(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as raised:
+        Protocol(**settings)
+    assert str(raised.value) == message
+
+
+def test_what_to_score_is_needed_once(write_dome: WriteDome) -> None:
+    folder, ls = write_dome(), make_estimator("ls")
+    with pytest.raises(UsageError, match="method ls comes twice"):
+        evaluate([folder], [ls, ls], Protocol())
+    with pytest.raises(UsageError, match="nothing to score"):
+        evaluate([], [ls], Protocol())
+
+
+@pytest.mark.parametrize(("name", "mae_deg"), [("ballPNG", 4.29), ("catPNG", 8.45)])
+def test_least_squares_on_diligent(shared_data: Path, name: str, mae_deg: float) -> None:
+    folder = shared_data / "DiLiGenT/pmsData" / name
+    (result,) = evaluate([folder], [make_estimator("ls")], Protocol()).results
+    assert (result.n_lights, result.trials, result.std_deg) == (96, 1, 0)
+    assert result.mae_deg == pytest.approx(mae_deg, abs=0.02)
+
+
+def test_importing_is_light() -> None:
+    heavy = {"cv2", "scipy", "tifffile", "torch", "rich", "typer"}
+    modules = ("draws", "error_map", "protocol", "tables")
+    imports = ", ".join(f"splinecli.evaluation.{module}" for module in modules)
+    code = f"import {imports}, sys; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

@@ -1,0 +1,246 @@
+"""Pixel sets: what is written is what is read, whole or refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splinecli.errors import InputError, OutputError
+from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, PixelSetWriter, open_pixel_set
+
+RECIPE = {"scenes": {"lights": 30}, "seed": 1}
+MakeSet = Callable[..., PixelSet]
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text())
+    return manifest
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_round_trip(tmp_path: Path, matte_pixels: Callable[..., Any], dtype: type) -> None:
+    folder = tmp_path / "new" / "set"
+    writer = PixelSetWriter(folder)
+    written = {name: matte_pixels(7, 5 + seed, seed=seed, dtype=dtype) for seed, name in enumerate("ab")}
+    for name, pixels in written.items():
+        writer.add(name, f"scene {name}", "a test", RECIPE, pixels)
+        assert name in writer
+    assert writer.describe("b") == "b: 7 pixels, 6 lights, a test"
+    finished = writer.finish()
+    opened = open_pixel_set(folder)
+    assert opened == finished
+    assert [entry.scene for entry in opened.entries] == ["scene a", "scene b"]
+    assert [(entry.n_pixels, entry.n_lights) for entry in opened.entries] == [(7, 5), (7, 6)]
+    for entry in opened.entries:
+        loaded = opened.load(entry)
+        for array in ARRAYS:
+            found, expected = getattr(loaded, array), getattr(written[entry.name], array)
+            assert found.dtype == expected.dtype
+            assert isinstance(found.base, np.memmap)
+            np.testing.assert_array_equal(found, expected)
+    assert opened.load(opened.entries[0]).observations.dtype == dtype
+    manifest = read_manifest(folder)
+    assert manifest["format"] == FORMAT
+    assert [entry["recipe"] for entry in manifest["entries"]] == [RECIPE, RECIPE]
+    assert (manifest["n_pixels"], manifest["complete"]) == (14, True)
+    assert sorted(path.name for path in folder.iterdir()) == ["a", "b", MANIFEST]
+
+
+def test_an_entry_that_cannot_be_written_leaves_nothing(
+    tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = PixelSetWriter(tmp_path)
+    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    before = everything(tmp_path)
+    save, saved = np.save, []
+
+    def full(path: Path, array: np.ndarray, **kwargs: Any) -> None:
+        saved.append(path)
+        if len(saved) == 3:
+            Path(path).write_bytes(b"\x93NUMPY")
+            raise OSError(28, "No space left on device")
+        save(path, array, **kwargs)
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(OutputError, match=r"b: cannot be written \(No space left on device\)"):
+        writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
+    assert len(saved) == 3
+    assert everything(tmp_path) == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", MANIFEST]
+    assert "b" not in writer
+    assert [entry["name"] for entry in read_manifest(tmp_path)["entries"]] == ["a"]
+    # And with room again it goes on.
+    monkeypatch.setattr(np, "save", save)
+    writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
+    writer.finish()
+    assert [entry.name for entry in open_pixel_set(tmp_path).entries] == ["a", "b"]
+
+
+def test_an_entry_is_named_only_once_it_is_there(
+    tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Killed between the entry's renaming and the manifest's: the next run puts the entry there again.
+    writer = PixelSetWriter(tmp_path)
+    monkeypatch.setattr(
+        writer, "_write_manifest", lambda *, complete: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        writer.add("a", "a", "a test", RECIPE, matte_pixels(9, 4, seed=1))
+    assert read_manifest(tmp_path)["entries"] == []
+    again = PixelSetWriter(tmp_path)
+    assert "a" not in again
+    again.add("a", "a", "a test", RECIPE, matte_pixels(7, 5, seed=2))
+    finished = again.finish()
+    assert open_pixel_set(tmp_path) == finished
+    assert finished.entries[0].n_pixels == 7
+
+
+def test_going_on_keeps_what_is_there(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()}
+    again = PixelSetWriter(tmp_path)
+    assert "a" in again
+    again.add("b", "b", "a test", RECIPE, matte_pixels(3, 5))
+    assert again.finish() == open_pixel_set(tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()} == before
+    # A finished set can be added to, and is not to be trained on until that is done.
+    more = PixelSetWriter(tmp_path)
+    assert len(open_pixel_set(tmp_path).entries) == 2
+    more.add("c", "c", "a test", RECIPE, matte_pixels(3, 5))
+    with pytest.raises(InputError, match="not finished"):
+        open_pixel_set(tmp_path)
+    assert len(more.finish().entries) == 3
+
+
+def test_an_entry_made_in_another_way_is_not_taken_for_this_one(
+    tmp_path: Path, matte_pixels: Callable[..., Any]
+) -> None:
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    writer = PixelSetWriter(tmp_path)
+    assert writer.holds("a", dict(reversed(RECIPE.items())))
+    assert not writer.holds("b", RECIPE)
+    with pytest.raises(
+        OutputError, match=r"the entry a was made with seed = 1, this asks for 2\. Choose another -o\."
+    ):
+        writer.holds("a", {**RECIPE, "seed": 2})
+    with pytest.raises(OutputError, match=r"was made with scenes = .* asks for None"):
+        writer.holds("a", {"seed": 1})
+    assert open_folder_names(tmp_path) == ["a", MANIFEST]
+
+
+def open_folder_names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("\\begin")
+    with pytest.raises(OutputError, match="is not empty and holds no pixel set"):
+        PixelSetWriter(tmp_path)
+    assert everything(tmp_path) == {"thesis.tex": b"\\begin"}
+    with pytest.raises(OutputError, match="is a file"):
+        PixelSetWriter(tmp_path / "thesis.tex")
+
+
+def test_a_manifest_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / MANIFEST).write_text('{"name": "an app"}')
+    with pytest.raises(InputError, match="is no manifest of a pixel set: found format None"):
+        PixelSetWriter(tmp_path)
+    assert everything(tmp_path) == {MANIFEST: b'{"name": "an app"}'}
+
+
+def test_an_unfinished_set_is_refused(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
+    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    with pytest.raises(InputError, match=r"not finished\. Run its 'splinecli prepare' again: it goes on\."):
+        open_pixel_set(tmp_path)
+    with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
+        PixelSetWriter(tmp_path / "empty").finish()
+        open_pixel_set(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+@pytest.mark.parametrize("entry", ["a", "b"])
+def test_no_changed_byte_goes_unnoticed(make_set: MakeSet, array: str, entry: str) -> None:
+    folder = make_set().folder
+    path = folder / entry / f"{array}.npy"
+    whole = path.read_bytes()
+    for position in (8, 127, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        with pytest.raises(InputError, match="does not match the manifest") as caught:
+            open_pixel_set(folder)
+        assert caught.value.path == path
+    path.write_bytes(whole)
+    open_pixel_set(folder)
+    path.unlink()
+    with pytest.raises(InputError, match="found no such file") as caught:
+        open_pixel_set(folder)
+    assert caught.value.path == path
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        (
+            "n_pixels",
+            41,
+            r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)",
+        ),
+        ("n_lights", 29, r"observations\.npy: .* expected \(40, 29\)"),
+        ("sha256", {}, r"manifest\.json: an entry is incomplete \(a checksum is missing\)"),
+        ("sha256", {"observations": "0" * 64}, r"manifest\.json: an entry is incomplete"),
+        ("sha256", None, r"manifest\.json: an entry is incomplete"),
+        ("name", "d", r"d/observations\.npy: does not match the manifest: found no such file"),
+    ],
+)
+def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message: str) -> None:
+    folder = make_set().folder
+    manifest = read_manifest(folder)
+    manifest["entries"][0][key] = value
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=message):
+        open_pixel_set(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "is no manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'"),
+        ('{"format": "splinecli-pixel-set-2"}', "found format 'splinecli-pixel-set-2', expected"),
+        (f'{{"format": "{FORMAT}", "complete": true}}', r"an entry is incomplete \('entries'\)"),
+        (
+            f'{{"format": "{FORMAT}", "complete": true, "entries": [{{"name": "a"}}]}}',
+            "an entry is incomplete",
+        ),
+        (f'{{"format": "{FORMAT}", "complete": true, "entries": [5]}}', "an entry is incomplete"),
+    ],
+)
+def test_no_manifest(make_set: MakeSet, text: str, message: str) -> None:
+    folder = make_set().folder
+    (folder / MANIFEST).write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        open_pixel_set(folder)
+    assert caught.value.path == folder / MANIFEST
+
+
+def test_a_damaged_manifest_is_left_alone(tmp_path: Path) -> None:
+    text = json.dumps({"format": FORMAT, "recipe": RECIPE, "entries": [{"name": "a"}]})
+    (tmp_path / MANIFEST).write_text(text)
+    with pytest.raises(InputError, match="an entry is incomplete"):
+        PixelSetWriter(tmp_path)
+    assert (tmp_path / MANIFEST).read_text() == text
+
+
+def test_no_set_at_all(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no pixel set: its manifest\.json cannot be read") as caught:
+        open_pixel_set(tmp_path / "nowhere")
+    assert caught.value.path == tmp_path / "nowhere"
+    assert "splinecli prepare" in str(caught.value)

@@ -1,0 +1,117 @@
+"""The albedo of a coloured sphere with highlights and cast shadows, whose albedo is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.results.albedo import albedo_map
+from splinecli.capture import open_capture
+from splinecli.errors import InputError
+
+SIZE = 40
+STRENGTHS = np.array(
+    [(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)]
+)
+LIGHTS = np.array([(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)])
+
+
+@pytest.fixture
+def scene(tmp_path: Path):
+    """A capture's folder, true normals and true albedo; some pixels shine or lie in shadow under one light each."""
+    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+    y, x = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
+    nx, ny = x / (SIZE / 2), -y / (SIZE / 2)
+    inside = np.hypot(nx, ny) < 0.9
+    nz = np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 1))
+    normals = np.where(inside[..., None], np.stack((nx, ny, nz), axis=-1), 0).astype(np.float32)
+    rng = np.random.default_rng(0)
+    albedo = np.where(inside[..., None], rng.uniform(0.1, 0.6, (SIZE, SIZE, 3)), 0)
+    for number, (light, strength) in enumerate(zip(lights, STRENGTHS, strict=True)):
+        image = albedo * (normals @ light).clip(0)[..., None]
+        image[number::12] *= 0.1  # cast shadow on every twelfth row
+        image[:, number::12] += 0.2  # highlights on every twelfth column
+        stored = np.rint((image * strength).clip(0, 1) * 65535).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), stored[..., ::-1])
+    np.savetxt(tmp_path / "lights.txt", lights)
+    np.savetxt(tmp_path / "light_intensities.txt", STRENGTHS)
+    cv2.imwrite(str(tmp_path / "mask.png"), inside.astype(np.uint8) * 255)
+    return tmp_path, normals, albedo
+
+
+def test_restored_pixels_do_not_spoil_it(scene):
+    """Overexposed, stored colours are too dark; the others tell the albedo."""
+    folder, normals, albedo = scene
+    for path in folder.glob("[0-9].png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
+        cv2.imwrite(str(path), np.minimum(2.5 * picture, 65_535).astype(np.uint16))
+    source = open_capture(folder)
+    capture = source.read(mend=True)
+    stored = source.read().observations
+    inside = normals.any(axis=2)
+    found = albedo_map(source, capture, normals)[inside] / (2.5 * albedo[inside])
+    touched = (capture.observations > stored).any(axis=1)
+    assert 0.2 < touched.mean() < 0.9
+    # Highlights and shadows are in it, as below.
+    assert np.median(found[touched]) == pytest.approx(1, abs=0.02)
+    assert np.quantile(found, 0.99) < 1.5
+
+
+def test_strengths_that_were_estimated_count(scene):
+    folder, normals, _ = scene
+    source = open_capture(folder)
+    capture = source.read()
+    twice = replace(
+        capture, observations=capture.observations / 2, light_strengths=np.full(capture.n_lights, 2.0)
+    )
+    np.testing.assert_allclose(
+        albedo_map(source, twice, normals), albedo_map(source, capture, normals) / 2, rtol=1e-5
+    )
+
+
+def test_albedo_in_colour(scene):
+    folder, normals, albedo = scene
+    source = open_capture(folder)
+    steps = []
+    found = albedo_map(source, source.read(), normals, progress=lambda: steps.append(1))
+    assert len(steps) == 6
+    assert (found.dtype, found.shape) == (np.float32, (SIZE, SIZE, 3))
+    inside = normals.any(axis=2)
+    assert not found[~inside].any()
+    error = np.abs(found - albedo)[inside] / albedo[inside]
+    # A highlight that is weaker than 30 % of the albedo under its light passes for matte.
+    assert np.median(error) < 1e-3
+    assert np.quantile(error, 0.99) < 0.12
+    # The plain mean over the lights, to see that the others matter here.
+    capture = source.read()
+    plain = (capture.observations / (normals[inside] @ capture.light_directions.T).clip(0.15)).mean(axis=1)
+    assert np.quantile(np.abs(plain / albedo[inside].mean(axis=1) - 1), 0.9) > 0.2
+
+
+def test_some_of_the_lights(scene):
+    folder, normals, albedo = scene
+    source = open_capture(folder)
+    found = albedo_map(source, source.read([5, 0, 2]), normals)
+    inside = normals[..., 2] > 0.8
+    assert np.median(np.abs(found - albedo)[inside] / albedo[inside]) < 1e-3
+
+
+def test_pixels_that_no_light_reaches_are_black(scene):
+    folder, normals, _ = scene
+    turned = normals * (1, 1, -1)
+    source = open_capture(folder)
+    found = albedo_map(source, source.read(), turned.astype(np.float32))
+    assert not found[normals[..., 2] > 0.95].any()
+
+
+def test_an_image_that_went_away(scene):
+    folder, normals, _ = scene
+    source = open_capture(folder)
+    capture = source.read()
+    (folder / "3.png").unlink()
+    with pytest.raises(InputError, match=r"3\.png: the file does not exist"):
+        albedo_map(source, capture, normals)

@@ -1,0 +1,358 @@
+"""The page stands alone, takes names for text, holds the normals it was given, and lights them as Lambert would."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from html_page import HtmlPage
+from splinecli.normals import angle_between_deg, unit
+from splinecli.results.files import albedo_picture
+from splinecli.results.page import LONGEST_SIDE, result_page
+from splinecli.transfer import decode_transfer, encode_srgb
+
+REPORT: dict[str, Any] = {
+    "capture": "ball",
+    "method": "spline-net",
+    "weights": {"name": "blobby-7", "sha256": "0123456789ab" * 5},
+    "n_lights": 10,
+    "light_indices": list(range(10)),
+    "n_pixels": 45200,
+    "image_size": [296, 321],
+    "device": "cpu",
+    "precision": "float32",
+    "seconds": {"read": 0.6, "estimate": 0.008},
+    "peak_memory_mib": 86,
+    "warnings": [],
+    "expected_under_5": 0.8123,
+    "angular_error_deg": {"mean": 9.063, "median": 6.24, "p90": 18.1, "under_5": 0.3725, "under_10": 0.75},
+    "version": "0.1.0",
+}
+HOSTILE = """</script><script>document.title = "x"</script>'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
+SIDE = 256  # pixels, of the sphere
+
+BROWSERS = (
+    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
+    *("chromium-headless-shell", "chrome-headless-shell", "headless_shell"),
+)
+"""Names on the path or in Playwright's cache."""
+
+
+def sphere(side: int = SIDE) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Normals (side, side, 3) and mask of a sphere that nearly fills the picture."""
+    steps = (np.arange(side) + 0.5 - side / 2) / (0.47 * side)
+    x, y = np.meshgrid(steps, -steps)
+    mask = x**2 + y**2 < 1
+    z = np.sqrt(np.where(mask, 1 - x**2 - y**2, 0))
+    return (np.stack((x, y, z), axis=2) * mask[..., None]).astype(np.float32), mask
+
+
+class Page(HtmlPage):
+    """What a page holds, and its pictures decoded."""
+
+    @property
+    def facts(self) -> dict[str, str]:
+        return dict(zip(self.text["dt"], self.text["dd"], strict=True))
+
+    @property
+    def alternative_texts(self) -> list[str | None]:
+        return [attributes["alt"] for tag, attributes in self.tags if tag == "img"]
+
+    def picture(self, alternative_text: str) -> NDArray[np.uint8]:
+        """RGB of the image with this alternative text."""
+        (source,) = (a["src"] for tag, a in self.tags if tag == "img" and a["alt"] == alternative_text)
+        assert source is not None
+        png = base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True)
+        picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        if picture.ndim == 2:
+            return np.repeat(picture[..., None], 3, axis=2)
+        assert picture.shape[2] == 3  # alpha would be multiplied into the rest
+        return np.asarray(picture[..., ::-1], np.uint8)
+
+    def normals(self) -> NDArray[np.float64]:
+        """As the page's script unpacks them; zero outside the mask."""
+        high, low = self.picture("Normal map").astype(int), self.picture("").astype(int)
+        return unit(((high * 32 + low) / 8191 * 2 - 1) * high.any(axis=2, keepdims=True))
+
+
+def test_it_stands_alone() -> None:
+    normals, mask = sphere(40)
+    html = result_page(REPORT, normals, mask, albedo=normals + 1, error_map_deg=normals[..., 0] * 40)
+    page = Page(html)
+    assert not re.search(
+        r"""(src|href)\s*=\s*["']?(?!["']?data:)|url\(|@import|//\w+\.|https?:|fetch\(|import\(""", html
+    )
+    policy = next(a["content"] for tag, a in page.tags if tag == "meta" and "http-equiv" in a)
+    assert policy is not None
+    assert policy.startswith("default-src 'none'; img-src data:;")
+
+
+def test_figures_and_pictures() -> None:
+    normals, mask = sphere(40)
+    errors = np.where(mask, 90 * normals[..., 2], np.nan).astype(np.float32)
+    page = Page(
+        result_page(
+            {**REPORT, "warnings": ["The images are 8-bit."]},
+            normals,
+            mask,
+            albedo=np.full_like(normals, 0.3) * mask[..., None],
+            confidence_map=mask.astype(np.float32) * 0.6,
+            error_map_deg=errors,
+        )
+    )
+    assert page.text["h1"] == page.text["title"] == ["Photometric stereo: ball"]
+    assert page.facts == {
+        "Mean": "9.06°",
+        "Median": "6.24°",
+        "90th percentile": "18.10°",
+        "Under 5°": "37.2%",
+        "Under 10°": "75.0%",
+        "Method": "spline-net",
+        "Weights": "blobby-7",
+        "Lights": "10",
+        "Pixels": "45,200",
+        "Size": "296 × 321",
+        "Likely within 5°": "81% of the pixels",
+        "Seconds": "read 0.6, estimate 0.008",
+        "Computed on": "cpu, float32",
+    }
+    assert page.text["li"] == ["The images are 8-bit."]
+    assert page.alternative_texts == ["Normal map", "Albedo map", "Confidence map", "Error map", ""]
+    assert (page.picture("Albedo map")[20, 20] == 255).all()  # the brightest hundredth is white
+    assert (page.picture("Confidence map")[20, 20] == 153).all()
+    assert (page.picture("Error map")[~mask] == 255).all()
+    assert {"0°", "30° and beyond"} <= set(page.text["span"])
+
+
+def test_what_is_not_given_is_absent() -> None:
+    normals, mask = sphere(40)
+    html = result_page(
+        {**REPORT, "weights": None, "angular_error_deg": None, "expected_under_5": None}, normals, mask
+    )
+    page = Page(html)
+    assert page.alternative_texts == ["Normal map", ""]
+    assert not {"Weights", "Mean", "Likely within 5°", "Shown at"} & set(page.facts)
+    assert "Warnings" not in page.text["h2"]
+    assert 'id="coloured"' not in html
+    assert "beyond" not in "".join(page.text["figcaption"])
+
+
+def test_names_are_text() -> None:
+    normals, mask = sphere(40)
+    hostile = {"capture": HOSTILE, "method": HOSTILE, "device": HOSTILE, "version": HOSTILE}
+    report = {**REPORT, **hostile, "weights": {"name": HOSTILE, "sha256": ""}, "warnings": [HOSTILE]}
+    page = Page(result_page(report, normals, mask))
+    plain = Page(result_page({**REPORT, "warnings": ["w"]}, normals, mask))
+    assert [tag for tag, _ in page.tags] == [tag for tag, _ in plain.tags]
+    assert page.text["script"] == plain.text["script"]
+    assert page.text["title"] == [f"Photometric stereo: {HOSTILE}"]
+    assert page.facts["Method"] == page.facts["Weights"] == page.text["li"][0] == HOSTILE
+
+
+def test_the_normals_survive() -> None:
+    random = np.random.default_rng(0)
+    normals = unit(random.normal(size=(70, 90, 3))).astype(
+        np.float32
+    )  # all round, those seen from behind, too
+    mask = random.random((70, 90)) < 0.8
+    decoded = Page(result_page(REPORT, normals * mask[..., None], mask)).normals()
+    assert (decoded.any(axis=2) == mask).all()
+    assert angle_between_deg(decoded, normals)[mask].max() < 0.02
+
+
+def test_large_maps_are_reduced() -> None:
+    """Two faces side by side: means of what is equal are the same, and the background does not take part."""
+    width, height = 2 * LONGEST_SIDE, 301
+    faces = unit(np.array([[0.6, 0.2, 0.5], [-0.9, 0.1, 0.3]], np.float32))
+    mask = np.ones((height, width), bool)
+    mask[:101] = False
+    normals = faces[(np.arange(width) >= LONGEST_SIDE).astype(int)][None].repeat(height, 0) * mask[..., None]
+    albedo = np.float32([0.5, 0.25, 0.125]) * mask[..., None]
+    errors = np.where(mask, np.float32(12), np.nan)
+    page = Page(result_page(REPORT, normals, mask, albedo=albedo, error_map_deg=errors))
+    decoded = page.normals()
+    assert decoded.shape == (150, LONGEST_SIDE, 3)
+    assert page.facts["Shown at"] == "1600 × 150"
+    for face, half in zip(faces, np.split(decoded, 2, axis=1), strict=True):
+        shown = half.any(axis=2)
+        assert shown[51:].all()
+        assert not shown[:50].any()
+        assert angle_between_deg(half[shown], np.broadcast_to(face, half[shown].shape)).max() < 0.02
+    shown = decoded.any(axis=2)
+    for name in ("Albedo map", "Error map"):
+        colours = page.picture(name)[shown].astype(int)
+        assert np.ptp(colours, axis=0).max() <= 1  # of rounding, nothing of the background
+
+
+@pytest.fixture(scope="session")
+def browser() -> str:
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    cached = (
+        path
+        for path in sorted(Path.home().glob(".cache/ms-playwright/chromium*/*/*"))
+        if path.name in BROWSERS
+    )
+    browser = found or next(map(str, cached), None)
+    if browser is None:
+        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} on the path or in Playwright's cache")
+    return browser
+
+
+@pytest.fixture
+def run_browser(browser: str, tmp_path: Path) -> Callable[..., bytes]:
+    def run(html: str, fragment: str, *options: str, webgl: bool = True) -> bytes:
+        """What the browser prints; WebGL is that of SwiftShader, on the processor."""
+        (tmp_path / "page.html").write_text(html, "utf-8")
+        driver = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        return subprocess.run(
+            [
+                browser,
+                "--headless",
+                "--no-sandbox",  # of no use to root, nor for a page of our own
+                "--disable-dev-shm-usage",
+                "--force-color-profile=srgb",
+                "--force-device-scale-factor=1",
+                "--virtual-time-budget=3000",
+                f"--user-data-dir={tmp_path / 'profile'}",
+                *(driver if webgl else ["--disable-3d-apis"]),
+                *options,
+                f"{(tmp_path / 'page.html').as_uri()}#{fragment}",
+            ],
+            check=True,
+            capture_output=True,
+            timeout=60,
+        ).stdout
+
+    return run
+
+
+def view(
+    run_browser: Callable[..., bytes], folder: Path, html: str, fragment: str, *, webgl: bool = True
+) -> NDArray[np.uint8]:
+    """What the view shows, (SIDE, SIDE, 3) RGB, laid over the page, pixel by pixel."""
+    # Not over the window's corner, where a headless browser believes the pointer to be.
+    edge, shot = 64, folder / "shot.png"
+    style = f"#view {{ position: fixed; left: {edge}px; top: {edge}px; width: {SIDE}px; border-radius: 0 }}"
+    html = html.replace("</head>", f"<style>{style}</style></head>")
+    run_browser(html, fragment, f"--screenshot={shot}", "--window-size=800,600", webgl=webgl)
+    window = cv2.imread(str(shot))
+    return np.asarray(window[edge : edge + SIDE, edge : edge + SIDE, ::-1], np.uint8)
+
+
+def light_at(x: float, y: float) -> NDArray[np.float64]:
+    return np.array((x, y, np.sqrt(1 - x * x - y * y)))
+
+
+@pytest.mark.parametrize("webgl", [True, False])
+def test_a_matte_sphere_is_lit_by_the_cosine(
+    run_browser: Callable[..., bytes], tmp_path: Path, webgl: bool
+) -> None:
+    normals, mask = sphere()
+    html = result_page(REPORT, normals, mask)
+    for x, y in ((-0.7, 0.5), (0.6, -0.3)):
+        seen = view(run_browser, tmp_path, html, f"light={x},{y}&specular=0", webgl=webgl).astype(int)
+        expected = encode_srgb(np.maximum(normals @ light_at(x, y), 0)).astype(int)
+        # Half a level each for the screen and the picture, and one where sRGB is steep: 13 bits of the normal there.
+        assert np.abs(seen - expected[..., None]).max() <= 2
+        rows, columns = np.nonzero(seen[..., 0] > 250)
+        assert np.sign(columns.mean() - SIDE / 2) == np.sign(x)  # the lit side follows the light
+        assert np.sign(SIDE / 2 - rows.mean()) == np.sign(y)
+
+
+def test_an_enlarged_view_interpolates_normals(run_browser: Callable[..., bytes], tmp_path: Path) -> None:
+    """And not the digits they are packed in, which at a carry of the lower one would be off by up to 25 levels."""
+    html = result_page(REPORT, *sphere(SIDE // 4))
+    seen = view(run_browser, tmp_path, html, "light=-0.7,0.5&specular=0").astype(int)
+    normals, _ = sphere()
+    expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
+    # Away from the outline and the terminator, whose bends four pixels cannot follow.
+    smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
+    assert np.abs(seen - expected[..., None])[smooth].max() <= 3
+
+
+def test_a_glossy_sphere_of_two_colours(run_browser: Callable[..., bytes], tmp_path: Path) -> None:
+    """Blinn and Phong's normalised lobe, and the albedo as its picture stores it."""
+    normals, mask = sphere()
+    albedo = np.where(
+        np.arange(SIDE)[:, None] < 100, np.float32([0.8, 0.2, 0.1]), np.float32([0.1, 0.3, 0.5])
+    )
+    albedo = albedo[:, None].repeat(SIDE, 1).reshape(SIDE, SIDE, 3) * mask[..., None]
+    gain, shininess, light = 0.2, 64, light_at(-0.5, 0.4)
+    cosine = np.maximum(normals @ light, 0)[..., None]
+    lobe = (
+        (shininess + 8)
+        / 8
+        * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
+    )
+    stored = decode_transfer(albedo_picture(albedo, mask).astype(np.float32) / 255, None)
+
+    html = result_page(REPORT, normals, mask, albedo=albedo)
+    fragment = f"light=-0.5,0.4&specular={gain}&shininess={shininess}"
+    for base, choice in ((stored, ""), (1, "&albedo=0")):
+        seen = view(run_browser, tmp_path, html, fragment + choice)
+        expected = encode_srgb(((1 - gain) * base + gain * lobe) * cosine)
+        assert np.abs(seen.astype(int) - expected).max() <= 3
+
+
+INTERACTION = """
+<script>
+splinecli.ready.then(() => {
+  const view = document.getElementById("view"), box = view.getBoundingClientRect(), seen = {};
+  const radius = Math.min(box.width, box.height) / 2;
+  const tell = (name) => { seen[name] = splinecli.light; };
+  const point = (type, x, y, pointerType) => view.dispatchEvent(new PointerEvent(type, {
+    clientX: box.left + box.width / 2 + x * radius, clientY: box.top + box.height / 2 - y * radius, pointerType,
+  }));
+  const press = (key) => view.dispatchEvent(new KeyboardEvent("keydown", { key }));
+  tell("first");
+  point("pointermove", 0, 0, "mouse"); tell("centre");
+  press("ArrowRight"); press("ArrowUp"); press("ArrowUp"); tell("arrows");
+  point("pointermove", 3, 4, "mouse"); tell("beyond");
+  point("pointerdown", 0.3, 0.3, "mouse"); point("pointermove", -0.5, 0, "mouse"); tell("held");
+  point("pointermove", -0.2, 0.1, "touch"); tell("touch");
+  splinecli.setLight(NaN, 0); tell("nonsense");
+  splinecli.setLight(0.1, -0.2); tell("set");
+  seen.renderer = view.dataset.renderer;
+  seen.notice = !document.getElementById("notice").hidden;
+  seen.overflow = document.documentElement.scrollWidth - innerWidth;
+  document.body.append(Object.assign(document.createElement("pre"), { textContent: JSON.stringify(seen) }));
+});
+</script>
+"""
+
+
+@pytest.mark.parametrize("webgl", [True, False])
+def test_pointer_keys_and_a_narrow_screen(run_browser: Callable[..., bytes], webgl: bool) -> None:
+    normals, mask = sphere()
+    report = {**REPORT, "capture": "x" * 300, "warnings": ["y" * 300]}
+    errors = np.where(mask, np.float32(3), np.nan)
+    html = result_page(report, normals, mask, albedo=normals + 1, error_map_deg=errors)
+    html = html.replace("</body>", f"{INTERACTION}</body>")
+    dom = run_browser(html, "", "--dump-dom", "--window-size=400,800", webgl=webgl).decode()
+    seen = json.loads(dom.partition("<pre>")[2].partition("</pre>")[0])
+    assert seen["renderer"] == ("webgl" if webgl else "software")
+    assert seen["notice"] is not webgl
+    assert seen["overflow"] <= 0
+    lights = {
+        "first": (-0.72, 0.48),  # the preview's raking light, from the upper left
+        "centre": (0, 0),
+        "arrows": (0.05, 0.1),
+        "beyond": (0.6 * 0.995, 0.8 * 0.995),
+        "held": (0.3, 0.3),
+        "touch": (-0.2, 0.1),
+        "nonsense": (-0.2, 0.1),
+        "set": (0.1, -0.2),
+    }
+    for name, (x, y) in lights.items():
+        np.testing.assert_allclose(seen[name], light_at(x, y), atol=2e-3, err_msg=name)
