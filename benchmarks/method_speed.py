@@ -25,7 +25,7 @@ NETWORKS = ("spline-net", "cnn-ps")
 def main(folder: str, pixels: int) -> None:
     source = open_capture(folder)
     (lights,) = draw_lights(source.light_directions, N_LIGHTS, seed=0)
-    capture = source.read(lights)
+    capture = source.read(lights, as_stored=True)
     print(f"{capture.name}, {N_LIGHTS} lights")
     for name in method_names():
         count = pixels // 10 if name in NETWORKS else pixels

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
-from splinecli.capture.restore.light_intensities import find_light_strengths
-from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.capture.lights.draws import draw_lights
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
+from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.methods.estimator import CONFIDENT_DEG
 from splinecli.networks.error_head import probability_within
 from splinecli.networks.spline_net import SplineNet
@@ -43,7 +43,7 @@ class Draw(NamedTuple):
 
 def read_draws(folder: Path, n_draws: int, n_pixels: int) -> list[Draw]:
     source = open_capture(folder)
-    capture = source.read()
+    capture = source.read(as_stored=True)
     assert capture.ground_truth is not None, f"{folder} has no ground truth"
     normals = capture.ground_truth[capture.mask]
     known = np.flatnonzero(normals.any(axis=1))
@@ -95,7 +95,7 @@ def overexposed(network: SplineNet, draw: Draw) -> list[float]:
 def withheld(network: SplineNet, draw: Draw) -> tuple[bool, list[float]]:
     """Whether unequal strengths were found; spread of the log strengths' error in %, if equal and as found; errors."""
     raw = (draw.observations * draw.strengths).astype(np.float32)
-    found = find_light_strengths(raw, None, draw.lights)
+    found = estimate_light_intensities(raw, None, draw.lights)
     used = np.ones(N_LIGHTS) if found is None else found
     spreads = [100 * float(np.std(np.log(s / draw.strengths))) for s in (np.ones(N_LIGHTS), used)]
     errors = [

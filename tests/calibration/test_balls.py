@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.pictures.calibration import calibration_picture
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg
+from splinecli.pictures.calibration import calibration_picture
 
 BALL = Circle(103.3, 88.7, 61.4)
 Render = Callable[..., NDArray[np.float32]]

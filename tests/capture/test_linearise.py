@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.results.albedo import albedo_map
-from splinecli.capture import Development, open_capture, read_capture
+from splinecli.capture import RadiometricCalibration, open_capture, read_capture
 from splinecli.capture.linearise import is_display_encoded
 from splinecli.errors import InputError
+from splinecli.results.albedo import albedo_map
 
 LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
 WriteImage = Callable[..., Path]
@@ -47,7 +47,7 @@ def srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def observed(folder: Path, **settings: Any) -> NDArray[np.float32]:
-    return open_capture(folder, development=Development(**settings)).read().observations
+    return open_capture(folder, radiometry=RadiometricCalibration(**settings)).read().observations
 
 
 def expected(light: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,7 +75,7 @@ def test_ambient_light_is_taken_off(
     folder = store(tmp_path / "capture", encode(light + ambient))
     path = write((folder if found else tmp_path) / "Ambient.png", encode(ambient))
     settings = {} if found else {"ambient": path}
-    capture = open_capture(folder, development=Development(gamma, **settings)).read()
+    capture = open_capture(folder, radiometry=RadiometricCalibration(gamma, **settings)).read()
     np.testing.assert_allclose(capture.observations, expected(light), atol=6e-5)
     assert ("The light of Ambient.png was taken off all images." in capture.warnings) == found
 
@@ -156,5 +156,5 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     assert not any("display-encoded" in warning for warning in read_capture(folder).warnings)
     (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))
     assert any("display-encoded" in warning for warning in read_capture(folder).warnings)
-    told = open_capture(folder, development=Development(None)).warnings
+    told = open_capture(folder, radiometry=RadiometricCalibration(None)).warnings
     assert not any("display-encoded" in warning for warning in told)

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import typer
 
-from splinecli.results.index import INDEX
 from splinecli.cli.app import app
 from splinecli.cli.man import EXAMPLES, FILES, man_pages
 from splinecli.results.files import OWN_FILES
+from splinecli.results.index import INDEX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

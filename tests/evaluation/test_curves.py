@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.evaluation.curves import light_noise_curves, lights_curves
-from splinecli.pictures.plotting import method_looks
 from splinecli.evaluation.records import Evaluation, Protocol, Result
 from splinecli.methods import method_names
+from splinecli.pictures.plotting import method_looks
 
 METHODS = ("ls", "spline-net")
 

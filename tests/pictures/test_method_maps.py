@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splinecli.normals import unit
 from splinecli.pictures.error_map import TOP_DEG, colour_errors
 from splinecli.pictures.method_maps import method_maps
-from splinecli.normals import unit
 
 
 def decode(png: bytes) -> NDArray[np.uint8]:

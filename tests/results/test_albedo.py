@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.results.albedo import albedo_map
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
+from splinecli.results.albedo import albedo_map
 
 SIZE = 40
 STRENGTHS = np.array(
@@ -50,8 +50,8 @@ def test_restored_pixels_do_not_spoil_it(scene):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
         cv2.imwrite(str(path), np.minimum(2.5 * picture, 65_535).astype(np.uint16))
     source = open_capture(folder)
-    capture = source.read(mend=True)
-    stored = source.read().observations
+    capture = source.read()
+    stored = source.read(as_stored=True).observations
     inside = normals.any(axis=2)
     found = albedo_map(source, capture, normals)[inside] / (2.5 * albedo[inside])
     touched = (capture.observations > stored).any(axis=1)
@@ -66,7 +66,7 @@ def test_strengths_that_were_estimated_count(scene):
     source = open_capture(folder)
     capture = source.read()
     twice = replace(
-        capture, observations=capture.observations / 2, light_strengths=np.full(capture.n_lights, 2.0)
+        capture, observations=capture.observations / 2, estimated_intensities=np.full(capture.n_lights, 2.0)
     )
     np.testing.assert_allclose(
         albedo_map(source, twice, normals), albedo_map(source, capture, normals) / 2, rtol=1e-5

@@ -19,7 +19,7 @@ from splinecli.synthesis.effects import (
     Wall,
     add_sensor_noise,
     disturb_light_directions,
-    disturb_light_strengths,
+    disturb_light_intensities,
     draw_ambient,
     draw_exposure,
     draw_wall,
@@ -249,13 +249,13 @@ def test_errors_of_light_directions() -> None:
 
 def test_errors_of_light_strengths() -> None:
     observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
-    factor = (disturb_light_strengths(observations, 0.6, generator()) / observations).numpy()
+    factor = (disturb_light_intensities(observations, 0.6, generator()) / observations).numpy()
     sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
     disturbed = sigma > 1e-5
     assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
     assert stats.kstest(sigma[disturbed], stats.uniform(0, 0.05).cdf).statistic < 0.04
     assert factor[disturbed].mean() == pytest.approx(1, abs=1e-3)
-    assert torch.equal(disturb_light_strengths(observations, 0.0, generator()), observations)
+    assert torch.equal(disturb_light_intensities(observations, 0.0, generator()), observations)
 
 
 def test_exposure() -> None:

@@ -21,7 +21,7 @@ from splinecli.synthesis.pixels import (
 )
 
 PLAIN = PixelGeneratorConfig(
-    light_direction_error_share=0.0, light_strength_error_share=0.0, saturated_share=0.0, sensor_noise=False
+    light_direction_error_share=0.0, light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False
 )
 NOTHING = replace(PLAIN, wall_share=0.0, second_wall_share=0.0, ambient_share=0.0, mixed_share=0.0)
 

@@ -24,6 +24,7 @@ from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.weights import load_weights
+from splinecli.pixel_sets.store import PixelSet
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training import loop
@@ -39,7 +40,6 @@ from splinecli.training.loop import (
     stream_seed,
 )
 from splinecli.training.objective import compute_losses
-from splinecli.pixel_sets.store import PixelSet
 from splinecli.training.records import METRICS, Metrics, read_metrics
 from splinecli.training.validation import validation_deg
 

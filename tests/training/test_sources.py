@@ -11,11 +11,11 @@ import torch
 
 from splinecli.errors import InputError
 from splinecli.observation_map import cell_directions
+from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import CaptureConfig, PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training import sources
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.training.sources import (
     FILL_STEPS,
     MixedSource,
@@ -28,7 +28,7 @@ from splinecli.training.sources import (
 
 FAULTLESS = CaptureConfig(
     min_lights=5, max_lights=10, usual_lights=8, light_direction_error_share=0.0,
-    light_strength_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
+    light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
 )  # fmt: skip
 MakeSet = Callable[..., PixelSet]
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
-from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.capture.formats.images import read_mask, to_linear
+from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
+from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
-from splinecli.capture.layouts.capture_files import AMBIENT, find_named
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.linearise import Developer, Development
 from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.images import read_mask
+from splinecli.capture.layouts.capture_files import AMBIENT, find_named
+from splinecli.capture.linearise import Lineariser, RadiometricCalibration
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.errors import InputError
 
@@ -36,7 +36,7 @@ def light_strengths(
             called `ambient` in their folder is taken off.
         light_directions: (F, 3), unit.
         target: a matte ball, or a matte card that faces the camera, normal (0, 0, 1).
-        gamma: of the photographs' transfer curve, as in Development.
+        gamma: of the photographs' transfer curve, as in RadiometricCalibration.
 
     Raises:
         InputError: the numbers disagree, an image cannot be read, or a light leaves the target dark or overexposed.
@@ -62,23 +62,25 @@ def light_strengths(
     else:
         normals = np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     check_exposures(files.images)
-    development = Development(gamma, find_named(files.folder, AMBIENT))
-    develop = Developer(development, mask, len(files.images))
+    radiometry = RadiometricCalibration(gamma, find_named(files.folder, AMBIENT))
+    linearise = Lineariser(radiometry, mask, len(files.images))
     strengths = [
-        _strength(path, develop, index, normals @ light)
+        _strength(path, linearise, index, normals @ light)
         for index, (path, light) in enumerate(zip(files.images, light_directions, strict=True))
     ]
     relative: NDArray[np.float64] = np.array(strengths) / np.mean(strengths)
     return relative
 
 
-def _strength(path: Path, develop: Developer, index: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+def _strength(
+    path: Path, linearise: Lineariser, index: int, cosine: NDArray[np.float64]
+) -> NDArray[np.float64]:
     stored = decode_image(path)
-    if stored.shape[:2] != develop.mask.shape:
+    if stored.shape[:2] != linearise.mask.shape:
         raise InputError("the image is not of the others' size", path=path)
-    pixels = stored[develop.mask]
+    pixels = stored[linearise.mask]
     usable = (cosine > STEEPEST) & ~find_saturated(pixels)
-    values = develop(pixels, path, index)[usable]
+    values = linearise(pixels, path, index)[usable]
     ratio = (
         np.median(values / cosine[usable, None], axis=0) if usable.sum() >= _FEWEST_PIXELS else np.zeros(1)
     )

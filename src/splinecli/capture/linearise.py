@@ -18,7 +18,7 @@ _DARKEST_FLAT = 0.02  # of a flat field's mean: darker places do not tell the fa
 
 
 @dataclass(frozen=True)
-class Development:
+class RadiometricCalibration:
     """How stored values become linear light.
 
     Args:
@@ -32,32 +32,32 @@ class Development:
     flat_field: tuple[Path, ...] = ()
 
 
-AS_STORED = Development()
+AS_STORED = RadiometricCalibration()
 
 
-class Developer:
+class Lineariser:
     """Develops the pixels of a mask (H, W) of one capture; what all its images share is read once."""
 
-    def __init__(self, development: Development, mask: NDArray[np.bool_], n_images: int) -> None:
+    def __init__(self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int) -> None:
         """Raises InputError: the ambient image cannot be read, or the number of flat fields does not fit."""
-        self.development = development
+        self.radiometry = radiometry
         self.mask = mask
-        flats = development.flat_field
+        flats = radiometry.flat_field
         if len(flats) not in (0, 1, n_images):
             raise InputError(
                 f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image",
                 path=flats[0].parent,
             )
-        self._ambient = None if development.ambient is None else self._linear(development.ambient)
+        self._ambient = None if radiometry.ambient is None else self._linear(radiometry.ambient)
         self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
 
     def __call__(self, pixels: NDArray[Any], path: Path, index: int) -> NDArray[np.float32]:
         """Linear light (P, C) of the mask's pixels (P, C) as stored in image `index`. Raises InputError."""
-        linear = decode_transfer(to_linear(pixels, path), self.development.gamma)
+        linear = decode_transfer(to_linear(pixels, path), self.radiometry.gamma)
         if self._ambient is not None:
             linear = np.maximum(linear - self._ambient, 0)
-        if len(self.development.flat_field) > 1:
-            linear = linear / self._read_flat(self.development.flat_field[index])
+        if len(self.radiometry.flat_field) > 1:
+            linear = linear / self._read_flat(self.radiometry.flat_field[index])
         elif self._flat is not None:
             linear = linear / self._flat
         return linear
@@ -79,7 +79,7 @@ class Developer:
                 f" expected {self.mask.shape[1]} x {self.mask.shape[0]} as the others",
                 path=path,
             )
-        return decode_transfer(to_linear(stored[self.mask], path), self.development.gamma)
+        return decode_transfer(to_linear(stored[self.mask], path), self.radiometry.gamma)
 
 
 def is_display_encoded(path: Path) -> bool:

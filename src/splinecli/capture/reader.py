@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights import named_lights
-from splinecli.capture.restore.auto_mask import find_object
-from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.linearise import AS_STORED, Developer, Development, is_display_encoded
 from splinecli.capture.formats.exposure import check_exposures
-from splinecli.capture.formats.normal_files import UPSIDE_DOWN, read_ground_truth
 from splinecli.capture.formats.images import read_boundary, read_mask
+from splinecli.capture.formats.normal_files import UPSIDE_DOWN, read_ground_truth
+from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.layouts.registry import StrPath, find_capture_files
+from splinecli.capture.lights import named_lights
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
-from splinecli.capture.restore.light_intensities import find_light_strengths
+from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration, is_display_encoded
 from splinecli.capture.record import Capture, check_light_indices
+from splinecli.capture.restore.auto_mask import find_object
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import find_saturated, restore_saturated
 from splinecli.errors import InputError
 
@@ -45,7 +45,7 @@ class CaptureSource:
         light_intensities: (F, 3) float64, RGB; ones where nothing gives them.
         knows_intensities: whether anything does.
         warnings: sentences a user should read.
-        development: how the images' values become linear light.
+        radiometry: how the images' values become linear light.
         found_mask: (H, W) bool, instead of one among the files; see find_mask.
     """
 
@@ -53,7 +53,7 @@ class CaptureSource:
     light_directions: NDArray[np.float64]
     light_intensities: NDArray[np.float64]
     warnings: tuple[str, ...] = ()
-    development: Development = AS_STORED
+    radiometry: RadiometricCalibration = AS_STORED
     found_mask: NDArray[np.bool_] | None = None
     knows_intensities: bool = True
 
@@ -66,7 +66,7 @@ class CaptureSource:
         light_indices: Sequence[int] | None = None,
         progress: Callable[[], object] | None = None,
         *,
-        mend: bool = False,
+        as_stored: bool = False,
     ) -> Capture:
         """The capture under the chosen lights (all of them for None), in the order given.
 
@@ -76,9 +76,9 @@ class CaptureSource:
         Args:
             light_indices: zero-based.
             progress: called once after each image.
-            mend: put right what photographs of one's own often have wrong: estimate the lights' strengths where no
-                file gives them and they are plainly unequal (see find_light_strengths), and put estimates in the place
-                of saturated observations (see restore_saturated).
+            as_stored: use the stored values alone. By default, saturated observations are restored (see
+                restore_saturated) and light intensities that no file gives are estimated (see
+                estimate_light_intensities).
 
         Raises:
             UsageError: an index is out of range, comes twice, or there are fewer than three.
@@ -98,7 +98,7 @@ class CaptureSource:
             ground_truth, upside_down = read_ground_truth(
                 self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
             )
-        develop = Developer(self.development, mask, len(self.files.images))
+        linearise = Lineariser(self.radiometry, mask, len(self.files.images))
         observations = np.empty((np.count_nonzero(mask), len(indices)), np.float32)
         saturated = np.zeros((0, len(indices)), np.bool_)  # grows when there is something to say
         n_8_bit = 0
@@ -115,17 +115,21 @@ class CaptureSource:
                 if not len(saturated):
                     saturated = np.zeros(observations.shape, np.bool_)
                 saturated[:, position] = here
-            observations[:, position] = _observe(develop(pixels, path, index), self.light_intensities[index])
+            observations[:, position] = _observe(
+                linearise(pixels, path, index), self.light_intensities[index]
+            )
             n_8_bit += stored.dtype == np.uint8
             stored = None  # let go before the next is decoded: one full image at a time
             if progress is not None:
                 progress()
         directions, strengths = self.light_directions[list(indices)], None
-        if mend and not self.knows_intensities:
-            strengths = find_light_strengths(observations, saturated if len(saturated) else None, directions)
+        if not as_stored and not self.knows_intensities:
+            strengths = estimate_light_intensities(
+                observations, saturated if len(saturated) else None, directions
+            )
             if strengths is not None:
                 observations /= strengths.astype(np.float32)
-        if mend and len(saturated):
+        if not as_stored and len(saturated):
             restore_saturated(observations, saturated, directions)
         n_saturated = np.count_nonzero(saturated)
         n_black = len(observations) - np.count_nonzero(observations.any(axis=1))
@@ -142,7 +146,7 @@ class CaptureSource:
                 *((UPSIDE_DOWN,) if upside_down else ()),
                 *(() if strengths is None else (_strengths_in_words(strengths),)),
             ),
-            light_strengths=strengths,
+            estimated_intensities=strengths,
         )
 
     def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
@@ -151,18 +155,18 @@ class CaptureSource:
         Linear, each channel divided by its light's intensity. It raises InputError where the image cannot be read, or
         does not have the size of the mask.
         """
-        develop = Developer(self.development, mask, len(self.files.images))
+        linearise = Lineariser(self.radiometry, mask, len(self.files.images))
 
         def read(index: int) -> NDArray[np.float32]:
             path = self.files.images[index]
             stored = decode_image(path)
             _check_image_size(stored, mask, path, self.files.images[0])
-            return self._colours(develop, stored[mask], index)
+            return self._colours(linearise, stored[mask], index)
 
         return read
 
-    def _colours(self, develop: Developer, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
-        linear = develop(pixels, self.files.images[index], index)
+    def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
+        linear = linearise(pixels, self.files.images[index], index)
         # In float32 and in place: of 24 megapixels, anything else is felt.
         colours = np.array(np.broadcast_to(linear, (len(linear), 3)), np.float32)
         colours /= self.light_intensities[index].astype(np.float32)
@@ -175,15 +179,15 @@ class CaptureSource:
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
-        develop = None
+        linearise = None
         for index, path in enumerate(self.files.images):
             stored = decode_image(path)
-            if develop is None:
+            if linearise is None:
                 shape = stored.shape[:2]
-                develop = Developer(self.development, np.ones(shape, np.bool_), self.n_lights)
+                linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
                 total = np.zeros(shape[0] * shape[1], np.float32)
-            _check_image_size(stored, develop.mask, path, self.files.images[0])
-            total += self._colours(develop, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
+            _check_image_size(stored, linearise.mask, path, self.files.images[0])
+            total += self._colours(linearise, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
             if progress is not None:
                 progress()
         try:
@@ -225,13 +229,13 @@ def open_capture(
     intensities: StrPath | None = None,
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
-    development: Development = AS_STORED,
+    radiometry: RadiometricCalibration = AS_STORED,
 ) -> CaptureSource:
     """Find a capture's files and read its lights; files named here go before those that the folder holds.
 
     Args:
         intensities: a file, or EQUAL.
-        development: how the images' values become linear light; where it names no ambient image, one called `ambient`
+        radiometry: how the images' values become linear light; where it names no ambient image, one called `ambient`
             in the folder is taken off.
 
     Raises:
@@ -251,10 +255,10 @@ def open_capture(
     if path.suffix.lower() in named_lights.SUFFIXES:
         named = named_lights.read_named_lights(path)
         images, how = named.match(files.images)
-        flats = development.flat_field
+        flats = radiometry.flat_field
         if len(flats) == len(files.images) > 1:  # they lie in the order of the folder's images
             flat_of = dict(zip(files.images, flats, strict=True))
-            development = replace(development, flat_field=tuple(flat_of[image] for image in images))
+            radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in images))
         if len(images) < len(files.images):
             warnings += (
                 f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out.",
@@ -273,16 +277,16 @@ def open_capture(
         check_exposures(files.images)
         strengths = np.ones((len(files.images), 3))
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
-    if development.ambient is None and found is not None:
-        development = replace(development, ambient=found)
+    if radiometry.ambient is None and found is not None:
+        radiometry = replace(radiometry, ambient=found)
         warnings += (f"The light of {found.name} was taken off all images.",)
-    files = replace(files, ambient=development.ambient)
-    if development.gamma == 1 and any(is_display_encoded(image) for image in files.images):
+    files = replace(files, ambient=radiometry.ambient)
+    if radiometry.gamma == 1 and any(is_display_encoded(image) for image in files.images):
         warnings += (
             "The images look display-encoded (JPEG, or PNG that says so) but are taken to be linear;"
             " --transfer srgb undoes sRGB's curve.",
         )
-    return CaptureSource(files, directions, strengths, warnings, development, knows_intensities=known)
+    return CaptureSource(files, directions, strengths, warnings, radiometry, knows_intensities=known)
 
 
 def read_capture(
@@ -294,13 +298,13 @@ def read_capture(
     ground_truth: StrPath | None = None,
     light_indices: Sequence[int] | None = None,
     progress: Callable[[], object] | None = None,
-    mend: bool = False,
+    as_stored: bool = False,
 ) -> Capture:
-    """Open a capture and read it: open_capture and CaptureSource.read, which see. `infer` reads with `mend`."""
+    """Open a capture and read it: see open_capture and CaptureSource.read."""
     source = open_capture(
         folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
     )
-    return source.read(light_indices, progress, mend=mend)
+    return source.read(light_indices, progress, as_stored=as_stored)
 
 
 def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:

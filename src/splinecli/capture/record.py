@@ -36,8 +36,8 @@ class Capture:
         mask: (H, W) bool with P true pixels.
         ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
         warnings: sentences a user should read.
-        light_strengths: (F,) float64, what the observations were divided by beyond what the capture's files say, where
-            it was found from the images; else None.
+        estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
+            intensities and the images show that they differ; else None.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
@@ -51,7 +51,7 @@ class Capture:
     mask: NDArray[np.bool_]
     ground_truth: NDArray[np.float32] | None = None
     warnings: tuple[str, ...] = ()
-    light_strengths: NDArray[np.float64] | None = None
+    estimated_intensities: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -60,8 +60,10 @@ class Capture:
         object.__setattr__(self, "light_indices", tuple(operator.index(i) for i in self.light_indices))
         object.__setattr__(self, "mask", np.asarray(self.mask, np.bool_))
         object.__setattr__(self, "warnings", tuple(self.warnings))
-        if self.light_strengths is not None:
-            object.__setattr__(self, "light_strengths", np.asarray(self.light_strengths, np.float64))
+        if self.estimated_intensities is not None:
+            object.__setattr__(
+                self, "estimated_intensities", np.asarray(self.estimated_intensities, np.float64)
+            )
         self._check_lights()
         self._check_observations()
         if self.ground_truth is not None:
@@ -92,7 +94,9 @@ class Capture:
             observations=self.observations[:, chosen],
             light_directions=self.light_directions[chosen],
             light_indices=tuple(self.light_indices[i] for i in chosen),
-            light_strengths=None if self.light_strengths is None else self.light_strengths[chosen],
+            estimated_intensities=None
+            if self.estimated_intensities is None
+            else self.estimated_intensities[chosen],
         )
 
     def _check_lights(self) -> None:
@@ -106,9 +110,9 @@ class Capture:
                 f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}",
                 hint="A normal has three unknowns, so three images under different lights are the fewest",
             )
-        if self.light_strengths is not None and self.light_strengths.shape != (len(lights),):
+        if self.estimated_intensities is not None and self.estimated_intensities.shape != (len(lights),):
             raise InputError(
-                f"{self.name}: light strengths of shape {self.light_strengths.shape}, expected ({len(lights)},)"
+                f"{self.name}: light strengths of shape {self.estimated_intensities.shape}, expected ({len(lights)},)"
             )
         if not np.isfinite(lights).all():
             raise InputError(f"{self.name}: a light direction is not finite")

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.linearise import Developer
 from splinecli.capture.formats.images import to_linear
+from splinecli.capture.linearise import Lineariser
 from splinecli.capture.reader import SATURATED_SHARE, CaptureSource
 from splinecli.capture.restore.saturation import find_saturated
 
@@ -88,7 +88,7 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         if mask is None:
             mask = source.read_mask(stored.shape[:2])
             # It refuses ambient images and flat fields that do not fit.
-            Developer(source.development, mask, len(source.files.images))
+            Lineariser(source.radiometry, mask, len(source.files.images))
         pixels = stored[mask] if mask.shape == stored.shape[:2] else stored.reshape(-1, stored.shape[2])
         images.append(
             ImageSummary(

@@ -75,10 +75,10 @@ def calibrate(
     """
     from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
     from splinecli.calibration.gray import light_strengths
-    from splinecli.pictures.calibration import calibration_picture
-    from splinecli.capture.linearise import is_display_encoded
     from splinecli.capture.lights.light_files import read_light_directions
+    from splinecli.capture.linearise import is_display_encoded
     from splinecli.files import check_free, write_bytes, write_text
+    from splinecli.pictures.calibration import calibration_picture
     from splinecli.results.files import encode_png
     from splinecli.transfer import parse_transfer
 

@@ -115,9 +115,9 @@ def evaluate(
     passed over; the exit code is then 3.
     """
     from splinecli.capture import find_captures
-    from splinecli.evaluation.run import TrialStore, evaluate_all
     from splinecli.evaluation.records import Protocol
     from splinecli.evaluation.report import html_report
+    from splinecli.evaluation.run import TrialStore, evaluate_all
     from splinecli.files import check_writable, held_folder, write_text
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method, make_estimator, method_names
 

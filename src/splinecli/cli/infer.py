@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 
-from splinecli.pipeline.infer import Job, inputs_sha256
 from splinecli.cli.options import (
     AmbientOption,
     BatchSizeOption,
@@ -30,12 +29,13 @@ from splinecli.cli.options import (
     WeightsOption,
     complete_list,
     complete_methods,
-    parse_development,
     parse_indices,
+    parse_radiometry,
     split_commas,
 )
 from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, OutputError, UsageError
+from splinecli.pipeline.infer import Job, inputs_sha256
 
 
 def infer(
@@ -129,13 +129,13 @@ def infer(
     truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished
     before with the same options are left as they are. OUT/index.html links the results of several.
     """
-    from splinecli.results.index import INDEX, check_index_free, has_index, index_page, with_earlier
     from splinecli.capture import capture_name
-    from splinecli.capture.record import check_light_indices
     from splinecli.capture.lights.draws import check_draw_settings
+    from splinecli.capture.record import check_light_indices
     from splinecli.files import check_free, write_text
     from splinecli.methods import MethodOptions, check_method
     from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, finished_report
+    from splinecli.results.index import INDEX, check_index_free, has_index, index_page, with_earlier
 
     if n_lights is not None and light_indices is not None:
         raise UsageError("--n-lights and --light-indices exclude each other")
@@ -147,7 +147,7 @@ def infer(
         check_draw_settings(n_lights, 1, seed)
     if indices is not None:
         check_light_indices(indices, max(indices) + 1)
-    development = parse_development(transfer, ambient, flat_field)
+    radiometry = parse_radiometry(transfer, ambient, flat_field)
     _refuse_same_names(captures)
     options = {
         "method": method, "weights": weights, "rotations": rotations, "precision": precision.value,
@@ -163,7 +163,7 @@ def infer(
         from splinecli.capture import open_capture
 
         try:
-            return inputs_sha256(open_capture(folder, development=development, **files), weights)
+            return inputs_sha256(open_capture(folder, radiometry=radiometry, **files), weights)
         except InputError:
             return ""  # told when its turn comes
 
@@ -188,7 +188,7 @@ def infer(
         else:
             finished[folder] = report
     job = Job(
-        development=development,
+        radiometry=radiometry,
         files=files,
         output=output,
         formats=split_commas(formats, "--format", list(NORMALS)),

@@ -14,7 +14,7 @@ from splinecli.cli.options import (
     JsonOption,
     QuietOption,
     TransferOption,
-    parse_development,
+    parse_radiometry,
 )
 from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
@@ -62,7 +62,7 @@ def info(
         intensities=intensities,
         mask=mask,
         ground_truth=ground_truth,
-        development=parse_development(transfer, ambient, flat_field),
+        radiometry=parse_radiometry(transfer, ambient, flat_field),
     )
     if plot is not None:
         if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:

@@ -14,7 +14,7 @@ import typer
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splinecli.capture import Development
+    from splinecli.capture import RadiometricCalibration
 
 
 class Device(StrEnum):
@@ -144,9 +144,9 @@ def parse_indices(text: str, option: str) -> list[int]:
         raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
 
 
-def parse_development(transfer: str, ambient: Path | None, flat_field: Path | None) -> Development:
+def parse_radiometry(transfer: str, ambient: Path | None, flat_field: Path | None) -> RadiometricCalibration:
     """What --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
-    from splinecli.capture import Development
+    from splinecli.capture import RadiometricCalibration
     from splinecli.capture.layouts.image_lists import check_not_empty, list_images
     from splinecli.transfer import parse_transfer
 
@@ -157,4 +157,4 @@ def parse_development(transfer: str, ambient: Path | None, flat_field: Path | No
     )
     if flat_field is not None:
         check_not_empty(flats, flat_field)
-    return Development(parse_transfer(transfer), ambient, flats)
+    return RadiometricCalibration(parse_transfer(transfer), ambient, flats)

@@ -16,8 +16,8 @@ from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from splinecli.pixel_sets.store import PixelSet
     from splinecli.pixel_sets.preparation import ScenePlan
+    from splinecli.pixel_sets.store import PixelSet
 
 CONTACT_SHEET = "contact_sheet.png"
 
@@ -58,10 +58,10 @@ def prepare(
     """
     from splinecli.capture import find_captures
     from splinecli.files import check_writable, held_folder, write_bytes
-    from splinecli.results.files import encode_png
     from splinecli.pictures.contact_sheet import contact_sheet
-    from splinecli.pixel_sets.store import PixelSetWriter
     from splinecli.pixel_sets.preparation import add_capture, add_scene, name_captures
+    from splinecli.pixel_sets.store import PixelSetWriter
+    from splinecli.results.files import encode_png
 
     if not sources and not scenes and not mesh:
         raise UsageError("nothing to prepare", hint="Name a SOURCE, or ask for --scenes N or --mesh FILE")
@@ -123,9 +123,9 @@ def _plan(
     measured: Path | None,
     measured_share: float,
 ) -> ScenePlan:
+    from splinecli.pixel_sets.preparation import ScenePlan
     from splinecli.synthesis.meshes import read_mesh
     from splinecli.synthesis.scenes import SceneConfig
-    from splinecli.pixel_sets.preparation import ScenePlan
 
     for path in meshes:
         read_mesh(path)  # a bad one is refused before anything is rendered

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError
-from splinecli.pictures.method_maps import method_maps
-from splinecli.pictures.observation_maps import observation_map_figure
-from splinecli.evaluation.run import first_trial, see_trial
 from splinecli.evaluation.records import Protocol
+from splinecli.evaluation.run import first_trial, see_trial
 from splinecli.evaluation.tables import heading
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import Estimator
+from splinecli.pictures.method_maps import method_maps
+from splinecli.pictures.observation_maps import observation_map_figure
 
 SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Of SPLINE-Net's errors: the pixels whose maps are shown unless others are chosen."""
@@ -58,7 +58,7 @@ def capture_figures(
     """
     source = open_capture(folder)
     trial = first_trial(source, name, protocol)
-    whole = source.read(range(protocol.skipped_lights(name), source.n_lights))
+    whole = source.read(range(protocol.skipped_lights(name), source.n_lights), as_stored=True)
     capture = see_trial(whole, trial)
     assert capture.ground_truth is not None  # or there is no first trial
     estimates = {e.name: estimate_normals(capture, e) for e in estimators}

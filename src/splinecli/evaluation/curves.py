@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from splinecli.pictures.plotting import method_looks, png_bytes
 from splinecli.evaluation.records import Evaluation
 from splinecli.evaluation.statistics import AVERAGE, trial_averages
+from splinecli.pictures.plotting import method_looks, png_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.errors import UsageError
 from splinecli.capture.lights.draws import check_draw_settings
+from splinecli.errors import UsageError
 from splinecli.evaluation.light_noise import LARGEST_SIGMA_DEG
 
 

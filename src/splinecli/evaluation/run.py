@@ -14,9 +14,16 @@ from pathlib import Path
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
+from splinecli.capture.lights.draws import (
+    NOISE_STREAM,
+    Draw,
+    DrawsFile,
+    draw_lights,
+    in_one_plane,
+    read_draws,
+)
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.capture.lights.draws import NOISE_STREAM, Draw, DrawsFile, draw_lights, in_one_plane, read_draws
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.quirks import describe_quirks
 from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
@@ -169,7 +176,7 @@ class _CaptureJob:
     def read(self, units: Sequence[tuple[Trial, Estimator]]) -> Capture:
         """The capture under the lights of these trials, without the pixels that are not scored."""
         lights = sorted(set().union(*(trial.lights for trial, _ in units)))
-        capture = self.source.read(lights)
+        capture = self.source.read(lights, as_stored=True)
         for task in self.tasks:
             task.notes[self.name] = describe_quirks(capture, self.name, task.protocol)
         # All protocols of an evaluation score the same pixels.

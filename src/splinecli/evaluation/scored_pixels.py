@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from splinecli.capture import Capture
-from splinecli.errors import InputError
 from splinecli.capture.lights.draws import PIXELS_STREAM
+from splinecli.errors import InputError
 
 
 def keep_scored_pixels(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> Capture:

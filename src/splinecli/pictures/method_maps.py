@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.normals import encode_picture
 from splinecli.pictures.error_map import TITLE, TOP_DEG, Picture, colour_errors
 from splinecli.pictures.plotting import png_bytes
-from splinecli.normals import encode_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture, CaptureSource, Development
+    from splinecli.capture import Capture, CaptureSource, RadiometricCalibration
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator, MethodOptions
     from splinecli.normals import Convention
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Job:
     """What the command line asked for, the same for every capture."""
 
-    development: Development
+    radiometry: RadiometricCalibration
     files: dict[str, Path | None]
     output: Path
     formats: list[str]
@@ -61,14 +61,14 @@ class Job:
         from splinecli.capture import open_capture
 
         started = time.perf_counter()
-        source = open_capture(folder, development=self.development, **self.files)
+        source = open_capture(folder, radiometry=self.radiometry, **self.files)
         if self.auto_mask:
             with self.talk.progress(f"{source.files.name}: finding the object", source.n_lights) as advance:
                 source = source.find_mask(lambda: advance(1))
         chosen = self._choose_lights(source)
         count = source.n_lights if chosen is None else len(chosen)
         with self.talk.progress(f"{source.files.name}: reading", count) as advance:
-            capture = source.read(chosen, progress=lambda: advance(1), mend=True)
+            capture = source.read(chosen, progress=lambda: advance(1))
         return source, capture, time.perf_counter() - started
 
     def estimate(self, source: CaptureSource, capture: Capture, read_seconds: float) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
     from splinecli.evaluation.trials import place_size_and_time, stamp_files
     from splinecli.files import file_sha256
 
-    flats = [place_size_and_time(path) for path in source.development.flat_field]
+    flats = [place_size_and_time(path) for path in source.radiometry.flat_field]
     own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
     stamps = [*stamp_files(source.files), flats, own_weights]
     return hashlib.sha256(json.dumps(stamps).encode()).hexdigest()

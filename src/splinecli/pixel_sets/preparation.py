@@ -16,11 +16,11 @@ import numpy as np
 from splinecli.capture import CaptureFiles, capture_name, open_capture
 from splinecli.errors import InputError
 from splinecli.files import file_sha256
+from splinecli.pixel_sets.store import Pixels, PixelSetWriter
 from splinecli.synthesis.measured import MeasuredLibrary
 from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.scenes import CLASSES, SceneConfig, draw_scene, render_scene
-from splinecli.pixel_sets.store import Pixels, PixelSetWriter
 
 RENDERER = 1
 """To be raised when the same scene comes out otherwise: a set must not mix both without saying so."""
@@ -75,7 +75,7 @@ def add_capture(writer: PixelSetWriter, name: str, folder: Path) -> None:
         return
     if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
-    capture = source.read()
+    capture = source.read(as_stored=True)
     assert capture.ground_truth is not None
     truth = capture.ground_truth[capture.mask]
     used = truth.any(axis=1)

@@ -48,8 +48,8 @@ def albedo_map(
     for position, index in enumerate(capture.light_indices):
         cosine = (normals @ lights[position]) * counts[:, position]
         colours = read(index)
-        if capture.light_strengths is not None:
-            colours /= np.float32(capture.light_strengths[position])
+        if capture.estimated_intensities is not None:
+            colours /= np.float32(capture.estimated_intensities[position])
         # Restored observations are brighter than their colours, which are saturated: the others tell better.
         restored = colours.mean(axis=1) < 0.99 * capture.observations[:, position]
         weight = cosine * np.where(restored, np.float32(1e-3), np.float32(1))

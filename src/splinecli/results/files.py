@@ -87,9 +87,9 @@ def report_of(
         "weights": estimator.weights,
         "n_lights": capture.n_lights,
         "light_indices": list(capture.light_indices),
-        "light_strengths": None
-        if capture.light_strengths is None
-        else capture.light_strengths.round(4).tolist(),
+        "estimated_intensities": None
+        if capture.estimated_intensities is None
+        else capture.estimated_intensities.round(4).tolist(),
         "n_pixels": capture.n_pixels,
         "image_size": [capture.mask.shape[1], capture.mask.shape[0]],
         "device": estimator.device,

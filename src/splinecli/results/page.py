@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.pictures.error_map import TOP_DEG, colour_errors
 from splinecli.normals import unit
+from splinecli.pictures.error_map import TOP_DEG, colour_errors
 from splinecli.results.files import RAKING_LIGHT, albedo_picture, confidence_picture, encode_png
 from splinecli.results.templates import render
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from splinecli.synthesis.effects import (
     add_sensor_noise,
     disturb_light_directions,
-    disturb_light_strengths,
+    disturb_light_intensities,
     draw_exposure,
     quantise,
 )
@@ -28,7 +28,7 @@ class CaptureConfig:
     max_lights: int = 96
     usual_lights: int = 10
     light_direction_error_share: float = 0.5
-    light_strength_error_share: float = 0.5
+    light_intensity_error_share: float = 0.5
     saturated_share: float = 0.08
     sensor_noise: bool = True
     eight_bit_share: float = 0.15
@@ -136,7 +136,7 @@ def photograph(
     """What a camera and a calibration with faults make of radiance (P, F) under directions (P, F, 3)."""
     radiance = radiance * valid
     exposure = draw_exposure(radiance, config.saturated_share, generator)
-    observed = disturb_light_strengths(radiance * exposure, config.light_strength_error_share, generator)
+    observed = disturb_light_intensities(radiance * exposure, config.light_intensity_error_share, generator)
     observed = observed.clamp(max=1)
     if config.sensor_noise:
         observed = add_sensor_noise(observed, generator)

@@ -160,7 +160,7 @@ def disturb_light_directions(directions: Tensor, share: float, generator: torch.
     return torch.nn.functional.normalize(moved, dim=-1)
 
 
-def disturb_light_strengths(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
+def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Each light's strength off by a Gaussian factor, sigma U(0, 5 %), for a `share` of the pixels (P, F)."""
     sigma = _uniform(generator, len(observations), 1, high=0.05) * (
         _uniform(generator, len(observations), 1) < share

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from splinecli.errors import InputError
 from splinecli.observation_map import cell_directions, rotate_about_view_axis, sparse_map
+from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, join_batches, photograph
 from splinecli.synthesis.lights import draw_light_counts
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
 
 FILL_STEPS = 3
 """Gaps of a dense map are interpolated up to so many cells from a light."""

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import find_ball_files
 from splinecli.capture import open_capture, read_capture
-from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.linearise import is_display_encoded
 from splinecli.capture.formats.exposure import Exposure, read_exposure
-from splinecli.capture.layouts.image_lists import list_images
 from splinecli.capture.formats.raw import _full_scale
+from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
+from splinecli.capture.layouts.image_lists import list_images
+from splinecli.capture.linearise import is_display_encoded
 from splinecli.errors import InputError
 
 WHITE = 16383

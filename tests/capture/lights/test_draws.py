@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splinecli.errors import InputError, UsageError
 from splinecli.capture.lights.draws import draw_lights, read_draws
+from splinecli.errors import InputError, UsageError
 from splinecli.normals import unit
 
 

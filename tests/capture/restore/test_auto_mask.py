@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splinecli.capture.restore.auto_mask import find_object
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.reader import open_capture
+from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError
 
 SIDE = 120

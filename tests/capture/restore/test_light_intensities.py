@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.capture.restore.light_intensities import find_light_strengths
-from splinecli.capture.reader import open_capture
 from splinecli.capture.lights.draws import draw_lights
+from splinecli.capture.reader import open_capture
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.normals import unit
 
 STRENGTHS = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
@@ -40,7 +40,7 @@ def sphere(directions: np.ndarray, *, shine: float = 0.0) -> np.ndarray:
 def test_unequal_lights_are_told(n_lights, shine):
     directions, strengths = lights(n_lights), STRENGTHS[:n_lights]
     observations = (sphere(directions, shine=shine) * strengths).astype(np.float32)
-    found = find_light_strengths(observations, None, directions)
+    found = estimate_light_intensities(observations, None, directions)
     assert found is not None
     assert found.mean() == pytest.approx(1)
     np.testing.assert_allclose(found, strengths / strengths.mean(), rtol=0.02)
@@ -49,29 +49,32 @@ def test_unequal_lights_are_told(n_lights, shine):
 @pytest.mark.parametrize("shine", [0.0, 0.5, 3.0])
 def test_equal_lights_are_left_alone(shine):
     directions = lights(8)
-    assert find_light_strengths(sphere(directions, shine=shine).astype(np.float32), None, directions) is None
+    assert (
+        estimate_light_intensities(sphere(directions, shine=shine).astype(np.float32), None, directions)
+        is None
+    )
 
 
 def test_where_nothing_tells():
     directions = lights(4)
     assert (
-        find_light_strengths((sphere(directions) * STRENGTHS[:4]).astype(np.float32), None, directions)
+        estimate_light_intensities((sphere(directions) * STRENGTHS[:4]).astype(np.float32), None, directions)
         is None
     )
     few = (sphere(lights(8)) * STRENGTHS)[:40].astype(np.float32)
-    assert find_light_strengths(few, None, lights(8)) is None
-    assert find_light_strengths(np.zeros((500, 8), np.float32), None, lights(8)) is None
+    assert estimate_light_intensities(few, None, lights(8)) is None
+    assert estimate_light_intensities(np.zeros((500, 8), np.float32), None, lights(8)) is None
     never = (sphere(lights(8)) * STRENGTHS * (np.arange(8) != 3)).astype(
         np.float32
     )  # a lamp that did not flash
-    assert find_light_strengths(never, None, lights(8)) is None
+    assert estimate_light_intensities(never, None, lights(8)) is None
 
 
 def test_saturated_observations_do_not_count():
     directions = lights(8)
     truth = sphere(directions) * STRENGTHS
     stored = np.minimum(truth, 0.6).astype(np.float32)
-    found = find_light_strengths(stored, truth >= 0.6, directions)
+    found = estimate_light_intensities(stored, truth >= 0.6, directions)
     assert found is not None
     np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=0.05)
 
@@ -86,22 +89,24 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16))
     np.savetxt(tmp_path / "lights.txt", directions)
     source = open_capture(tmp_path)
-    plain, mended = source.read(), source.read(mend=True)
-    assert plain.light_strengths is None
-    assert mended.light_strengths is not None
+    plain, mended = source.read(as_stored=True), source.read()
+    assert plain.estimated_intensities is None
+    assert mended.estimated_intensities is not None
     low, high = STRENGTHS.min() / STRENGTHS.mean(), STRENGTHS.max() / STRENGTHS.mean()
     (said,) = (warning for warning in mended.warnings if "unequally" in warning)
     told = [float(number) for number in re.findall(r"\d\.\d\d", said)]
     assert told == pytest.approx([low, high], abs=0.02)
-    np.testing.assert_allclose(mended.light_strengths, STRENGTHS / STRENGTHS.mean(), rtol=0.02)
-    np.testing.assert_allclose(mended.observations, plain.observations / mended.light_strengths, rtol=1e-5)
+    np.testing.assert_allclose(mended.estimated_intensities, STRENGTHS / STRENGTHS.mean(), rtol=0.02)
+    np.testing.assert_allclose(
+        mended.observations, plain.observations / mended.estimated_intensities, rtol=1e-5
+    )
     some = mended.choose_lights([6, 0, 2])
-    np.testing.assert_array_equal(some.light_strengths, mended.light_strengths[[6, 0, 2]])
+    np.testing.assert_array_equal(some.estimated_intensities, mended.estimated_intensities[[6, 0, 2]])
     # Who knows better is believed.
     np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
-    assert open_capture(tmp_path).read(mend=True).light_strengths is None
+    assert open_capture(tmp_path).read().estimated_intensities is None
     (tmp_path / "light_intensities.txt").unlink()
-    assert open_capture(tmp_path, intensities="equal").read(mend=True).light_strengths is None
+    assert open_capture(tmp_path, intensities="equal").read().estimated_intensities is None
 
 
 @pytest.mark.parametrize("name", ["ballPNG", "catPNG"])
@@ -112,7 +117,7 @@ def test_real_objects_whose_lights_were_measured(shared_data, name):
     measured = source.light_intensities.mean(axis=1)
     for chosen in draw_lights(capture.light_directions, 10, trials=3, seed=0):
         order, directions = list(chosen), capture.light_directions[list(chosen)]
-        found = find_light_strengths(
+        found = estimate_light_intensities(
             (capture.observations[:, order] * measured[order]).astype(np.float32), None, directions
         )
         assert found is not None
@@ -128,4 +133,4 @@ def test_real_objects_under_equal_lights(shared_data, place, n_lights):
     for chosen in draw_lights(capture.light_directions, n_lights, trials=3, seed=0):
         order = list(chosen)
         observations, directions = capture.observations[:, order], capture.light_directions[order]
-        assert find_light_strengths(observations, None, directions) is None
+        assert estimate_light_intensities(observations, None, directions) is None

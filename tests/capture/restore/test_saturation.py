@@ -87,11 +87,11 @@ def test_a_capture_is_restored_where_that_is_asked_for(tmp_path):
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16).reshape(side, side))
     np.savetxt(tmp_path / "lights.txt", LIGHTS)
     source = open_capture(tmp_path)
-    stored, restored = (source.read(mend=mend).observations for mend in (False, True))
+    stored, restored = (source.read(as_stored=as_stored).observations for as_stored in (True, False))
     assert stored.max() == 1
     known = ((truth < 0.6).sum(axis=1) >= 4) & (truth >= 0.6).any(axis=1)
     np.testing.assert_allclose(restored[known], truth[known] / 0.6, atol=0.025)
     # Under some of the lights, those alone tell.
-    some = source.read([0, 2, 4, 6, 8], mend=True).observations
+    some = source.read([0, 2, 4, 6, 8]).observations
     assert some.shape == (100, 5)
     assert (some >= stored[:, ::2]).all()

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image, decode_with_alpha
-from splinecli.capture.paths import find_mode
 from splinecli.capture.formats.text import read_number_rows
+from splinecli.capture.paths import find_mode
 from splinecli.errors import InputError
 from splinecli.normals import SHORTEST_IN_PICTURE, decode_picture
 

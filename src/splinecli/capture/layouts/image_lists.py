@@ -7,9 +7,9 @@ import stat
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from splinecli.capture.paths import find_mode, is_file, resolve
 from splinecli.capture.formats.raw import RAW_SUFFIXES
 from splinecli.capture.formats.text import read_lines
+from splinecli.capture.paths import find_mode, is_file, resolve
 from splinecli.errors import InputError
 
 _DEVELOPED = (".png", ".tif", ".tiff")

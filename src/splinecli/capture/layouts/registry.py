@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from splinecli.capture import cyclesps, diligent, plain_folder, psbox
+from splinecli.capture.layouts import cyclesps, diligent, plain_folder, psbox
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     LIGHT_FILES,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.record import FLATTEST_LIGHTS, MIN_LIGHTS
 from splinecli.capture.formats.text import read_lines
+from splinecli.capture.record import FLATTEST_LIGHTS, MIN_LIGHTS
 from splinecli.errors import InputError, UsageError
 
 Draw = tuple[int, ...]

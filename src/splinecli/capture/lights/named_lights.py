@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.light_files import unit_directions
 from splinecli.capture.formats.text import parse_number, read_lines
+from splinecli.capture.lights.light_files import unit_directions
 from splinecli.errors import InputError
 
 SUFFIXES = (".lp", ".json")

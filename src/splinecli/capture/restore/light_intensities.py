@@ -45,7 +45,7 @@ _LIT = 0.3  # of a pixel's brightest prediction; darker ones may be shadows
 _STEP = 1.5  # beyond what each round finds, which saves a third of them
 
 
-def find_light_strengths(
+def estimate_light_intensities(
     observations: NDArray[np.float32], missing: NDArray[np.bool_] | None, light_directions: Array
 ) -> Array | None:
     """Strengths (F,) with a mean of 1, or None where the lights may well be equally strong, or nothing tells.

@@ -1,0 +1,5 @@
+"""Pixel sets made by hand."""
+
+from small_pixel_sets import _matte_pixels, make_set
+
+__all__ = ["_matte_pixels", "make_set"]

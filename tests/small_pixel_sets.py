@@ -1,0 +1,58 @@
+"""Pixel sets made by hand, for the tests that read them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import DTypeLike
+
+from splinecli.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+
+MakeSet = Callable[..., PixelSet]
+
+
+def matte_pixels(pixels: int, lights: int, *, seed: int = 0, dtype: DTypeLike = np.float32) -> Pixels:
+    """Matte pixels of random albedo under random lights: albedo max(0, n . l)."""
+    random = np.random.default_rng(seed)
+
+    def upward(count: int) -> np.ndarray:
+        vectors = random.standard_normal((count, 3))
+        vectors[:, 2] = np.abs(vectors[:, 2]) + 0.1
+        return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+    normals, directions = upward(pixels), upward(lights)
+    albedo = random.uniform(0.2, 1.0, (pixels, 1))
+    mask = np.zeros((pixels, 2), bool)
+    mask[:, 0] = True
+    return Pixels((albedo * (normals @ directions.T).clip(0)).astype(dtype), normals, directions, mask)
+
+
+@pytest.fixture(name="matte_pixels")
+def _matte_pixels() -> Callable[..., Pixels]:
+    return matte_pixels
+
+
+@pytest.fixture
+def make_set(tmp_path: Path) -> MakeSet:
+    """Write a finished set of matte pixels: entries as (name, scene, pixels, lights)."""
+
+    def make(
+        name: str = "set",
+        entries: Sequence[tuple[str, str, int, int]] = (
+            ("a", "one", 40, 30),
+            ("b", "two", 30, 25),
+            ("c", "three", 20, 12),
+        ),
+        dtype: DTypeLike = np.float32,
+    ) -> PixelSet:
+        writer = PixelSetWriter(tmp_path / name)
+        for index, (entry, scene, pixels, lights) in enumerate(entries):
+            writer.add(
+                entry, scene, "a test", {"by": "hand"}, matte_pixels(pixels, lights, seed=index, dtype=dtype)
+            )
+        return writer.finish()
+
+    return make
