@@ -65,7 +65,7 @@ def estimate(
     network: SplineNet, observations: NDArray[np.float32], draw: Draw, valid: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Errors (P,) in degrees and confidences (P,)."""
-    normals, error = network.normals_with_error(
+    normals, error = network(
         torch.from_numpy(observations),
         torch.from_numpy(draw.lights).float(),
         None if valid is None else torch.from_numpy(valid),

@@ -78,7 +78,7 @@ def test_confidence_on_generated_pixels():
     config = PixelGeneratorConfig(min_lights=10, usual_lights=10, max_lights=10)
     batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(3000)
     with torch.inference_mode():
-        normals, error = resolve_weights("spline-net").network.normals_with_error(
+        normals, error = resolve_weights("spline-net").network(
             batch.observations, batch.light_directions, batch.valid
         )
     assert error is not None

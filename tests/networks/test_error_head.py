@@ -36,14 +36,14 @@ def test_it_changes_no_normal(random_network: Callable[..., SplineNet]) -> None:
     lights = torch.nn.functional.normalize(torch.rand(9, 3, generator=generator) + 0.1, dim=1)
     observations = torch.rand(20, 9, generator=generator)
     with torch.inference_mode():
-        normals, error = telling.normals_with_error(observations, lights)
-        assert torch.equal(plain(observations, lights), normals)
-        assert plain.normals_with_error(observations, lights)[1] is None
+        normals, error = telling(observations, lights)
+        assert torch.equal(plain(observations, lights).normals, normals)
+        assert plain(observations, lights).error is None
         assert error is not None
         assert (error.shape, error.dtype) == ((20, 2), torch.float32)
         # It is of the pixel, not of its place in the capture's frame.
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        turned = telling.normals_with_error(observations, lights @ turn.T)[1]
+        turned = telling(observations, lights @ turn.T).error
     torch.testing.assert_close(turned, error, atol=1e-4, rtol=0)
 
 

@@ -189,8 +189,8 @@ def test_observations_give_the_normals_that_theirs_give(authors: Authors, import
     assert (sparse > 0).sum() == 60  # no two lights share a cell, where theirs keeps the last
     expected = authors[1](torch.cat((authors[0](sparse), sparse), 1))
     with torch.no_grad():
-        normals = imported(observations, lights)
-        views = imported.look(observations, lights)
+        normals = imported(observations, lights).normals
+        views = imported.build_maps(observations, lights)
     torch.testing.assert_close(views.sparse.flip(2), sparse, atol=1e-7, rtol=0)
     torch.testing.assert_close(normals, expected, atol=1e-5, rtol=0)
     assert expected.std(0).max() > 1e-3

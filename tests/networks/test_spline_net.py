@@ -40,7 +40,7 @@ def test_normals_are_unit_vectors(
 ) -> None:
     observations, lights = pixels
     with torch.no_grad():
-        normals = random_network(**settings)(observations.float(), lights.float())
+        normals = random_network(**settings)(observations.float(), lights.float()).normals
     assert normals.shape == (64, 3)
     assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
 
@@ -51,7 +51,7 @@ def test_dense_map_ends_with_the_unit_disc(
 ) -> None:
     network = random_network(**settings)
     with torch.no_grad():
-        dense = network.interpolate(network.look(pixels[0].float(), pixels[1].float()))
+        dense = network.interpolate(network.build_maps(pixels[0].float(), pixels[1].float()))
     size = network.config.map_size
     assert dense.shape == (64, 1, size, size)
     _, inside = cell_directions(size)
@@ -70,8 +70,8 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
     visible = expected[:, 2] > 0.05
     assert visible.sum() > 50
     with torch.no_grad():
-        normals = network(observations, lights)
-        dense = network.interpolate(network.look(observations, lights))
+        normals = network(observations, lights).normals
+        dense = network.interpolate(network.build_maps(observations, lights))
     torch.testing.assert_close(normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False)
     # Its dense map is that normal's Lambertian one, turned to azimuth 0.
     b = fit_lambertian(observations / map_scale(observations), lights)[visible]
@@ -88,7 +88,10 @@ def test_compact_estimates_turn_with_the_lights(
     observations, lights = pixels
     network = random_network().double()
     with torch.no_grad():
-        here, there = network(observations, lights), network(observations, turn(lights, degrees))
+        here, there = (
+            network(observations, lights).normals,
+            network(observations, turn(lights, degrees)).normals,
+        )
     torch.testing.assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
     # The correction is not nothing: without it the fit alone would pass.
     fit = fit_lambertian(observations / map_scale(observations), lights)
@@ -103,7 +106,10 @@ def test_brightness_does_not_matter(
     network = random_network(**settings).double()
     with torch.no_grad():
         torch.testing.assert_close(
-            network(observations, lights), network(observations * 137.5, lights), atol=1e-5, rtol=0
+            network(observations, lights).normals,
+            network(observations * 137.5, lights).normals,
+            atol=1e-5,
+            rtol=0,
         )
 
 
@@ -116,7 +122,10 @@ def test_order_of_the_lights_does_not_matter(
     network = random_network(**settings).double()
     with torch.no_grad():
         torch.testing.assert_close(
-            network(observations, lights), network(observations[:, order], lights[order]), atol=1e-5, rtol=0
+            network(observations, lights).normals,
+            network(observations[:, order], lights[order]).normals,
+            atol=1e-5,
+            rtol=0,
         )
 
 
@@ -128,8 +137,8 @@ def test_observations_that_are_not_valid_do_not_matter(
     valid = (torch.arange(10) < 7).expand(64, 10)
     garbage = observations.where(valid, torch.tensor(9.0, dtype=torch.float64))
     with torch.no_grad():
-        expected = network(observations[:, :7], lights[:7])
-        torch.testing.assert_close(network(garbage, lights, valid), expected, atol=1e-5, rtol=0)
+        expected = network(observations[:, :7], lights[:7]).normals
+        torch.testing.assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("settings", [{}, PAPER])
@@ -137,7 +146,7 @@ def test_all_zero_pixels_give_a_unit_normal(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
     with torch.no_grad():
-        normals = random_network(**settings)(torch.zeros(3, 10), pixels[1].float())
+        normals = random_network(**settings)(torch.zeros(3, 10), pixels[1].float()).normals
     assert torch.isfinite(normals).all()
     assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
 
@@ -149,11 +158,11 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
     observations, lights = pixels
     network = random_network().double()
     with torch.no_grad():
-        mirrored = network(observations, lights, turn_deg=7.0, mirror=True)
-        expected = network(observations, lights * FLIP, turn_deg=-7.0) * FLIP
+        mirrored = network(observations, lights, turn_deg=7.0, mirror=True).normals
+        expected = network(observations, lights * FLIP, turn_deg=-7.0).normals * FLIP
     torch.testing.assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
     with torch.no_grad():
-        plain = network(observations, lights, turn_deg=7.0)
+        plain = network(observations, lights, turn_deg=7.0).normals
     assert (mirrored - plain).abs().max() > 1e-4
 
 
@@ -161,7 +170,7 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
 def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
     observations, lights = pixels
     network = random_network().double()
-    views = network.look(observations, lights, turn_deg=torch.linspace(-15, 15, 64), mirror=mirror)
+    views = network.build_maps(observations, lights, turn_deg=torch.linspace(-15, 15, 64), mirror=mirror)
     vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
     torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
     # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or not.
@@ -173,7 +182,7 @@ def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tenso
 
 
 def test_the_paper_size_looks_without_turning(random_network: Make, pixels: tuple[Tensor, Tensor]) -> None:
-    views = random_network(**PAPER).look(pixels[0].float(), pixels[1].float())
+    views = random_network(**PAPER).build_maps(pixels[0].float(), pixels[1].float())
     assert torch.equal(views.cosine, torch.ones(64))
     assert not views.sine.any()
     assert views.sparse.amax(dim=(1, 2, 3)).max() <= 1
@@ -185,6 +194,6 @@ def test_autocast_does_not_round_the_geometry(random_network: Make, pixels: tupl
     torch.nn.init.zeros_(network.ne_net.out.weight)  # type: ignore[union-attr,arg-type]
     torch.nn.init.zeros_(network.ne_net.out.bias)  # type: ignore[union-attr,arg-type]
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
-        coarse = network(observations, lights)
+        coarse = network(observations, lights).normals
     with torch.no_grad():
-        torch.testing.assert_close(coarse, network(observations, lights), atol=1e-6, rtol=0)
+        torch.testing.assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)

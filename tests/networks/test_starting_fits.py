@@ -58,7 +58,7 @@ def test_an_untrained_network_gives_the_robust_lambertian_normal() -> None:
     observations, directions = pixels(30, 10)
     networks = [SplineNet(config) for config in (TINY, replace_fits(TINY))]
     with torch.no_grad():
-        plain, weighing = (network(observations, directions) for network in networks)
+        plain, weighing = (network(observations, directions).normals for network in networks)
     torch.testing.assert_close(plain, weighing)
 
 
@@ -71,7 +71,7 @@ def test_the_network_can_take_any_fit() -> None:
         with torch.no_grad():
             weigh.bias.copy_(torch.arange(len(NAMES) + 1) == place)
             for mirror in (False, True):
-                found = network(observations, directions, turn_deg=20.0, mirror=mirror)
+                found = network(observations, directions, turn_deg=20.0, mirror=mirror).normals
                 torch.testing.assert_close(found, fit_normals([name], observations, directions)[:, 0])
 
 

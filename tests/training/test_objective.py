@@ -143,11 +143,11 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     )  # fmt: skip
     with torch.no_grad():
         found = compute_losses(network, batch, config, part=part)
-        views = network.look(batch.observations, batch.light_directions, batch.valid)
+        views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
         dense_truth = dense_truth_in_frame(batch, views, size=32)
         normal_truth = to_pixel_frame(batch.scene.normals, views)
         dense = network.interpolate(views)
-        normals = network.estimate(views, dense)
+        normals = network.estimate(views, dense).normals
         cells = cell_directions(32)[1].sum()
         # Each term by the paper's formulas (eqs. 5 and 8).
         error = (dense - dense_truth.values).abs()
@@ -214,7 +214,7 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     observations = batch.scene.radiance(lights) * exposure
     seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.scene, exposure)
     # Without a turn beyond multiples of 90 degrees, centres stay centres.
-    views = network.look(observations, lights)._replace(
+    views = network.build_maps(observations, lights)._replace(
         cosine=torch.zeros(40), sine=torch.ones(40), mirrored=mirror
     )
     dense = dense_truth_in_frame(seen, views, size=32)
@@ -241,7 +241,7 @@ def test_truth_and_views_share_any_turn(tiny: TrainingConfig) -> None:
     network = SplineNet(replace(tiny.network, map_size=16))
     batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(5)
     turn_deg = torch.tensor([0.0, 10.0, -35.0, 90.0, 200.0])
-    views = network.look(batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg)
+    views = network.build_maps(batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg)
     dense = dense_truth_in_frame(batch, views, size=16)
     normals = to_pixel_frame(batch.scene.normals, views)
     azimuth = torch.atan2(batch.scene.normals[:, 1], batch.scene.normals[:, 0])

@@ -33,7 +33,7 @@ def test_validation_is_the_mean_angle_to_the_truth(network: SplineNet, batch: Pi
     found = validation_deg(network, batch)
     assert not network.training
     with torch.no_grad():
-        normals = network(batch.observations, batch.light_directions, batch.valid)
+        normals = network(batch.observations, batch.light_directions, batch.valid).normals
     cosine = (normals.double() * batch.scene.normals).sum(dim=1).clamp(-1, 1)
     assert found == pytest.approx(cosine.acos().rad2deg().mean().item(), abs=1e-3)
     assert all(parameter.grad is None for parameter in network.parameters())
@@ -47,11 +47,11 @@ def test_bfloat16_is_near(network: SplineNet, batch: PixelBatch) -> None:
 def test_the_maps_of_some_pixels(network: SplineNet, batch: PixelBatch) -> None:
     shown = sample_maps(network, batch)
     assert len(shown.sparse) == len(shown.dense) == len(shown.truth) == len(shown.error_deg) == SHOWN_PIXELS
-    views = network.look(batch.observations, batch.light_directions, batch.valid)
+    views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     inside = cell_directions()[1].numpy()
     with torch.no_grad():
         dense = network.interpolate(views)
-        normals = network(batch.observations, batch.light_directions, batch.valid)
+        normals = network(batch.observations, batch.light_directions, batch.valid).normals
     cosine = (normals.double() * batch.scene.normals).sum(dim=1).clamp(-1, 1)
     for index in range(SHOWN_PIXELS):
         pixel = 5 * index  # spread over the 40

@@ -107,7 +107,7 @@ class NetworkEstimator:
         total = batch.new_zeros(len(batch), 4)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
             for turn, mirror in self._views:
-                normals, error = self.network.normals_with_error(batch, lights, turn_deg=turn, mirror=mirror)
+                normals, error = self.network(batch, lights, turn_deg=turn, mirror=mirror)
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3] += probability_within(error, CONFIDENT_DEG)
@@ -134,20 +134,20 @@ class NetworkEstimator:
             shares of the largest of the F observations; NaN in cells that hold nothing.
         """
         device, network = self.device, self.network
-        views = network.look(
+        maps = network.build_maps(
             torch.as_tensor(observations, dtype=torch.float32, device=device),
             torch.as_tensor(light_directions, dtype=torch.float32, device=device),
         )
-        dense = network.interpolate(views)
+        dense = network.interpolate(maps)
         assert dense is not None, "CNN-PS has no dense maps"
         turned = rotate_about_view_axis(
             torch.as_tensor(all_directions, dtype=torch.float32, device=device).expand(
                 len(observations), -1, 3
             ),
-            views.cosine[:, None],
-            views.sine[:, None],
+            maps.cosine[:, None],
+            maps.sine[:, None],
         )
-        values = torch.as_tensor(all_observations, dtype=torch.float32, device=device) / views.scale
+        values = torch.as_tensor(all_observations, dtype=torch.float32, device=device) / maps.scale
         config = network.config
         every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
 
@@ -155,7 +155,7 @@ class NetworkEstimator:
             return np.asarray(values.masked_fill(holds == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
 
         inside = network.inside.expand_as(dense)
-        return known(views.sparse, views.holds), known(dense, inside), known(every.values, every.holds)
+        return known(maps.sparse, maps.holds), known(dense, inside), known(every.values, every.holds)
 
 
 def views(rotations: int, *, canonical: bool) -> list[tuple[float, bool]]:

@@ -15,7 +15,7 @@ The compact size differs from the paper's in four ways, all of them about learni
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -36,8 +36,8 @@ from splinecli.observation_map import (
 RESIDUAL_LIMIT = 3.0
 
 
-class Views(NamedTuple):
-    """What the networks see of P pixels, in each pixel's own frame.
+class PixelMaps(NamedTuple):
+    """Observation maps of P pixels and what belongs to them, in each pixel's own frame.
 
     sparse, holds, residual, lambertian_map: (P, 1, w, w); lambertian_normals (P, 3); scale (P, 1), the
     observation that the maps call 1; fitted_normals (P, K, 3), of the configuration's further fits; cosine,
@@ -54,6 +54,13 @@ class Views(NamedTuple):
     cosine: Tensor
     sine: Tensor
     mirrored: bool
+
+
+class Estimate(NamedTuple):
+    """Unit normals (P, 3), and the error head's distribution of their errors (P, 2), None without an error head."""
+
+    normals: Tensor
+    error: Tensor | None
 
 
 class SplineNet(nn.Module):
@@ -87,7 +94,7 @@ class SplineNet(nn.Module):
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)
         self.register_buffer("inside", inside.float()[None, None], persistent=False)
 
-    def look(
+    def build_maps(
         self,
         observations: Tensor,
         light_directions: Tensor,
@@ -95,7 +102,7 @@ class SplineNet(nn.Module):
         *,
         turn_deg: float | Tensor = 0.0,
         mirror: bool = False,
-    ) -> Views:
+    ) -> PixelMaps:
         """Maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
 
         Args:
@@ -130,7 +137,7 @@ class SplineNet(nn.Module):
         stacked = torch.stack((observed, residual), dim=-1)
         maps = sparse_map(stacked, lights, valid, size=side, grid=grid)
         lambertian_map = (scaled_normals @ self.cells.T).clamp(0, 1).view(-1, 1, side, side)
-        return Views(
+        return PixelMaps(
             maps.values[:, :1],
             maps.holds,
             maps.values[:, 1:],
@@ -143,37 +150,29 @@ class SplineNet(nn.Module):
             mirror,
         )
 
-    def interpolate(self, views: Views) -> Tensor | None:
-        """LI-Net: the dense maps (P, 1, w, w) of what was seen, zero outside the unit disc; None without one."""
+    def interpolate(self, maps: PixelMaps) -> Tensor | None:
+        """LI-Net: dense maps (P, 1, w, w), zero outside the unit disc; None for a network without LI-Net."""
         if self.li_net is None:
             return None
         if self.config.size == "paper":
-            dense: Tensor = self.li_net(views.sparse)
+            dense: Tensor = self.li_net(maps.sparse)
         else:
-            inputs = torch.cat((views.sparse, views.holds, views.residual, views.lambertian_map), dim=1)
-            dense = views.lambertian_map + self.li_net(inputs)
+            inputs = torch.cat((maps.sparse, maps.holds, maps.residual, maps.lambertian_map), dim=1)
+            dense = maps.lambertian_map + self.li_net(inputs)
         return dense * self.inside
 
-    def estimate(self, views: Views, dense: Tensor | None) -> Tensor:
-        """NE-Net: unit normals (P, 3) in the pixels' frames."""
-        return self.estimate_with_error(views, dense)[0]
-
-    def estimate_with_error(self, views: Views, dense: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """NE-Net: unit normals (P, 3) in the pixels' frames, and what its error head says (P, 2), None without one."""
-        interpolated = [] if dense is None else [dense.to(views.sparse.dtype)]
+    def estimate(self, maps: PixelMaps, dense: Tensor | None) -> Estimate:
+        """NE-Net: normals in the pixels' frames, and their errors."""
+        interpolated = [] if dense is None else [dense.to(maps.sparse.dtype)]
         if self.config.size == "paper":
-            raw, error = self.ne_net(torch.cat((views.sparse, *interpolated), dim=1)), None
+            raw, error = self.ne_net(torch.cat((maps.sparse, *interpolated), dim=1)), None
         else:
-            seen = (views.sparse, views.holds, views.residual, views.lambertian_map)
-            normals = torch.cat((views.lambertian_normals[:, None], views.fitted_normals), dim=1)
-            raw, error = self.ne_net(torch.cat((*seen, *interpolated), dim=1), normals)
-        return nn.functional.normalize(raw.float(), dim=-1), error
+            channels = (maps.sparse, maps.holds, maps.residual, maps.lambertian_map)
+            normals = torch.cat((maps.lambertian_normals[:, None], maps.fitted_normals), dim=1)
+            raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals)
+        return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)
 
-    def forward(self, *pixels: Any, **view: Any) -> Tensor:
-        """Unit normals (P, 3) in the capture's frame; arguments as in `look`."""
-        return self.normals_with_error(*pixels, **view)[0]
-
-    def normals_with_error(
+    def forward(
         self,
         observations: Tensor,
         light_directions: Tensor,
@@ -181,26 +180,30 @@ class SplineNet(nn.Module):
         *,
         turn_deg: float | Tensor = 0.0,
         mirror: bool = False,
-    ) -> tuple[Tensor, Tensor | None]:
-        """Unit normals (P, 3) in the capture's frame, and what the error head says (P, 2), None without one.
+    ) -> Estimate:
+        """Normals in the capture's frame, and their errors.
 
-        Arguments as in `look`.
+        Args:
+            observations: (P, F), linear, divided by the light intensities; any scale.
+            light_directions: (F, 3) or (P, F, 3), unit; x right, y up, z to the camera.
+            valid: (P, F) bool, all by default; the others are left out.
+            turn_deg, mirror: see build_maps.
         """
-        # Only the convolutions may run in bfloat16: the fit and the maps' geometry need every digit.
+        # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):
-            views = self.look(observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror)
-        normals, error = self.estimate_with_error(views, self.interpolate(views))
-        return to_capture_frame(normals, views), error
+            maps = self.build_maps(observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror)
+        normals, error = self.estimate(maps, self.interpolate(maps))
+        return Estimate(to_capture_frame(normals, maps), error)
 
 
-def to_capture_frame(normals: Tensor, views: Views) -> Tensor:
+def to_capture_frame(normals: Tensor, maps: PixelMaps) -> Tensor:
     """Turn normals (P, 3) from the pixels' frames back into the capture's."""
-    if views.mirrored:
+    if maps.mirrored:
         normals = normals * normals.new_tensor((1.0, -1.0, 1.0))
-    return rotate_about_view_axis(normals, views.cosine, -views.sine)
+    return rotate_about_view_axis(normals, maps.cosine, -maps.sine)
 
 
-def to_pixel_frame(vectors: Tensor, views: Views) -> Tensor:
+def to_pixel_frame(vectors: Tensor, maps: PixelMaps) -> Tensor:
     """Turn vectors (P, 3) from the capture's frame into the pixels'."""
-    turned = rotate_about_view_axis(vectors, views.cosine, views.sine)
-    return turned * turned.new_tensor((1.0, -1.0, 1.0)) if views.mirrored else turned
+    turned = rotate_about_view_axis(vectors, maps.cosine, maps.sine)
+    return turned * turned.new_tensor((1.0, -1.0, 1.0)) if maps.mirrored else turned

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splinecli.networks.error_head import error_surprise
-from splinecli.networks.spline_net import SplineNet, Views, to_pixel_frame
+from splinecli.networks.spline_net import SplineNet, PixelMaps, to_pixel_frame
 from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig
@@ -67,30 +67,30 @@ def compute_losses(
     NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). Where both are updated, the sum,
     with the angle once. The error head: minus the log-likelihood of the angle.
     """
-    views = network.look(
+    maps = network.build_maps(
         batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg, mirror=mirrored
     )
-    normal_truth = to_pixel_frame(batch.scene.normals, views)
+    normal_truth = to_pixel_frame(batch.scene.normals, maps)
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     if part == "error_head":
         with _fixed(network, part), autocast:
-            normals, error = network.estimate_with_error(views, network.interpolate(views))
+            normals, error = network.estimate(maps, network.interpolate(maps))
         assert error is not None, "TrainingConfig asks for an error head"
         angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
         return Losses(error_surprise(error, angle).mean(), angle.mean(), *[missing] * 4)
     with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
     # Half of the work of a batch; CNN-PS has no use for it.
-    dense_truth = dense_truth_in_frame(batch, views, size=network.config.map_size) if with_maps else None
+    dense_truth = dense_truth_in_frame(batch, maps, size=network.config.map_size) if with_maps else None
     with _fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
-            dense = network.interpolate(views)
-        normals = network.estimate(views, dense)
+            dense = network.interpolate(maps)
+        normals = network.estimate(maps, dense).normals
     angle = angular_loss(normals, normal_truth)
     on_map = masked = angle.new_full((), torch.nan)
     if dense is not None and dense_truth is not None:
         dense = dense.float()
         on_map = map_loss(dense, dense_truth.values, dense_truth.known)
-        masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, views.holds)
+        masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, maps.holds)
     symmetric = asymmetric = angle.new_full((), torch.nan)
     if dense_truth is not None and (config.symmetric_weight or config.asymmetric_weight):
         symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
@@ -98,7 +98,7 @@ def compute_losses(
     if part != "ne_net" and dense is not None and dense_truth is not None:
         against = (dense, dense_truth.values, dense_truth.known)
         total = total + config.map_weight * map_loss(*against, config.li_net_norm)
-        total = total + config.masked_weight * masked_map_loss(*against, views.holds, config.li_net_norm)
+        total = total + config.masked_weight * masked_map_loss(*against, maps.holds, config.li_net_norm)
     if config.symmetric_weight:
         total = total + config.symmetric_weight * symmetric
     if config.asymmetric_weight:
@@ -131,12 +131,12 @@ def _special(
     return symmetric, asymmetric
 
 
-def dense_truth_in_frame(batch: PixelBatch, views: Views, *, size: int) -> DenseMap:
+def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> DenseMap:
     """D_gt in the pixels' frames, at the sparse map's scale, cut at 1."""
-    dense = batch.scene.rotate(views.cosine, views.sine).dense_truth(size)
-    values = (dense.values * (batch.exposure / views.scale)[..., None, None]).clamp(max=1)
+    dense = batch.scene.rotate(maps.cosine, maps.sine).dense_truth(size)
+    values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
     dense = DenseMap(values, dense.known, dense.filled)
-    return dense.flip_y() if views.mirrored else dense
+    return dense.flip_y() if maps.mirrored else dense
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.networks.spline_net import SplineNet, Views, to_pixel_frame
+from splinecli.networks.spline_net import SplineNet, PixelMaps, to_pixel_frame
 from splinecli.normals import angle_between_deg
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.training.losses import angular_loss
@@ -21,8 +21,8 @@ SHOWN_PIXELS = 8
 
 def validation_deg(network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False) -> float:
     """Mean angular error in degrees."""
-    views, _, normals = _estimate(network, batch, bfloat16=bfloat16)
-    return math.degrees(angular_loss(normals, to_pixel_frame(batch.scene.normals, views)).item())
+    maps, _, normals = _estimate(network, batch, bfloat16=bfloat16)
+    return math.degrees(angular_loss(normals, to_pixel_frame(batch.scene.normals, maps)).item())
 
 
 class SampleMaps(NamedTuple):
@@ -40,9 +40,9 @@ class SampleMaps(NamedTuple):
 def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
     """What the networks see, guess and should have guessed of some pixels of a batch, spread evenly over it."""
     step = max(1, len(batch.observations) // SHOWN_PIXELS)
-    views, dense, normals = _estimate(network, batch)
-    truth = dense_truth_in_frame(batch, views, size=network.config.map_size)
-    normal_truth = to_pixel_frame(batch.scene.normals, views)
+    maps, dense, normals = _estimate(network, batch)
+    truth = dense_truth_in_frame(batch, maps, size=network.config.map_size)
+    normal_truth = to_pixel_frame(batch.scene.normals, maps)
 
     def picture(values: Tensor, known: Tensor) -> NDArray[np.float32]:
         values = values.float().masked_fill(known == 0, torch.nan)
@@ -51,7 +51,7 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
 
     error_deg = angle_between_deg(normals.cpu().numpy(), normal_truth.cpu().numpy())
     return SampleMaps(
-        picture(views.sparse, views.holds),
+        picture(maps.sparse, maps.holds),
         None if dense is None else picture(dense, network.inside.expand_as(dense)),
         picture(truth.values, truth.filled),
         error_deg[::step][:SHOWN_PIXELS].astype(np.float32),
@@ -61,11 +61,11 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
 @torch.no_grad()
 def _estimate(
     network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
-) -> tuple[Views, Tensor | None, Tensor]:
+) -> tuple[PixelMaps, Tensor | None, Tensor]:
     """What the networks see, LI-Net's dense maps and NE-Net's normals, in the pixels' frames."""
     network.eval()
-    views = network.look(batch.observations, batch.light_directions, batch.valid)
+    maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-        dense = network.interpolate(views)
-        normals = network.estimate(views, dense)
-    return views, dense, normals
+        dense = network.interpolate(maps)
+        normals = network.estimate(maps, dense).normals
+    return maps, dense, normals
