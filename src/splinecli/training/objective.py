@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splinecli.networks.error_head import error_surprise
-from splinecli.networks.spline_net import SplineNet, PixelMaps, to_pixel_frame
+from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.networks.spline_net import SplineNet, PixelMaps, to_pixel_frame
+from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.normals import angle_between_deg
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.training.losses import angular_loss
