@@ -243,3 +243,15 @@ def test_infer_medallion_runs_from_any_folder(tmp_path):
     assert said.startswith("spline-net, 10 lights: MAE ")
     made = {path.name for path in (tmp_path / "here" / "medallion").iterdir()}
     assert made == {"normals.png", "normals.npy", "error_map.png", "report.json"}
+
+
+@needs_weights
+def test_the_overview_is_what_the_script_draws(tmp_path):
+    """The README's picture matches the results of today; fonts and rounding differ a little between machines."""
+    run([sys.executable, str(EXAMPLES / "make_overview.py"), "overview.png"], tmp_path)
+    drawn, stored = read_png(tmp_path / "overview.png"), read_png(TUTORIAL.parent / "pictures/overview.png")
+    assert drawn.shape == stored.shape == (400, 1200, 3)
+    assert (TUTORIAL.parent / "pictures/overview.png").stat().st_size < 400_000
+    difference = np.abs(drawn.astype(int) - stored)
+    assert np.quantile(difference[:340], 0.99) <= 8  # two of the picture's steps
+    assert difference.mean() < 0.5
