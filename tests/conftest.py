@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from browser import browser, open_page
+
+__all__ = ["browser", "open_page"]
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
-import shutil
-import subprocess
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from browser import OpenPage
 from html_page import HtmlPage
 from splinecli.normals import angle_between_deg, unit
 from splinecli.results.files import albedo_picture
@@ -41,12 +37,6 @@ REPORT: dict[str, Any] = {
 }
 HOSTILE = """</script><script>document.title = "x"</script>'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
 SIDE = 256  # pixels, of the sphere
-
-BROWSERS = (
-    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
-    *("chromium-headless-shell", "chrome-headless-shell", "headless_shell"),
-)
-"""Names on the path or in Playwright's cache."""
 
 
 def sphere(side: int = SIDE) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -195,59 +185,18 @@ def test_large_maps_are_reduced() -> None:
         assert np.ptp(colours, axis=0).max() <= 1  # of rounding, nothing of the background
 
 
-@pytest.fixture(scope="session")
-def browser() -> str:
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    cached = (
-        path
-        for path in sorted(Path.home().glob(".cache/ms-playwright/chromium*/*/*"))
-        if path.name in BROWSERS
-    )
-    browser = found or next(map(str, cached), None)
-    if browser is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} on the path or in Playwright's cache")
-    return browser
-
-
-@pytest.fixture
-def run_browser(browser: str, tmp_path: Path) -> Callable[..., bytes]:
-    def run(html: str, fragment: str, *options: str, webgl: bool = True) -> bytes:
-        """What the browser prints; WebGL is that of SwiftShader, on the processor."""
-        (tmp_path / "page.html").write_text(html, "utf-8")
-        driver = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        return subprocess.run(
-            [
-                browser,
-                "--headless",
-                "--no-sandbox",  # of no use to root, nor for a page of our own
-                "--disable-dev-shm-usage",
-                "--force-color-profile=srgb",
-                "--force-device-scale-factor=1",
-                "--virtual-time-budget=3000",
-                f"--user-data-dir={tmp_path / 'profile'}",
-                *(driver if webgl else ["--disable-3d-apis"]),
-                *options,
-                f"{(tmp_path / 'page.html').as_uri()}#{fragment}",
-            ],
-            check=True,
-            capture_output=True,
-            timeout=60,
-        ).stdout
-
-    return run
-
-
-def view(
-    run_browser: Callable[..., bytes], folder: Path, html: str, fragment: str, *, webgl: bool = True
-) -> NDArray[np.uint8]:
-    """What the view shows, (SIDE, SIDE, 3) RGB, laid over the page, pixel by pixel."""
-    # Not over the window's corner, where a headless browser believes the pointer to be.
-    edge, shot = 64, folder / "shot.png"
+def view(open_page: OpenPage, html: str, fragment: str, *, webgl: bool = True) -> NDArray[np.uint8]:
+    """A screenshot of the view, (SIDE, SIDE, 3) RGB, one screen pixel for each pixel of the map."""
+    # At the window's edge the view would be under the place where a headless browser's pointer rests.
+    edge = 64
     style = f"#view {{ position: fixed; left: {edge}px; top: {edge}px; width: {SIDE}px; border-radius: 0 }}"
-    html = html.replace("</head>", f"<style>{style}</style></head>")
-    run_browser(html, fragment, f"--screenshot={shot}", "--window-size=800,600", webgl=webgl)
-    window = cv2.imread(str(shot))
-    return np.asarray(window[edge : edge + SIDE, edge : edge + SIDE, ::-1], np.uint8)
+    page = open_page(html.replace("</head>", f"<style>{style}</style></head>"), fragment, webgl=webgl)
+    page.evaluate("splinecli.ready")
+    assert page.evaluate("document.getElementById('view').dataset.renderer") == (
+        "webgl" if webgl else "software"
+    )
+    png = page.screenshot(clip={"x": edge, "y": edge, "width": SIDE, "height": SIDE})
+    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
 
 
 def light_at(x: float, y: float) -> NDArray[np.float64]:
@@ -255,13 +204,11 @@ def light_at(x: float, y: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("webgl", [True, False])
-def test_a_matte_sphere_is_lit_by_the_cosine(
-    run_browser: Callable[..., bytes], tmp_path: Path, webgl: bool
-) -> None:
+def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = sphere()
     html = result_page(REPORT, normals, mask)
     for x, y in ((-0.7, 0.5), (0.6, -0.3)):
-        seen = view(run_browser, tmp_path, html, f"light={x},{y}&specular=0", webgl=webgl).astype(int)
+        seen = view(open_page, html, f"light={x},{y}&specular=0", webgl=webgl).astype(int)
         expected = encode_srgb(np.maximum(normals @ light_at(x, y), 0)).astype(int)
         # Half a level each for the screen and the picture, and one where sRGB is steep: 13 bits of the normal there.
         assert np.abs(seen - expected[..., None]).max() <= 2
@@ -270,10 +217,10 @@ def test_a_matte_sphere_is_lit_by_the_cosine(
         assert np.sign(SIDE / 2 - rows.mean()) == np.sign(y)
 
 
-def test_an_enlarged_view_interpolates_normals(run_browser: Callable[..., bytes], tmp_path: Path) -> None:
-    """And not the digits they are packed in, which at a carry of the lower one would be off by up to 25 levels."""
+def test_an_enlarged_view_interpolates_normals(open_page: OpenPage) -> None:
+    """The view interpolates normals, not the two bytes that store them, which would be off by up to 25 levels."""
     html = result_page(REPORT, *sphere(SIDE // 4))
-    seen = view(run_browser, tmp_path, html, "light=-0.7,0.5&specular=0").astype(int)
+    seen = view(open_page, html, "light=-0.7,0.5&specular=0").astype(int)
     normals, _ = sphere()
     expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
     # Away from the outline and the terminator, whose bends four pixels cannot follow.
@@ -281,8 +228,8 @@ def test_an_enlarged_view_interpolates_normals(run_browser: Callable[..., bytes]
     assert np.abs(seen - expected[..., None])[smooth].max() <= 3
 
 
-def test_a_glossy_sphere_of_two_colours(run_browser: Callable[..., bytes], tmp_path: Path) -> None:
-    """Blinn and Phong's normalised lobe, and the albedo as its picture stores it."""
+def test_a_glossy_sphere_of_two_colours(open_page: OpenPage) -> None:
+    """The view shows Blinn and Phong's normalised lobe, and the albedo as its picture stores it."""
     normals, mask = sphere()
     albedo = np.where(
         np.arange(SIDE)[:, None] < 100, np.float32([0.8, 0.2, 0.1]), np.float32([0.1, 0.3, 0.5])
@@ -300,50 +247,47 @@ def test_a_glossy_sphere_of_two_colours(run_browser: Callable[..., bytes], tmp_p
     html = result_page(REPORT, normals, mask, albedo=albedo)
     fragment = f"light=-0.5,0.4&specular={gain}&shininess={shininess}"
     for base, choice in ((stored, ""), (1, "&albedo=0")):
-        seen = view(run_browser, tmp_path, html, fragment + choice)
+        seen = view(open_page, html, fragment + choice)
         expected = encode_srgb(((1 - gain) * base + gain * lobe) * cosine)
         assert np.abs(seen.astype(int) - expected).max() <= 3
 
 
 INTERACTION = """
-<script>
-splinecli.ready.then(() => {
+async () => {
+  await splinecli.ready;
   const view = document.getElementById("view"), box = view.getBoundingClientRect(), seen = {};
   const radius = Math.min(box.width, box.height) / 2;
-  const tell = (name) => { seen[name] = splinecli.light; };
+  const note = (name) => { seen[name] = splinecli.light; };
   const point = (type, x, y, pointerType) => view.dispatchEvent(new PointerEvent(type, {
     clientX: box.left + box.width / 2 + x * radius, clientY: box.top + box.height / 2 - y * radius, pointerType,
   }));
   const press = (key) => view.dispatchEvent(new KeyboardEvent("keydown", { key }));
-  tell("first");
-  point("pointermove", 0, 0, "mouse"); tell("centre");
-  press("ArrowRight"); press("ArrowUp"); press("ArrowUp"); tell("arrows");
-  point("pointermove", 3, 4, "mouse"); tell("beyond");
-  point("pointerdown", 0.3, 0.3, "mouse"); point("pointermove", -0.5, 0, "mouse"); tell("held");
-  point("pointermove", -0.2, 0.1, "touch"); tell("touch");
-  splinecli.setLight(NaN, 0); tell("nonsense");
-  splinecli.setLight(0.1, -0.2); tell("set");
-  seen.renderer = view.dataset.renderer;
-  seen.notice = !document.getElementById("notice").hidden;
-  seen.overflow = document.documentElement.scrollWidth - innerWidth;
-  document.body.append(Object.assign(document.createElement("pre"), { textContent: JSON.stringify(seen) }));
-});
-</script>
+  note("first");
+  point("pointermove", 0, 0, "mouse"); note("centre");
+  press("ArrowRight"); press("ArrowUp"); press("ArrowUp"); note("arrows");
+  point("pointermove", 3, 4, "mouse"); note("beyond");
+  point("pointerdown", 0.3, 0.3, "mouse"); point("pointermove", -0.5, 0, "mouse"); note("held");
+  point("pointermove", -0.2, 0.1, "touch"); note("touch");
+  splinecli.setLight(NaN, 0); note("nonsense");
+  splinecli.setLight(0.1, -0.2); note("set");
+  return seen;
+}
 """
 
 
 @pytest.mark.parametrize("webgl", [True, False])
-def test_pointer_keys_and_a_narrow_screen(run_browser: Callable[..., bytes], webgl: bool) -> None:
+def test_pointer_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = sphere()
     report = {**REPORT, "capture": "x" * 300, "warnings": ["y" * 300]}
     errors = np.where(mask, np.float32(3), np.nan)
     html = result_page(report, normals, mask, albedo=normals + 1, error_map_deg=errors)
-    html = html.replace("</body>", f"{INTERACTION}</body>")
-    dom = run_browser(html, "", "--dump-dom", "--window-size=400,800", webgl=webgl).decode()
-    seen = json.loads(dom.partition("<pre>")[2].partition("</pre>")[0])
-    assert seen["renderer"] == ("webgl" if webgl else "software")
-    assert seen["notice"] is not webgl
-    assert seen["overflow"] <= 0
+    page = open_page(html, width=400, height=800, webgl=webgl)
+    seen = page.evaluate(INTERACTION)
+    assert page.evaluate("document.getElementById('view').dataset.renderer") == (
+        "webgl" if webgl else "software"
+    )
+    assert page.locator("#notice").is_visible() is not webgl
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
     lights = {
         "first": (-0.72, 0.48),  # the preview's raking light, from the upper left
         "centre": (0, 0),
