@@ -19,7 +19,7 @@ TIGHT = {"tolerance": 1e-9, "max_iterations": 400}
 
 
 def grid(height: int, width: int) -> tuple[Floats, Floats]:
-    """x (columns) and y, up, of the pixels (H, W), about the centre."""
+    """Return x (right) and y (up) of the pixels (H, W), from the centre."""
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     return columns - (width - 1) / 2, (height - 1) / 2 - rows
 
@@ -29,7 +29,7 @@ def normals_of_slopes(along_x: Floats, along_y: Floats) -> Floats:
 
 
 def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats, Mask, Floats]:
-    """Normals, mask and heights of the cap within `reach` of the radius, not centred on a pixel."""
+    """Return normals, mask and heights of the cap within `reach` of the radius, not centred on a pixel."""
     x, y = grid(height, width)
     x, y = x + 0.3, y - 0.2
     mask = x**2 + y**2 < (reach * radius) ** 2
@@ -38,7 +38,7 @@ def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats
 
 
 def bumps(height: int, width: int, seed: int = 0) -> Floats:
-    """Normals that no surface has: smooth ones with noise, some nearly grazing and some facing away."""
+    """Return normals that no surface has: smooth ones with noise, some nearly grazing, some facing away."""
     rng = np.random.default_rng(seed)
     x, y = grid(height, width)
     normals = normals_of_slopes(np.sin(x / 3) + y / height, np.cos(y / 2))
@@ -48,7 +48,7 @@ def bumps(height: int, width: int, seed: int = 0) -> Floats:
 
 
 def holes(height: int, width: int, seed: int = 1) -> Mask:
-    """A ragged mask of several parts, with strips one pixel wide and pixels on their own."""
+    """Return a ragged mask of several parts, with strips one pixel wide and single pixels."""
     mask: Mask = np.random.default_rng(seed).uniform(size=(height, width)) < 0.7
     mask[:, width // 2] = False
     mask[1, :] = True
@@ -58,7 +58,7 @@ def holes(height: int, width: int, seed: int = 1) -> Mask:
 
 
 def error_share(found: Floats, truth: Floats, mask: Mask) -> float:
-    """The mean error, offset apart, as a share of the range of the truth."""
+    """Return the mean error without the offset, as a share of the range of the truth."""
     error = (found - truth)[mask]
     return float(np.abs(error - np.median(error)).mean() / np.ptp(truth[mask]))
 
@@ -92,8 +92,10 @@ def test_tent_of_unequal_sides() -> None:
 
 
 def levels(rows: int, columns: int, height: float, slope: float, joined: int) -> tuple[Floats, Floats, Mask]:
-    """Normals and heights of two flat levels; in the first `joined` rows a ramp leads from one up to the other. The
-    rest of the border is a wall one pixel thick, true in the mask, that faces the lower level and nearly all aside.
+    """Return normals and heights of two flat levels, and the mask of the wall between them.
+
+    In the first `joined` rows, a ramp connects the levels. The wall is one pixel thick and faces the lower level,
+    nearly at a right angle to the view.
     """
     x, _ = grid(rows, columns)
     x = np.ceil(x)
@@ -133,7 +135,7 @@ def test_plane_is_exact(shape: tuple[int, int], slopes: tuple[float, float]) -> 
 
 
 def seen(camera: Floats, height: int, width: int) -> Floats:
-    """Points (H, W, 3) at depth 1 in the frame that the pixels show: by hand, for a camera without skew."""
+    """Return the points (H, W, 3) at depth 1 that the pixels show, by hand, for a camera without skew."""
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     x, down = (columns - camera[0, 2]) / camera[0, 0], (rows - camera[1, 2]) / camera[1, 1]
     return np.stack((x, -down, -np.ones_like(x)), axis=-1)
@@ -181,8 +183,9 @@ def test_a_camera_far_away_is_orthographic() -> None:
 
 
 def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
-    """facing * (h' - h) + slant to the right, left, bottom and top: matrices (P, P) and constants (P,), zero for what
-    is not there. Normals at 87 degrees and more say nothing.
+    """Return matrices (P, P) and constants (P,) of facing * (h' - h) + slant to the right, left, bottom and top.
+
+    Equations without a neighbour, and those of normals at 87 degrees and more, are zero.
     """
     number = {(int(r), int(c)): i for i, (r, c) in enumerate(np.argwhere(mask))}
     matrices, constants = [], []
@@ -201,7 +204,7 @@ def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
 
 
 def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Floats:
-    """The same by the pseudo-inverse, whose heights have mean 0 in every part."""
+    """Return the heights (P,) by the pseudo-inverse, which have mean 0 in every part."""
     matrices, constants = equations(normals, mask)
     heights = np.zeros(np.count_nonzero(mask))
     for iteration in range(iterations):
@@ -246,7 +249,7 @@ def test_parts_are_independent() -> None:
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_single_pixels_and_normals_that_tell_nothing(camera: Floats | None) -> None:
+def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) -> None:
     normals, mask = bumps(12, 17), holes(12, 17)
     middle = 0.0 if camera is None else 1.0
     for some in (
@@ -291,15 +294,44 @@ def test_mirror() -> None:
     np.testing.assert_allclose(mirrored, found[:, ::-1], atol=5e-3)
 
 
-def test_inputs_stay_and_progress_is_told() -> None:
+def test_inputs_do_not_change_and_progress_is_reported() -> None:
     normals, mask, _ = sphere(40, 50, 30, 0.9)
-    kept, told = normals.copy(), []
-    integrate_normals(normals, mask, max_iterations=2, progress=lambda done, most: told.append((done, most)))
+    kept, calls = normals.copy(), []
+    integrate_normals(normals, mask, max_iterations=2, progress=lambda done, most: calls.append((done, most)))
     np.testing.assert_array_equal(normals, kept)
-    assert told == [(1, 2), (2, 2)]
+    assert calls == [(1, 2), (2, 2)]
 
 
-def test_normals_of_nearly_unit_length_are_taken() -> None:
+@pytest.mark.parametrize("background", [0.0, np.nan])
+def test_without_a_mask_all_normals_count(background: float) -> None:
+    normals, mask, _ = sphere(40, 50, 30, 0.9)
+    expected = integrate_normals(normals, mask)
+    found = integrate_normals(np.where(mask[..., None], normals, background))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("normals", "error", "message"),
+    [
+        (np.zeros((3, 4, 3)), InputError, "the normal map has no normal"),
+        (np.zeros((3, 4)), UsageError, r"the normal map has shape \(3, 4\), expected \(H, W, 3\)"),
+    ],
+)
+def test_without_a_mask_and_without_normals(
+    normals: Floats, error: type[SplinecliError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        integrate_normals(normals)
+
+
+def test_the_camera_matrix_may_be_the_third_argument() -> None:
+    normals, mask, _ = sphere(40, 50, 30, 0.9)
+    np.testing.assert_array_equal(
+        integrate_normals(normals, mask, CAMERA), integrate_normals(normals, mask, camera_matrix=CAMERA)
+    )
+
+
+def test_normals_of_nearly_unit_length_are_accepted() -> None:
     normals, mask, _ = sphere(40, 50, 30, 0.9)
     np.testing.assert_allclose(
         integrate_normals(normals * 1.009, mask), integrate_normals(normals, mask), atol=1e-9
@@ -318,13 +350,13 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
             (NORMALS[..., :2], MASK),
             {},
             UsageError,
-            "the normal map has shape (3, 4, 2), expected (3, 4, 3) as the mask.",
+            "the normal map has shape (3, 4, 2), expected (3, 4, 3) for this mask.",
         ),
         (
             (NORMALS, MASK.T),
             {},
             UsageError,
-            "the normal map has shape (3, 4, 3), expected (4, 3, 3) as the mask.",
+            "the normal map has shape (3, 4, 3), expected (4, 3, 3) for this mask.",
         ),
         ((NORMALS, MASK.astype(np.uint8)), {}, UsageError, "the mask is uint8 (3, 4), expected bool (H, W)."),
         ((NORMALS, ~MASK), {}, InputError, "the mask is empty. Mark the pixels of the object in it."),
@@ -332,14 +364,14 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
             (ZERO_AT_1_2, MASK),
             {},
             InputError,
-            "1 of 12 normals in the mask are not unit vectors, the first in row 1, column 2. Take pixels without a "
+            "1 of 12 normals in the mask are not unit vectors, the first in row 1, column 2. Leave pixels without a "
             "normal out of the mask.",
         ),
         (
             (NORMALS * np.nan, MASK),
             {},
             InputError,
-            "12 of 12 normals in the mask are not unit vectors, the first in row 0, column 0. Take pixels without a "
+            "12 of 12 normals in the mask are not unit vectors, the first in row 0, column 0. Leave pixels without a "
             "normal out of the mask.",
         ),
         (
@@ -352,16 +384,21 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
             (NORMALS, MASK),
             {"camera_matrix": np.diag([9.0, 0, 1])},
             InputError,
-            "[[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]] is no camera matrix [[fx, s, cx], [0, fy, cy], "
-            "[0, 0, 1]] with fx and fy above zero. Give it in pixels, columns to the right and rows down.",
+            "[[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]] is not a camera matrix [[fx, s, cx], [0, fy, cy], "
+            "[0, 0, 1]] with positive fx and fy. Give it in pixels, with columns to the right and rows down.",
         ),
-        ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected a number from 0 up."),
+        (
+            (NORMALS, MASK),
+            {"stiffness": -1},
+            UsageError,
+            "the stiffness is -1, expected a number of at least 0.",
+        ),
         ((NORMALS, MASK), {"max_iterations": 0}, UsageError, "max_iterations is 0, expected at least 1."),
         (
             (NORMALS, MASK),
             {"tolerance": np.nan},
             UsageError,
-            "the tolerance is nan, expected a number from 0 up.",
+            "the tolerance is nan, expected a number of at least 0.",
         ),
     ],
 )
@@ -379,5 +416,5 @@ def test_bad_input(
     ids=["nan", "upwards", "transposed", "doubled", "ones"],
 )
 def test_no_camera_matrix(matrix: Floats) -> None:
-    with pytest.raises(InputError, match="is no camera matrix"):
+    with pytest.raises(InputError, match="is not a camera matrix"):
         integrate_normals(NORMALS, MASK, camera_matrix=matrix)

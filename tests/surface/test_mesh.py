@@ -143,7 +143,7 @@ def test_unknown_kind_of_file(tmp_path: Path) -> None:
     mesh = surface_mesh(wave(), ragged())
     with pytest.raises(UsageError) as caught:
         write_mesh(mesh, tmp_path / "mesh.stl")
-    expected = f"{tmp_path / 'mesh.stl'}: no kind of mesh. Give it a name that ends in .ply or .obj."
+    expected = f"{tmp_path / 'mesh.stl'}: unknown mesh format. Give it a name that ends in .ply or .obj."
     assert str(caught.value) == expected
     assert not list(tmp_path.iterdir())
 
@@ -161,7 +161,7 @@ def test_place_that_cannot_be_written(tmp_path: Path) -> None:
             (wave(3, 4), np.ones((4, 3), bool)),
             {},
             UsageError,
-            "the depth has shape (3, 4), expected (4, 3) as the mask.",
+            "the depth has shape (3, 4), expected (4, 3) for this mask.",
         ),
         (
             (wave(3, 4), np.ones((3, 4))),
@@ -179,13 +179,14 @@ def test_place_that_cannot_be_written(tmp_path: Path) -> None:
             (wave(3, 4) * np.nan, np.ones((3, 4), bool)),
             {},
             InputError,
-            "a depth in the mask is not finite. Give the mask that the depth was found in.",
+            "a depth in the mask is not finite. Give the mask that integrate_normals had.",
         ),
         (
             (wave(3, 4) - 9, np.ones((3, 4), bool), CAMERA),
             {},
             InputError,
-            "a depth in the mask is not positive. With a camera matrix depths are needed.",
+            "a depth in the mask is not positive. With a camera matrix, give depths along the viewing axis instead of "
+            "heights.",
         ),
         (
             (wave(3, 4), np.ones((3, 4), bool), None, np.zeros((3, 4, 3))),
@@ -197,7 +198,7 @@ def test_place_that_cannot_be_written(tmp_path: Path) -> None:
             (wave(3, 4), np.ones((3, 4), bool)),
             {"largest_step": -1},
             UsageError,
-            "the largest step is -1, expected a number from 0 up.",
+            "the largest step is -1, expected a number of at least 0.",
         ),
         (
             (wave(3, 4) + 9, np.ones((3, 4), bool), np.eye(2)),

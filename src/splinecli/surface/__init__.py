@@ -1,1 +1,1 @@
-"""Surfaces from normals: heights by integration, triangle meshes and their files. Arrays in, arrays out."""
+"""Surfaces from normals: integration to heights, triangle meshes, and their files."""

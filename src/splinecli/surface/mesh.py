@@ -1,7 +1,8 @@
 """Triangle meshes of height and depth maps, and their files.
 
-Frame: x right, y up, z to the camera (docs/conventions.md), in pixels for an orthographic camera, about the centre of
-the picture; in the unit of the depth for a pinhole, which is at the origin.
+Frame: x right, y up, z to the camera (docs/conventions.md). For an orthographic camera, coordinates are in pixels and
+the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the origin is the
+camera.
 """
 
 from __future__ import annotations
@@ -14,13 +15,17 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
 from splinecli.files import write_bytes
-from splinecli.surface.integration import focal_length, pixel_rays
+from splinecli.surface.camera import focal_length, pixel_rays
 
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """vertices (V, 3) float32; triangles (T, 3) int32 rows of vertices, counter-clockwise seen from the camera;
-    colours (V, 3) uint8 RGB of the vertices, if any.
+    """A triangle mesh.
+
+    Args:
+        vertices: (V, 3) float32.
+        triangles: (T, 3) int32, the numbers of three vertices each, counter-clockwise as the camera sees them.
+        colours: (V, 3) uint8, RGB of the vertices, or None.
     """
 
     vertices: NDArray[np.float32]
@@ -36,21 +41,24 @@ def surface_mesh(
     *,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """The mesh of what integrate_normals gave: a vertex for each pixel of the mask, row by row.
+    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by row.
 
-    Four neighbours in a square make two triangles, split along the diagonal whose ends differ less in height, and
-    three make one.
+    Four pixels of the mask in a square make two triangles, split along the diagonal whose ends differ less in height.
+    Three make one triangle.
 
     Args:
-        depth: (H, W), finite in the mask (H, W): heights, or with a camera matrix positive depths.
-        camera_matrix: as for integrate_normals.
-        colours: (H, W, 3) uint8 RGB.
-        largest_step: triangles are left out whose corners differ by more in height, in pixels (as large as pixels
-            are at that depth): the walls along which the surface is torn. None keeps them.
+        depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix, as
+            integrate_normals returns them.
+        mask: (H, W), True on the object.
+        camera_matrix: (3, 3), the one that integrate_normals had, or None.
+        colours: (H, W, 3) uint8 RGB, or None.
+        largest_step: leaves out triangles whose corners differ by more than this in height, in pixels (for a pinhole
+            camera, in pixels at the depth of the triangle). They are the walls where the surface is torn. None keeps
+            all triangles.
 
     Raises:
-        UsageError: the arrays' shapes or types do not fit, or an option is out of range.
-        InputError: a depth in the mask is not finite, or not positive; or the camera matrix is none.
+        UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
+        InputError: a depth in the mask is not finite or not positive, or the camera matrix is not valid.
     """
     _check(depth, mask, colours, largest_step)
     values = depth[mask].astype(np.float64)
@@ -63,7 +71,8 @@ def surface_mesh(
         vertices = values[:, None] * pixel_rays(mask, camera_matrix)
         if not (values > 0).all():
             raise InputError(
-                "a depth in the mask is not positive", hint="With a camera matrix depths are needed"
+                "a depth in the mask is not positive",
+                hint="With a camera matrix, give depths along the viewing axis instead of heights",
             )
         heights = -focal_length(camera_matrix) * np.log(values)
     triangles = _triangles(heights, mask)
@@ -77,21 +86,23 @@ def surface_mesh(
 
 
 def write_mesh(mesh: SurfaceMesh, path: str | Path) -> None:
-    """Write a binary .ply, or an .obj with the colours, 0 to 1, behind the coordinates of each vertex.
+    """Write a mesh as binary .ply, or as .obj with the colours (0 to 1) after the coordinates of each vertex.
 
-    Raises UsageError for any other name and OutputError where the file cannot be written.
+    Raises:
+        UsageError: the name ends in neither .ply nor .obj.
+        OutputError: the file cannot be written.
     """
     path = Path(path)
     encoders = {".ply": _ply, ".obj": _obj}
     if path.suffix.lower() not in encoders:
-        raise UsageError(f"{path}: no kind of mesh", hint="Give it a name that ends in .ply or .obj")
+        raise UsageError(f"{path}: unknown mesh format", hint="Give it a name that ends in .ply or .obj")
     write_bytes(path, encoders[path.suffix.lower()](mesh))
 
 
 def _triangles(heights: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
-    # The corners of each square from the top left on, counter-clockwise: y is up.
+    # The corners of each square, counter-clockwise from the top left (y is up).
     squares = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1).reshape(
         -1, 4
     )
@@ -142,7 +153,7 @@ def _obj(mesh: SurfaceMesh) -> bytes:
 
 
 def _lines(line: str, rows: NDArray[np.generic]) -> str:
-    # One formatting of everything: several times as fast as one for each line.
+    # A single format operation is several times as fast as one for each line.
     return f"{line}\n" * len(rows) % tuple(rows.ravel().tolist())
 
 
@@ -155,16 +166,14 @@ def _check(
     if mask.ndim != 2 or mask.dtype != np.bool_:
         raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
     if depth.shape != mask.shape:
-        raise UsageError(f"the depth has shape {depth.shape}, expected {mask.shape} as the mask")
+        raise UsageError(f"the depth has shape {depth.shape}, expected {mask.shape} for this mask")
     if colours is not None and (colours.shape != (*mask.shape, 3) or colours.dtype != np.uint8):
         raise UsageError(
             f"the colours are {colours.dtype} {colours.shape}, expected uint8 {(*mask.shape, 3)}"
         )
     if largest_step is not None and not largest_step >= 0:
-        raise UsageError(f"the largest step is {largest_step:g}, expected a number from 0 up")
+        raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
     if not mask.any():
         raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
     if not np.isfinite(depth[mask]).all():
-        raise InputError(
-            "a depth in the mask is not finite", hint="Give the mask that the depth was found in"
-        )
+        raise InputError("a depth in the mask is not finite", hint="Give the mask that integrate_normals had")

@@ -1,4 +1,4 @@
-"""The files of a surface: meshes, and its depth as float32 NPY and TIFF."""
+"""The files of a surface: meshes, and the depth map as float32 NPY and TIFF."""
 
 from __future__ import annotations
 
@@ -13,26 +13,36 @@ from splinecli.files import write_bytes
 from splinecli.surface.mesh import SurfaceMesh, write_mesh
 
 SURFACE_FILES = {"ply": "mesh.ply", "obj": "mesh.obj", "npy": "depth.npy", "tiff": "depth.tiff"}
-"""By the names of their forms."""
+"""The file name of each format."""
 
 SURFACE_REPORT = "surface.json"
-"""Beside them, where `integrate` wrote them."""
+"""The report that `integrate` writes beside them."""
 
-USUAL_FORMS = ("ply", "npy", "tiff")
+DEFAULT_FORMATS = ("ply", "npy", "tiff")
 
 
 def write_surface(
-    folder: Path, depth: NDArray[np.floating], mesh: SurfaceMesh, forms: Sequence[str] = USUAL_FORMS
+    folder: Path, depth: NDArray[np.floating], mesh: SurfaceMesh, formats: Sequence[str] = DEFAULT_FORMATS
 ) -> None:
-    """Write some of SURFACE_FILES, each whole or not at all; depth (H, W) is NaN outside. Raises OutputError."""
+    """Write a surface to the files that SURFACE_FILES names, each complete or not at all.
+
+    Args:
+        folder: the folder of the files; it is made where it does not exist.
+        depth: (H, W), NaN outside the object.
+        mesh: the mesh of the same surface.
+        formats: keys of SURFACE_FILES.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
     depth = depth.astype(np.float32)
-    for form in forms:
-        path = folder / SURFACE_FILES[form]
-        if form in ("ply", "obj"):
+    for name in formats:
+        path = folder / SURFACE_FILES[name]
+        if name in ("ply", "obj"):
             write_mesh(mesh, path)
             continue
         buffer = io.BytesIO()
-        if form == "npy":
+        if name == "npy":
             np.save(buffer, depth, allow_pickle=False)
         else:
             import tifffile

@@ -1,0 +1,113 @@
+"""The equations of bilateral normal integration, and their weights.
+
+The unknown is one height h per pixel, in pixels: z itself for an orthographic camera, -f log(depth) for a pinhole
+camera of focal length f. The normal n of a pixel fixes how h changes towards the next pixel on the right and below:
+
+    facing * (h' - h) + slant = 0,      facing = -n.r,   slant = f n.dr.
+
+Here r is the ray through the pixel, scaled to z = -1, and dr its change to the neighbour. Orthographic rays are all
+(0, 0, -1), and f dr is one pixel.
+
+Away from edges, the equation of a pixel holds towards both its neighbours on an axis. At an edge it holds towards one
+of them. The method therefore weights the squared residual towards each side by
+
+    sigmoid(stiffness * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
+
+A side without a neighbour counts as a gap of zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.normals import unit
+from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
+
+Floats = NDArray[np.float64]
+Pixels = NDArray[np.int32]
+
+# The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
+# the normal says nothing reliable about the height. The equations of the neighbours fix the height of such pixels, and
+# of pixels whose normals face away from the camera.
+_SMALLEST_COSINE = 0.05
+
+
+@dataclass(frozen=True)
+class BilateralEquations:
+    """The equations of P pixels.
+
+    Args:
+        facing: (P,), zero where the normal is not usable.
+        slants: (P,) along the rows and (P,) along the columns, zero where the normal is not usable.
+        pairs: the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the
+            left or above, and (E,) pixel numbers on the right or below.
+    """
+
+    facing: Floats
+    slants: tuple[Floats, Floats]
+    pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
+
+    @classmethod
+    def from_normals(
+        cls,
+        normal_map: NDArray[np.floating],
+        mask: NDArray[np.bool_],
+        camera_matrix: NDArray[np.floating] | None,
+    ) -> BilateralEquations:
+        """Return the equations of a normal map (H, W, 3) at the pixels of a mask (H, W)."""
+        normals = unit(normal_map[mask].astype(np.float64))
+        if camera_matrix is None:
+            facing, cosine = normals[:, 2], normals[:, 2]
+            to_right, down = np.array([1.0, 0, 0]), np.array([0, -1.0, 0])
+        else:
+            rays = pixel_rays(mask, camera_matrix)
+            facing = -np.einsum("pi,pi->p", normals, rays)
+            cosine = facing / np.linalg.norm(rays, axis=1)
+            to_right, down, _ = focal_length(camera_matrix) * ray_basis(camera_matrix)
+        usable = cosine > _SMALLEST_COSINE
+        number = np.full(mask.shape, -1, np.int32)
+        number[mask] = np.arange(len(normals))
+        return cls(
+            facing * usable,
+            (normals @ to_right * usable, normals @ down * usable),
+            (_pairs(number[:, :-1], number[:, 1:]), _pairs(number[:-1], number[1:])),
+        )
+
+    def weigh(self, heights: Floats, stiffness: float) -> tuple[Floats, Floats, float]:
+        """Return the weights of all pairs at the heights (P,), their flows, and the weighted sum of squares.
+
+        The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
+        half the first derivative. Pairs along the rows come first, then those along the columns.
+        """
+        cost, weights, flows = 0.0, [], []
+        for slant, (near, far) in zip(self.slants, self.pairs, strict=True):
+            gap = heights[far] - heights[near]
+            ahead, behind = np.zeros_like(heights), np.zeros_like(heights)
+            ahead[near], behind[far] = gap, gap
+            share_ahead = _sigmoid(stiffness * self.facing**2 * (behind**2 - ahead**2))
+            weight, flow = np.zeros_like(gap), np.zeros_like(gap)
+            # Both pixels of a pair have an equation for its gap.
+            for pixels, share in ((near, share_ahead[near]), (far, 1 - share_ahead[far])):
+                facing = self.facing[pixels]
+                residual = facing * gap + slant[pixels]
+                weight += share * facing**2
+                flow += share * facing * residual
+                cost += float(share @ residual**2)
+            weights.append(weight)
+            flows.append(flow)
+        return np.concatenate(weights), np.concatenate(flows), cost
+
+
+def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:
+    both = (near >= 0) & (far >= 0)
+    return near[both], far[both]
+
+
+def _sigmoid(values: Floats) -> Floats:
+    from scipy.special import expit
+
+    shares: Floats = expit(values)
+    return shares

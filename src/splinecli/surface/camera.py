@@ -1,0 +1,54 @@
+"""The pinhole camera of integration and meshes: viewing rays and the focal length from a camera matrix.
+
+A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns count to the right, rows count down, and
+(0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of docs/conventions.md: x right, y up,
+z to the camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError, UsageError
+
+Floats = NDArray[np.float64]
+
+
+def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> Floats:
+    """Return the points (P, 3) at depth 1, z = -1, that a camera at the origin sees in the pixels of a mask (H, W).
+
+    Raises:
+        UsageError: the camera matrix is not 3 x 3.
+        InputError: the numbers are not those of a camera matrix.
+    """
+    rows, columns = np.nonzero(mask)
+    image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
+    return image @ ray_basis(camera_matrix)
+
+
+def focal_length(camera_matrix: NDArray[np.floating]) -> float:
+    """Return the focal length in pixels: the geometric mean of both axes."""
+    return float(np.sqrt(np.linalg.det(np.asarray(camera_matrix, np.float64)[:2, :2])))
+
+
+def ray_basis(camera_matrix: NDArray[np.floating]) -> Floats:
+    """Return the rows (3, 3) that turn an image point (column, row, 1) into its ray.
+
+    The first row is the step of a ray from one column to the next, the second the step from one row to the next, and
+    the third the ray of the image's origin. Raises the errors of pixel_rays.
+    """
+    matrix = np.asarray(camera_matrix, np.float64)
+    if matrix.shape != (3, 3):
+        raise UsageError(f"the camera matrix has shape {matrix.shape}, expected (3, 3)")
+    if not (
+        np.isfinite(matrix).all()
+        and min(matrix[0, 0], matrix[1, 1], np.linalg.det(matrix[:2, :2])) > 0
+        and (matrix[2] == (0, 0, 1)).all()
+    ):
+        raise InputError(
+            f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
+            " with positive fx and fy",
+            hint="Give it in pixels, with columns to the right and rows down",
+        )
+    return np.asarray(np.linalg.inv(matrix).T * (1, -1, -1), np.float64)
