@@ -85,7 +85,7 @@ def test_a_ball_cut_off_by_the_frame(
 ) -> None:
     for number, light in enumerate(lights[:3], start=1):
         write(tmp_path / "ball", f"{number}.png", render_ball(light, x=45.0, lamp=0.9))
-    with pytest.raises(InputError, match=r"cut off by the frame\. Photograph it whole"):
+    with pytest.raises(InputError, match=r"not entirely inside the image\. Take images of the whole"):
         calibrate_ball(find_ball_files(tmp_path / "ball"))
 
 
@@ -104,7 +104,7 @@ def test_pictures_of_another_size(ball: Path) -> None:
 
 
 def test_a_circle_outside_the_picture(ball: Path) -> None:
-    with pytest.raises(InputError, match="outside the picture"):
+    with pytest.raises(InputError, match="outside the image"):
         calibrate_ball(find_ball_files(ball), circle=Circle(900, 900, 20))
 
 

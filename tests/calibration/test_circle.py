@@ -29,7 +29,7 @@ def assert_close(found: Circle, true: Circle, pixels: float) -> None:
 def test_circle_of_a_mask() -> None:
     found = circle_from_mask(disc())
     assert_close(found, TRUE, 0.2)
-    assert found.seen > 0.98
+    assert found.visible > 0.98
     assert found.spread < 0.5
 
 
@@ -39,7 +39,7 @@ def test_a_stand_and_specks_do_not_move_the_circle() -> None:
     mask[5:8, 5:8] = True
     found = circle_from_mask(mask)
     assert_close(found, TRUE, 0.4)
-    assert 0.5 < found.seen < 0.9
+    assert 0.5 < found.visible < 0.9
 
 
 def test_a_mask_cut_off_by_the_frame_keeps_its_circle() -> None:
@@ -67,7 +67,7 @@ def test_circle_in_a_picture(ball: float, wall: float, scale: int) -> None:
     picture += np.random.default_rng(0).normal(0, 0.02 * abs(ball - wall), shape)
     found = find_circle(picture.clip(0))
     assert_close(found, true, 0.5 * max(1, scale / 3))
-    assert found.seen > 0.9
+    assert found.visible > 0.9
 
 
 def test_no_circle_in_a_picture() -> None:
@@ -91,4 +91,4 @@ def test_real_balls(shared_data: Path, record_property: Callable[[str, object], 
         record_property(f"ball {number}", found)
         assert_close(found, Circle(x, len(picture) - y, radius), 0.01 * radius)
     found = circle_from_mask(read_mask(shared_data / "uw/chrome/mask.png"))
-    assert found.seen > 0.98
+    assert found.visible > 0.98

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.gray import light_strengths
+from splinecli.calibration.gray import measure_light_intensities
 from splinecli.errors import InputError
 
 BALL = Circle(40.0, 42.0, 30.0)
-STRENGTHS = np.array([(1.0, 0.8, 0.6), (0.5, 0.5, 0.7), (1.3, 1.2, 1.0)])
+INTENSITIES = np.array([(1.0, 0.8, 0.6), (0.5, 0.5, 0.7), (1.3, 1.2, 1.0)])
 LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, -0.48, np.sqrt(1 - 0.48**2))])
 
 
@@ -32,36 +32,36 @@ def ball_images() -> NDArray[np.float64]:
     y, x = np.indices((84, 80)).astype(np.float64)
     normals = np.nan_to_num(BALL.normals(x, y))
     cosine = np.clip(np.einsum("hwi,fi->fhw", normals, LIGHTS), 0, None)
-    return 0.5 * cosine[..., None] * STRENGTHS[:, None, None]
+    return 0.5 * cosine[..., None] * INTENSITIES[:, None, None]
 
 
-def test_strengths_from_a_ball(tmp_path: Path) -> None:
+def test_intensities_from_a_ball(tmp_path: Path) -> None:
     images = ball_images()
     folder = write(tmp_path / "gray", images, BALL.inside(images.shape[1:3]))
-    found = light_strengths(find_ball_files(folder), LIGHTS, "ball")
-    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=0.01)
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
 
 
-def test_strengths_from_a_card(tmp_path: Path) -> None:
-    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * STRENGTHS)[:, None, None]
+def test_intensities_from_a_card(tmp_path: Path) -> None:
+    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
     folder = write(tmp_path / "card", images, None)
-    found = light_strengths(find_ball_files(folder), LIGHTS, "card")
-    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-4)
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-4)
 
 
 def test_photographs_for_a_screen(tmp_path: Path) -> None:
-    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * STRENGTHS)[:, None, None]
+    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
     folder = write(tmp_path / "card", images ** (1 / 2.2), None)
-    found = light_strengths(find_ball_files(folder), LIGHTS, "card", gamma=2.2)
-    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-3)
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card", gamma=2.2)
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)
 
 
 def test_ambient_light_is_taken_off(tmp_path: Path) -> None:
-    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * STRENGTHS)[:, None, None]
+    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
     folder = write(tmp_path / "card", images + 0.1, None)
     cv2.imwrite(str(folder / "ambient.png"), np.full((20, 30, 3), round(0.1 * 65535), np.uint16))
-    found = light_strengths(find_ball_files(folder), LIGHTS, "card")
-    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=1e-3)
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)
 
 
 def test_saturated_pixels_do_not_count(tmp_path: Path) -> None:
@@ -69,16 +69,16 @@ def test_saturated_pixels_do_not_count(tmp_path: Path) -> None:
     cut = (images * 1.7).clip(0, 1)
     assert (cut == 1).any()
     folder = write(tmp_path / "bright", cut, BALL.inside(cut.shape[1:3]))
-    found = light_strengths(find_ball_files(folder), LIGHTS, "ball")
-    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=0.01)
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
 
 
 def test_refusals(tmp_path: Path) -> None:
     images = np.zeros((3, 20, 30, 3))
     folder = write(tmp_path / "dark", images, None)
     with pytest.raises(InputError, match="dark or overexposed"):
-        light_strengths(find_ball_files(folder), LIGHTS, "card")
+        measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
     with pytest.raises(InputError, match="gray ball need a mask"):
-        light_strengths(find_ball_files(folder), LIGHTS, "ball")
+        measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
     with pytest.raises(InputError, match="found 3 images, expected 2"):
-        light_strengths(find_ball_files(folder), LIGHTS[:2], "card")
+        measure_light_intensities(find_ball_files(folder), LIGHTS[:2], "card")

@@ -35,11 +35,11 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
     return folder
 
 
-def write_gray(folder: Path, strengths) -> Path:
+def write_gray(folder: Path, intensities) -> Path:
     folder.mkdir()
     n, inside = normals()
-    for number, (light, strength) in enumerate(zip(LIGHTS, strengths, strict=True)):
-        picture = np.where(inside, 0.5 * strength * (n @ light).clip(0), 0)
+    for number, (light, intensity) in enumerate(zip(LIGHTS, intensities, strict=True)):
+        picture = np.where(inside, 0.5 * intensity * (n @ light).clip(0), 0)
         cv2.imwrite(str(folder / f"{number}.png"), np.rint(picture * 65535).astype(np.uint16))
     cv2.imwrite(str(folder / "mask.png"), inside.astype(np.uint8) * 255)
     return folder
@@ -77,18 +77,18 @@ def test_the_outline_that_is_given(run):
     assert json.loads(Path("out/calibration.json").read_text()) == report
 
 
-def test_two_balls_and_strengths(run):
+def test_two_balls_and_intensities(run):
     write_balls(Path("one"))
     write_balls(Path("two"))
-    strengths = [1.0, 0.5, 0.75, 1.25]
-    write_gray(Path("gray"), strengths)
+    intensities = [1.0, 0.5, 0.75, 1.25]
+    write_gray(Path("gray"), intensities)
     circles = ["--circle", "60,48,40", "--circle", "61,48,40"]
     result = run("calibrate", "one", "two", *circles, "--gray-ball", "gray", "--json")
     report = json.loads(result.out)
     # A centre 1 pixel off turns the light by about 2 / 40, 2.9 degrees; the mean lies in the middle.
     assert report["disagreement_deg"]["mean"] == pytest.approx(1.5, abs=0.2)
     np.testing.assert_allclose(
-        np.array(report["light_intensities"])[:, 0], np.array(strengths) / 0.875, rtol=0.03
+        np.array(report["light_intensities"])[:, 0], np.array(intensities) / 0.875, rtol=0.03
     )
     assert np.loadtxt("calibration/light_intensities.txt").shape == (4, 3)
 

@@ -1,1 +1,1 @@
-"""Light directions and strengths from photographs of mirror balls and of something gray."""
+"""Calibration of lights: directions from images of mirror balls, intensities from images of a gray target."""

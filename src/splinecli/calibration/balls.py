@@ -1,4 +1,4 @@
-"""Photographs of mirror balls, one folder a ball -> one light direction for each photograph."""
+"""Light directions from folders of images of mirror balls."""
 
 from __future__ import annotations
 
@@ -19,14 +19,21 @@ from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
 
 REFERENCES = ("ref", "reference")
-"""Stems of a picture that shows a ball's outline and is no photograph of a light."""
+"""Names, without suffix, of an image that shows the outline of the ball and belongs to no light."""
 
-_NO_LIGHTS = NOT_PHOTOGRAPHS | set(REFERENCES)
+_NOT_LIGHTS = NOT_PHOTOGRAPHS | set(REFERENCES)
 
 
 @dataclass(frozen=True, eq=False)
 class BallFiles:
-    """A folder's photographs of a ball, one a light, and what shows its outline."""
+    """The files of one ball.
+
+    Args:
+        folder: the folder of the ball.
+        images: one image for each light, in the order of the lights.
+        reference: an image that shows the outline of the ball, or None.
+        mask: a mask of the ball, or None.
+    """
 
     folder: Path
     images: tuple[Path, ...]
@@ -36,13 +43,14 @@ class BallFiles:
 
 @dataclass(frozen=True, eq=False)
 class BallCalibration:
-    """What F photographs of a ball say.
+    """The light directions from F images of one ball.
 
     Args:
-        files: of the ball.
-        circle: its outline; circle_from: "--circle", "mask" or "picture", whence it is known.
-        highlights: (F,).
-        directions: (F, 3) float64, unit; x right, y up, z to the camera.
+        files: the files of the ball.
+        circle: the outline of the ball.
+        circle_from: the source of the outline: "--circle", "mask" or "picture".
+        highlights: (F,), one for each image.
+        directions: (F, 3) float64, unit vectors; x right, y up, z to the camera.
     """
 
     files: BallFiles
@@ -53,17 +61,19 @@ class BallCalibration:
 
     @property
     def normals(self) -> NDArray[np.float64]:
-        """The ball's own normals (F, 3) at the highlights, half way from the view to the lights."""
+        """The normals (F, 3) of the ball at the highlights, half-way between the view and the lights."""
         return unit(self.directions + np.array((0.0, 0.0, 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLights:
-    """The lights of one or several balls.
+    """The light directions from one or several balls.
 
     Args:
-        directions: (F, 3) float64, unit: the mean of the balls.
-        disagreement_deg: (F,) float64, the largest angle between a ball's direction and the mean; zero for one ball.
+        balls: the calibration of each ball.
+        directions: (F, 3) float64, unit vectors: the mean direction of the balls.
+        disagreement_deg: (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a
+            single ball.
     """
 
     balls: tuple[BallCalibration, ...]
@@ -72,12 +82,20 @@ class CalibratedLights:
 
 
 def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
-    """A ball's photographs in natural order, or in that of filenames.txt. Raises InputError."""
+    """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
+
+    Args:
+        folder: the folder of the images.
+        mask: a mask that replaces the one in the folder.
+
+    Raises:
+        InputError: the folder does not exist, cannot be read, or has no images.
+    """
     filenames = find_named(folder, [FILENAMES])
     images = (
         read_image_list(filenames)
         if filenames is not None
-        else list_images(folder, leave_out_stems=_NO_LIGHTS, leave_out=() if mask is None else (mask,))
+        else list_images(folder, leave_out_stems=_NOT_LIGHTS, leave_out=() if mask is None else (mask,))
     )
     check_not_empty(images, folder)
     others = list_images(folder, leave_out_stems=(), leave_out=images)
@@ -88,15 +106,17 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
 def calibrate_ball(
     files: BallFiles, *, circle: Circle | None = None, progress: Callable[[], object] | None = None
 ) -> BallCalibration:
-    """Outline, highlights and light directions of one ball; one photograph is held at a time.
+    """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
 
     Args:
-        circle: the outline, where it is known. Else it comes from the mask, or is looked for in the reference picture,
-            or in the mean of the photographs.
+        files: the files of the ball.
+        circle: the outline. None takes it from the mask, from the reference image, or from the mean of all images, in
+            this order.
+        progress: called after each image.
 
     Raises:
-        InputError: with the file: an image cannot be read or is of another size, there is no circle, or it is cut off
-            by the frame, or a photograph shows no highlight.
+        InputError: an image cannot be read, has another size or shows no highlight; or the outline is not found or
+            not entirely inside the image.
     """
     circle_from = "--circle"
     if circle is None:
@@ -114,7 +134,7 @@ def calibrate_ball(
             )
         if not circle.inside(first).any():
             raise InputError(
-                "the circle lies outside the picture", path=path, hint="--circle is X,Y,R in pixels"
+                "the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels"
             )
         try:
             highlight = find_highlight(
@@ -132,7 +152,11 @@ def calibrate_ball(
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """The mean direction of each light over the balls. Raises InputError where they have not equally many images."""
+    """Return the mean direction of each light over the balls.
+
+    Raises:
+        InputError: the balls have different numbers of images.
+    """
     counts = [len(ball.directions) for ball in balls]
     if len(set(counts)) > 1:
         raise InputError(
@@ -147,44 +171,38 @@ def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
 
 
 def _find_outline(files: BallFiles) -> tuple[Circle, str]:
-    if files.mask is not None:
-        mask = read_mask(files.mask)
-        try:
-            circle, where = circle_from_mask(mask), "mask"
-        except InputError as error:
-            raise InputError(error.problem, path=files.mask, hint=error.hint) from None
-        shape, path = mask.shape, files.mask
-    else:
-        path = files.reference or files.images[0]
-        if files.reference is not None:
-            picture = to_linear(decode_image(path), path).mean(axis=2)
+    """Return the outline of the ball and its source: "mask" or "picture"."""
+    path = files.mask or files.reference or files.images[0]
+    try:
+        if files.mask is not None:
+            mask = read_mask(files.mask)
+            circle, source, shape = circle_from_mask(mask), "mask", mask.shape
         else:
-            picture = _mean_picture(files.images)
-        try:
-            circle, where = find_circle(picture), "picture"
-        except InputError as error:
-            raise InputError(error.problem, path=path, hint=error.hint) from None
-        shape = picture.shape
+            gray = _mean_gray(files.images if files.reference is None else [files.reference])
+            circle, source, shape = find_circle(gray), "picture", gray.shape
+    except InputError as error:
+        raise InputError(error.problem, path=error.path or path, hint=error.hint) from None
     if circle.reaches_beyond(shape):
         raise InputError(
-            f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels) is cut off by the"
-            " frame",
+            f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels) is not entirely"
+            " inside the image",
             path=path,
-            hint="Photograph it whole; if this is not the ball, give its circle by --circle X,Y,R",
+            hint="Take images of the whole ball. If this is not the ball, give its circle with --circle X,Y,R",
         )
-    return circle, where
+    return circle, source
 
 
-def _mean_picture(images: Sequence[Path]) -> NDArray[np.float32]:
+def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
+    """Return the mean (H, W) of the gray values of images."""
     total: NDArray[np.float32] | None = None
     for path in images:
-        picture = to_linear(decode_image(path), path).mean(axis=2)
-        if total is not None and total.shape != picture.shape:
+        gray = to_linear(decode_image(path), path).mean(axis=2)
+        if total is not None and total.shape != gray.shape:
             raise InputError(
-                f"found an image of {picture.shape[1]} x {picture.shape[0]} pixels,"
+                f"found an image of {gray.shape[1]} x {gray.shape[0]} pixels,"
                 f" expected {total.shape[1]} x {total.shape[0]} as in {images[0].name}",
                 path=path,
             )
-        total = picture if total is None else total + picture
+        total = gray if total is None else total + gray
     assert total is not None
     return total / np.float32(len(images))

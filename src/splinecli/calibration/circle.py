@@ -1,7 +1,6 @@
-"""The outline of a ball: a circle from a mask, or found in a picture, and how sure it is.
+"""The outline of a ball: a circle from a mask or from an image, with measures of its quality.
 
-Coordinates in pixels of the picture: x right, y down, whole numbers at the centres of pixels, (0, 0) in the top left
-corner.
+Coordinates are in pixels of the image: x right, y down, whole numbers at pixel centres, (0, 0) the top left pixel.
 """
 
 from __future__ import annotations
@@ -17,40 +16,47 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError
 
 RAYS = 720
-LEAST_SEEN = 0.35
-"""Share of a found outline that has to be seen; less may be the edge of anything."""
+MIN_VISIBLE = 0.35
+"""Smallest visible share of an outline. A shorter arc may be the edge of another object."""
 
-_SEARCH_SIZE = 480  # a picture's longer side when a circle is looked for in it
-_SEARCH_BAND = 0.06  # of the radius, to either side: where its outline is then looked for
-_CLOSE = 0.015  # of the radius: points of an outline that agree with a circle
+_SEARCH_SIZE = 480  # longer side, in pixels, of the image that the Hough transform searches
+_SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
+_TOLERANCE = 0.015  # of the radius: the largest distance from the circle at which a point agrees with it
+_MIN_EDGE = 0.01  # weakest edge that counts
+_N_CIRCLES = 12  # circles of the Hough transform that are refined
+_N_SAMPLES = 300  # random triples of points
 
 
 @dataclass(frozen=True)
 class Circle:
-    """Centre (x, y) and radius; spread: standard deviation of the outline about it, all in pixels; seen: share of the
-    outline that was found. A circle that was given has the spread 0 and is seen whole.
+    """The outline of a ball.
+
+    Args:
+        x, y, radius: centre and radius, in pixels.
+        spread: rms distance of the outline's points from the circle, in pixels. 0 for a circle that the user gives.
+        visible: share of the outline that the image or mask shows, 0 to 1. 1 for a circle that the user gives.
     """
 
     x: float
     y: float
     radius: float
     spread: float = 0.0
-    seen: float = 1.0
+    visible: float = 1.0
 
     def normals(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unit normals (N, 3) of the ball at points of the picture, orthographic; NaN outside the circle."""
+        """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the circle."""
         nx, ny = (x - self.x) / self.radius, (self.y - y) / self.radius
         with np.errstate(invalid="ignore"):
             return np.stack((nx, ny, np.sqrt(1 - nx * nx - ny * ny)), axis=-1)
 
     def inside(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        """The pixels (H, W) within the circle."""
+        """Return the mask (H, W) of the pixels inside the circle."""
         y, x = np.indices(shape[:2])
         inside: NDArray[np.bool_] = (x - self.x) ** 2 + (y - self.y) ** 2 < self.radius**2
         return inside
 
     def reaches_beyond(self, shape: tuple[int, ...]) -> bool:
-        """Whether a hundredth of the radius or more lies outside the picture."""
+        """Return whether a hundredth of the radius or more lies outside the image."""
         reach = 0.99 * self.radius
         height, width = shape[:2]
         across = self.x - reach < -0.5 or self.x + reach > width - 0.5
@@ -58,42 +64,42 @@ class Circle:
 
 
 def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
-    """The circle that most of the outline of a mask's largest part lies on.
+    """Return the circle through most of the outline of the largest part of a mask (H, W).
 
     Raises:
-        InputError: there is no such circle.
+        InputError: the outline is not that of a ball.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
     height, width = mask.shape
     x, y = outline.T
-    # Where the frame cuts the mask off is no outline.
+    # Points on the frame of the image are not part of the outline.
     outline = outline[(x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)]
     if len(outline) < 12:
-        raise InputError("the mask has no outline inside the picture, expected a ball")
+        raise InputError("the mask has no outline inside the image, expected a ball")
     circle = _fit(outline, outline_points=len(outline))
-    # A contour runs through the centres of the outermost pixels, which reach half a pixel further.
-    circle = Circle(circle.x, circle.y, circle.radius + 0.5, circle.spread, circle.seen)
-    if circle.seen < LEAST_SEEN:
+    # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel further.
+    circle = Circle(circle.x, circle.y, circle.radius + 0.5, circle.spread, circle.visible)
+    if circle.visible < MIN_VISIBLE:
         raise InputError(
-            f"only {100 * circle.seen:.0f} % of the mask's outline lies on a circle, expected a ball",
-            hint="Paint the ball alone, or give its circle by --circle X,Y,R",
+            f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball",
+            hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R",
         )
     return circle
 
 
-def find_circle(picture: NDArray[Any]) -> Circle:
-    """The most conspicuous circle in a gray picture (H, W), such as a photograph of a ball before another background.
+def find_circle(image: NDArray[Any]) -> Circle:
+    """Return the clearest circle in a gray image (H, W), such as a ball in front of another background.
 
     Raises:
-        InputError: none is found.
+        InputError: there is no clear circle.
     """
-    values = picture.astype(np.float32)
-    # Balls are often dark before dark: what is brighter than most counts as equally bright.
+    values = image.astype(np.float32)
+    # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings out its edge.
     values = np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
     scale = _SEARCH_SIZE / max(values.shape)
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=way)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=interpolation)
     small = cv2.GaussianBlur(small, (0, 0), 1.5)
     best: Circle | None = None
     for stretch in (1.0, 4.0):
@@ -107,8 +113,8 @@ def find_circle(picture: NDArray[Any]) -> Circle:
             minRadius=round(0.08 * max(small.shape)),
             maxRadius=round(0.55 * max(small.shape)),
         )
-        for x, y, radius in found[0, :12].tolist() if found is not None else ():
-            # A pixel of the small picture is 1 / scale wide, and the first one's centre is not at 0.
+        for x, y, radius in found[0, :_N_CIRCLES].tolist() if found is not None else ():
+            # Pixel centres are at whole numbers in both images, so their corners differ by half a pixel.
             guess = Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
             circle = _refine(values, guess)
             if circle is not None and (best is None or _merit(circle) > _merit(best)):
@@ -116,18 +122,21 @@ def find_circle(picture: NDArray[Any]) -> Circle:
     if best is None:
         raise InputError(
             "found no circle, expected a ball",
-            hint="Give a mask of the ball (--mask), or its circle (--circle X,Y,R)",
+            hint="Give a mask of the ball with --mask, or its circle with --circle X,Y,R",
         )
     return best
 
 
 def _merit(circle: Circle) -> float:
-    # Of two that are seen equally well the larger: reflections in the ball are circles, too.
-    return circle.seen * math.sqrt(circle.radius)
+    # Reflections in the ball are circles, too. Of two equally visible circles, the larger one is the ball.
+    return circle.visible * math.sqrt(circle.radius)
 
 
 def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
-    """The circle through the strongest edges along rays from the guess's centre; None where few agree."""
+    """Return the circle through the strongest edges along rays from the centre of the guess, or None.
+
+    The result is None where too few edges agree on a circle.
+    """
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         angle = np.arange(RAYS) * (2 * np.pi / RAYS)
         half = max(band * guess.radius, 3.0)
@@ -145,42 +154,43 @@ def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
         peak = edge[:, 1:-1].argmax(axis=1) + 1
         strength = edge[np.arange(RAYS), peak]
         before, after = edge[np.arange(RAYS), peak - 1], edge[np.arange(RAYS), peak + 1]
-        # The top of the parabola through the peak and its neighbours.
+        # Sub-pixel position: the top of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
-        clear = strength > 0.01
+        clear = strength > _MIN_EDGE
         if clear.sum() < 0.2 * RAYS:
             return None
         points = np.stack((guess.x + np.cos(angle) * reach, guess.y + np.sin(angle) * reach), axis=1)[clear]
         guess = _fit(points, outline_points=RAYS)
-        if guess.seen < LEAST_SEEN:
+        if guess.visible < MIN_VISIBLE:
             return None
     return guess
 
 
 def _fit(points: NDArray[np.float64], *, outline_points: int) -> Circle:
-    """The circle that most points (N, 2) lie on: random samples of three, then least squares over those close by.
+    """Return the circle that most points (N, 2) lie on.
 
-    outline_points: how many a whole outline has; the share of it that agrees is told.
+    RANSAC with samples of three points, then least squares over the points close to the circle. `outline_points` is
+    the number of points of a complete outline, to which the visible share refers.
     """
     generator = np.random.default_rng(0)
     best: tuple[float, float, float] | None = None
     most = -1
     size = np.ptp(points, axis=0).max()
-    for _ in range(300):
+    for _ in range(_N_SAMPLES):
         circle = _through(points[generator.choice(len(points), 3, replace=False)])
         if circle is None or not 0.2 * size < circle[2] < 3 * size:
             continue
-        agreeing = int(np.count_nonzero(_distance(points, circle) < _CLOSE * circle[2]))
+        agreeing = int(np.count_nonzero(_distance(points, circle) < _TOLERANCE * circle[2]))
         if agreeing > most:
             best, most = circle, agreeing
     if best is None:
         return Circle(0.0, 0.0, 1.0, math.inf, 0.0)
     for _ in range(5):
-        close_by = points[_distance(points, best) < _CLOSE * best[2]]
+        close_by = points[_distance(points, best) < _TOLERANCE * best[2]]
         if len(close_by) < 3:
             break
-        # x^2 + y^2 = 2 a x + 2 b y + c, linear in the centre (a, b); about the points' mean, for its digits.
+        # x^2 + y^2 = 2 a x + 2 b y + c is linear in the centre (a, b). Centring the points keeps it accurate.
         middle = close_by.mean(axis=0)
         around = close_by - middle
         a, b, c = np.linalg.lstsq(
@@ -188,13 +198,14 @@ def _fit(points: NDArray[np.float64], *, outline_points: int) -> Circle:
         )[0]
         best = (float(middle[0] + a), float(middle[1] + b), math.sqrt(max(c + a * a + b * b, 1e-9)))
     distance = _distance(points, best)
-    close = distance < _CLOSE * best[2]
+    close = distance < _TOLERANCE * best[2]
     spread = math.sqrt(float((distance[close] ** 2).mean())) if close.any() else math.inf
     x, y, radius = (float(value) for value in best)
     return Circle(x, y, radius, spread, min(1.0, float(close.sum() / outline_points)))
 
 
 def _through(three: NDArray[np.float64]) -> tuple[float, float, float] | None:
+    """Return x, y and radius of the circle through three points (3, 2), or None where they are in line."""
     (ax, ay), (bx, by), (cx, cy) = three
     twice_area = 2 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
     if abs(twice_area) < 1e-9:
