@@ -21,8 +21,8 @@ from splinecli.capture.lights.light_files import read_light_directions, read_lig
 from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration, is_display_encoded
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
-from splinecli.capture.restore.light_intensities import estimate_light_intensities
-from splinecli.capture.restore.saturation import find_saturated, restore_saturated
+from splinecli.capture.restore.saturation import find_saturated
+from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError
 
 EQUAL = "equal"
@@ -85,6 +85,13 @@ class CaptureSource:
             InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or
                 the lights cannot give normals (see Capture).
         """
+        stored = self.read_stored(light_indices, progress)
+        return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
+
+    def read_stored(
+        self, light_indices: Sequence[int] | None = None, progress: Callable[[], object] | None = None
+    ) -> StoredCapture:
+        """Return the stored values under the chosen lights, and what restores them; see read."""
         indices = (
             tuple(range(self.n_lights))
             if light_indices is None
@@ -122,21 +129,12 @@ class CaptureSource:
             stored = None  # let go before the next is decoded: one full image at a time
             if progress is not None:
                 progress()
-        directions, strengths = self.light_directions[list(indices)], None
-        if not as_stored and not self.knows_intensities:
-            strengths = estimate_light_intensities(
-                observations, saturated if len(saturated) else None, directions
-            )
-            if strengths is not None:
-                observations /= strengths.astype(np.float32)
-        if not as_stored and len(saturated):
-            restore_saturated(observations, saturated, directions)
         n_saturated = np.count_nonzero(saturated)
         n_black = len(observations) - np.count_nonzero(observations.any(axis=1))
-        return Capture(
+        capture = Capture(
             name=self.files.name,
             observations=observations,
-            light_directions=directions,
+            light_directions=self.light_directions[list(indices)],
             light_indices=indices,
             mask=mask,
             ground_truth=ground_truth,
@@ -144,10 +142,9 @@ class CaptureSource:
                 *self.warnings,
                 *_warnings(n_saturated / observations.size, n_black / len(observations), n_8_bit),
                 *((UPSIDE_DOWN,) if upside_down else ()),
-                *(() if strengths is None else (_strengths_in_words(strengths),)),
             ),
-            estimated_intensities=strengths,
         )
+        return StoredCapture(capture, saturated if len(saturated) else None, self.knows_intensities)
 
     def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
         """A function that reads the mask's (H, W) pixels (P, 3) RGB of an image by its index.
@@ -333,14 +330,6 @@ def _warnings(saturated_share: float, black_share: float, n_8_bit: int) -> tuple
     if n_8_bit:
         warnings.append("The images have 8 bits; 16-bit linear images give better normals.")
     return tuple(warnings)
-
-
-def _strengths_in_words(strengths: NDArray[np.float64]) -> str:
-    return (
-        f"The lights look unequally strong, from {strengths.min():.2f} to {strengths.max():.2f} times their mean, and"
-        f" what the images tell of it was used; --intensities FILE gives the strengths, --intensities {EQUAL} takes"
-        " them for equal."
-    )
 
 
 def _check_image_size(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path, first: Path) -> None:

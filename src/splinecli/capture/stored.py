@@ -1,0 +1,85 @@
+"""A capture with the values that its files store, and the step that restores it under a choice of lights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.record import Capture
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
+from splinecli.capture.restore.saturation import restore_saturated
+
+
+@dataclass(frozen=True, eq=False)
+class StoredCapture:
+    """A capture as its files store it, with what is needed to restore it.
+
+    `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
+    lights of each draw, and restores each choice by itself, so that both commands see the same observations.
+
+    Args:
+        capture: the stored observations, linear, divided by the light intensities that the files give.
+        saturated: (P, F) bool, or None where no observation is saturated.
+        knows_intensities: whether a file, an option or the image format gives the light intensities.
+    """
+
+    capture: Capture
+    saturated: NDArray[np.bool_] | None
+    knows_intensities: bool
+
+    def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
+        """Return the capture under some of its lights, with arrays of its own; see Capture.choose_lights."""
+        capture = self.capture.choose_lights(positions)
+        saturated = None if self.saturated is None else self.saturated[:, list(positions)]
+        return replace(self, capture=capture, saturated=saturated)
+
+    def choose_pixels(self, rows: NDArray[np.integer]) -> StoredCapture:
+        """Return the capture with some of its pixels, with arrays of its own.
+
+        Args:
+            rows: rows of the observations, in rising order.
+        """
+        capture = self.capture
+        mask = np.zeros_like(capture.mask)
+        # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
+        mask.flat[np.flatnonzero(capture.mask)[rows]] = True
+        saturated = None if self.saturated is None else self.saturated[rows]
+        chosen = replace(capture, observations=capture.observations[rows], mask=mask)
+        return replace(self, capture=chosen, saturated=saturated)
+
+    def estimate_intensities(self) -> NDArray[np.float64] | None:
+        """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
+        if self.knows_intensities:
+            return None
+        return estimate_light_intensities(
+            self.capture.observations, self.saturated, self.capture.light_directions
+        )
+
+    def restore(self, intensities: NDArray[np.float64] | None) -> Capture:
+        """Return the capture with its intensities divided out and its saturated observations restored.
+
+        The observations are changed in place: this record must not be used afterwards.
+
+        Args:
+            intensities: what estimate_intensities returns.
+        """
+        observations, warnings = self.capture.observations, self.capture.warnings
+        if intensities is not None:
+            observations /= intensities.astype(np.float32)
+            warnings = (*warnings, _intensities_in_words(intensities))
+        if self.saturated is not None:
+            restore_saturated(observations, self.saturated, self.capture.light_directions)
+        if intensities is None:
+            return self.capture
+        return replace(self.capture, warnings=warnings, estimated_intensities=intensities)
+
+
+def _intensities_in_words(intensities: NDArray[np.float64]) -> str:
+    return (
+        f"The lights look unequally strong, from {intensities.min():.2f} to {intensities.max():.2f} times their mean,"
+        " and what the images tell of it was used; --intensities FILE gives the strengths, --intensities equal takes"
+        " them for equal."
+    )
