@@ -1,4 +1,4 @@
-"""`splinecli calibrate`: photographs of mirror balls -> light directions, and of something gray -> their strengths."""
+"""`splinecli calibrate`: photographs of mirror balls -> light directions, and of something gray -> their intensities."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def calibrate(
     or is that of a mask (--mask, or a file named mask in the folder), or is looked for in a picture named ref, or in
     the photographs. The lamp is the ball's brightest spot. Directions of several balls are averaged. Writes
     OUT/light_directions.txt, for the option --lights of infer, calibration.png, to look at, and calibration.json; with
-    a gray ball or card also light_intensities.txt, the lights' strengths relative to each other.
+    a gray ball or card also light_intensities.txt, the lights' intensities relative to each other.
     """
     from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
-    from splinecli.calibration.gray import light_strengths
+    from splinecli.calibration.gray import measure_light_intensities
     from splinecli.capture.lights.light_files import read_light_directions
     from splinecli.capture.linearise import is_display_encoded
     from splinecli.files import check_free, write_bytes, write_text
@@ -102,13 +102,13 @@ def calibrate(
             for ball, own in zip(files, circles, strict=True)
         ]
     lights = combine_balls(calibrated)
-    strengths = None
+    intensities = None
     if gray_files is not None:
-        strengths = light_strengths(
+        intensities = measure_light_intensities(
             gray_files, lights.directions, "ball" if gray_ball is not None else "card", gamma=gamma
         )
     known = None if compare is None else read_light_directions(compare, len(lights.directions))
-    report = _report(lights, strengths, known)
+    report = _report(lights, intensities, known)
     if (
         gamma == 1
         and gray_files is not None
@@ -120,10 +120,10 @@ def calibrate(
         )
     output.mkdir(parents=True, exist_ok=True)
     write_text(output / DIRECTIONS, _rows(lights.directions))
-    if strengths is None:
+    if intensities is None:
         (output / INTENSITIES).unlink(missing_ok=True)  # of earlier lights
     else:
-        write_text(output / INTENSITIES, _rows(strengths))
+        write_text(output / INTENSITIES, _rows(intensities))
     write_bytes(output / PICTURE, encode_png(calibration_picture(lights.balls)))
     write_text(output / REPORT, json.dumps(report, indent=2) + "\n")
     for line in _told(report):
@@ -161,7 +161,7 @@ def _rows(values: NDArray[np.float64]) -> str:
 
 
 def _report(
-    lights: CalibratedLights, strengths: NDArray[np.float64] | None, known: NDArray[np.float64] | None
+    lights: CalibratedLights, intensities: NDArray[np.float64] | None, known: NDArray[np.float64] | None
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -170,9 +170,9 @@ def _report(
     warnings = []
     for ball in lights.balls:
         outline = ball.circle
-        if outline.seen < UNSURE_SEEN or outline.spread > UNSURE_SPREAD * outline.radius:
+        if outline.visible < UNSURE_SEEN or outline.spread > UNSURE_SPREAD * outline.radius:
             warnings.append(
-                f"{ball.files.folder}: the ball's outline is unsure ({100 * outline.seen:.0f} % of it seen, spread"
+                f"{ball.files.folder}: the ball's outline is unsure ({100 * outline.visible:.0f} % of it seen, spread"
                 f" {outline.spread:.1f} pixels): look at {PICTURE}; if the green circle is off, give --mask or"
                 " --circle."
             )
@@ -199,7 +199,7 @@ def _report(
                 "folder": str(ball.files.folder),
                 "circle": {
                     "x": _round(ball.circle.x), "y": _round(ball.circle.y), "radius": _round(ball.circle.radius),
-                    "from": ball.circle_from, "seen": _round(ball.circle.seen), "spread": _round(ball.circle.spread),
+                    "from": ball.circle_from, "seen": _round(ball.circle.visible), "spread": _round(ball.circle.spread),
                 },
                 "highlights": [[_round(mark.x), _round(mark.y)] for mark in ball.highlights],
                 "saturated": [_round(mark.saturated) for mark in ball.highlights],
@@ -208,8 +208,8 @@ def _report(
         ],
         "light_directions": [[_round(value, 6) for value in row] for row in lights.directions],
         "light_intensities": None
-        if strengths is None
-        else [[_round(value, 6) for value in row] for row in strengths],
+        if intensities is None
+        else [[_round(value, 6) for value in row] for row in intensities],
         "disagreement_deg": None
         if len(lights.balls) == 1
         else {"mean": _round(lights.disagreement_deg.mean()), "largest": _round(lights.disagreement_deg.max())},
