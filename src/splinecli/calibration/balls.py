@@ -187,7 +187,7 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
             f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels) is not entirely"
             " inside the image",
             path=path,
-            hint="Take images of the whole ball. If this is not the ball, give its circle with --circle X,Y,R",
+            hint="Take images of the whole ball; if this is not the ball, give its circle with --circle X,Y,R",
         )
     return circle, source
 

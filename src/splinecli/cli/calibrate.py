@@ -1,4 +1,4 @@
-"""`splinecli calibrate`: photographs of mirror balls -> light directions, and of something gray -> their intensities."""
+"""`splinecli calibrate`: light directions from images of mirror balls, intensities from a gray target."""
 
 from __future__ import annotations
 
