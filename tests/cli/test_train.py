@@ -38,9 +38,9 @@ def small_runs(tmp_path, monkeypatch):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Saving without drawing, which takes longer than all of such a run."""
-    from splinecli.training.records import Records
+    from splinecli.training.run_log import RunLog
 
-    monkeypatch.setattr(Records, "draw", lambda self, maps: None)
+    monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
 
 
 def rows() -> list[dict[str, str]]:

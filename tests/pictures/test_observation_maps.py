@@ -13,17 +13,19 @@ SIZE = 8
 YELLOW, VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' ends; 0.85 of 255
 
 
-def draw(n_pixels: int, *, with_truth: bool = True, grid: str = "even") -> NDArray[np.uint8]:
+def draw(
+    n_pixels: int, *, with_truth: bool = True, with_dense: bool = True, named: bool = True, grid: str = "even"
+) -> NDArray[np.uint8]:
     """RGB (H, W, 3). Sparse maps hold a one at row 1, column 5; dense maps are zeros; the truth is empty."""
     sparse = np.full((n_pixels, SIZE, SIZE), np.nan, np.float32)
     sparse[:, 1, 5] = 1
     png = observation_map_figure(
         sparse,
-        np.zeros_like(sparse),
+        np.zeros_like(sparse) if with_dense else None,
         np.full_like(sparse, np.nan) if with_truth else None,
-        pixels=np.array([[12, 34]] * n_pixels),
+        pixels=np.array([[12, 34]] * n_pixels) if named else None,
         error_deg=np.full(n_pixels, 3.25),
-        title="$cat$, 10 lights",
+        title="$cat$, 10 lights" if named else "",
         grid=grid,  # type: ignore[arg-type]
     )
     return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
@@ -55,6 +57,14 @@ def test_empty_cells_are_gray_and_the_truth_may_be_missing() -> None:
     assert with_truth.shape[1] > without.shape[1]
     gray = [(np.abs(p.astype(int) - GRAY).max(axis=2) <= 1).sum() for p in (with_truth, without)]
     assert gray[0] > 1.8 * gray[1]
+
+
+def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dense_map() -> None:
+    whole, unnamed, without = draw(2), draw(2, named=False), draw(2, named=False, with_dense=False)
+    assert len(boxes(unnamed, YELLOW)) == len(boxes(without, YELLOW)) == 2
+    assert boxes(unnamed, YELLOW)[0][1] < boxes(whole, YELLOW)[0][1]  # no title above
+    assert without.shape[1] < unnamed.shape[1]
+    assert not [box for box in boxes(without, VIOLET) if box[2] > 100]
 
 
 def test_the_circle_follows_the_grid() -> None:

@@ -12,7 +12,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training import loop
 from splinecli.training.config import TrainingConfig
-from splinecli.training.records import Records
+from splinecli.training.run_log import RunLog
 
 __all__ = ["_matte_pixels", "make_set"]
 
@@ -34,7 +34,7 @@ def small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Saving without drawing, which takes longer than all of such a run."""
-    monkeypatch.setattr(Records, "draw", lambda self, maps: None)
+    monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
 
 
 @pytest.fixture

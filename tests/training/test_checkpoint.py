@@ -10,7 +10,7 @@ import torch
 
 from splinecli.errors import ModelError
 from splinecli.networks.weights import save_weights
-from splinecli.training.checkpoint import Clock, load_checkpoint, read_checkpoint_config
+from splinecli.training.checkpoint import RunCounters, load_checkpoint, read_checkpoint_config
 from splinecli.training.config import TrainingConfig
 from splinecli.training.loop import CHECKPOINT, Trainer
 
@@ -29,8 +29,8 @@ def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
 def test_everything_comes_back(trainer: Trainer, tiny: TrainingConfig, tmp_path: Path) -> None:
     assert read_checkpoint_config(tmp_path / CHECKPOINT) == tiny
     other = Trainer(tiny, tmp_path / "other", CPU)
-    clock = load_checkpoint(tmp_path / CHECKPOINT, other.network, other.average, other.optimizer, {})
-    assert clock == trainer.clock == Clock(step=1, pixels=16, seconds=trainer.clock.seconds)
+    counters = load_checkpoint(tmp_path / CHECKPOINT, other.network, other.average, other.optimizer, {})
+    assert counters == trainer.counters == RunCounters(step=1, pixels=16, seconds=trainer.counters.seconds)
     for name in ("network", "average"):
         for key, tensor in getattr(trainer, name).state_dict().items():
             assert torch.equal(getattr(other, name).state_dict()[key], tensor)
@@ -66,9 +66,9 @@ def test_settings_of_a_later_splinecli(trainer: Trainer, tmp_path: Path) -> None
     path.write_bytes(whole.replace(b"batch_size", b"batch_sise"))
     with pytest.raises(ModelError, match="unknown training setting 'batch_sise'"):
         read_checkpoint_config(path)
-    clock = whole.replace(b'\\"pixels\\": 16', b'\\"pixelz\\": 16')
-    assert clock != whole
-    path.write_bytes(clock)
+    renamed = whole.replace(b'\\"pixels\\": 16', b'\\"pixelz\\": 16')
+    assert renamed != whole
+    path.write_bytes(renamed)
     with pytest.raises(ModelError, match="the checkpoint is incomplete"):
         Trainer(trainer.config, tmp_path, CPU, resume=True)
     path.write_bytes(whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0'))

@@ -17,9 +17,10 @@ from splinecli.errors import UsageError
 from splinecli.networks.weights import load_weights
 from splinecli.training import distributed
 from splinecli.training.config import TrainingConfig
+from splinecli.training.defaults import METRICS
 from splinecli.training.distributed import Workers, is_launched, is_to_go_on, join_workers
 from splinecli.training.loop import WEIGHTS, Trainer
-from splinecli.training.records import METRICS, read_metrics
+from splinecli.training.run_log import read_metrics
 
 CPU = torch.device("cpu")
 STEPS = 6
@@ -152,9 +153,9 @@ FAILING = """
 import os, signal
 from splinecli.cli.main import run
 from splinecli.training import loop
-from splinecli.training.records import Records
+from splinecli.training.run_log import RunLog
 loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, loop.VALIDATION_PIXELS = 0.05, 5, 16
-Records.draw = lambda self, maps: None
+RunLog.draw = lambda self, maps: None
 step = loop.Trainer.step
 def failing(self):
     saved = (self.folder / loop.CHECKPOINT).exists()

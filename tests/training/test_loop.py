@@ -30,6 +30,7 @@ from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training import loop
 from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
+from splinecli.training.defaults import METRICS
 from splinecli.training.distributed import Workers
 from splinecli.training.loop import (
     CHECKPOINT,
@@ -40,7 +41,7 @@ from splinecli.training.loop import (
     stream_seed,
 )
 from splinecli.training.objective import compute_losses
-from splinecli.training.records import METRICS, Metrics, read_metrics
+from splinecli.training.run_log import Metrics, read_metrics
 from splinecli.training.validation import validation_deg
 
 CPU = torch.device("cpu")
@@ -141,7 +142,7 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(
     second = Trainer(
         read_checkpoint_config(tmp_path / "halves" / CHECKPOINT), tmp_path / "halves", CPU, resume=True
     )
-    assert second.clock == first.clock
+    assert second.counters == first.counters
     # The same operations on the same numbers; only their places in memory differ.
     assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
@@ -190,7 +191,7 @@ def test_half_of_the_batches_are_mirrored(tiny: TrainingConfig, tmp_path: Path) 
     trainer = Trainer(replace(tiny, batch_size=1, shards=1), tmp_path, CPU)
     mirrored = []
     for step in range(100):
-        trainer.clock.step = step
+        trainer.counters.step = step
         mirrored.append(trainer.draw()[2])
     # Four standard deviations of the binomial.
     assert sum(mirrored) == pytest.approx(50, abs=20)
@@ -200,7 +201,7 @@ def test_the_paper_s_size_sees_its_pixels_as_they_are(tiny: TrainingConfig, tmp_
     config = replace(tiny, network=NetworkConfig(size="paper"), batch_size=4)
     trainer = Trainer(config, tmp_path, CPU)
     for step in range(8):
-        trainer.clock.step = step
+        trainer.counters.step = step
         _, turn_deg, mirrored = trainer.draw()
         assert not turn_deg.any()
         assert not mirrored
@@ -354,12 +355,12 @@ def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path, monkeypatch: 
     readings = itertools.count()
     monkeypatch.setattr("splinecli.training.loop.time.monotonic", lambda: next(readings) * 0.05)
     trainer = Trainer(replace(tiny, steps=1, minutes=0.01), tmp_path, CPU)
-    trainer.clock.seconds = 0.3
+    trainer.counters.seconds = 0.3
     assert trainer.progress == pytest.approx(0.5)
     last = trainer.run()
     assert last is not None
     assert last.step > 1
-    assert trainer.clock.seconds >= 0.6
+    assert trainer.counters.seconds >= 0.6
 
 
 def poison(trainer: Trainer, what: str) -> None:
@@ -393,7 +394,7 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
     after = (*trainer.network.parameters(), *trainer.average.parameters())
     assert all(torch.equal(a, b) for a, b in zip(weights, after, strict=True))
-    assert trainer.clock.step == 2
+    assert trainer.counters.step == 2
     # The kept checkpoint goes on.
     assert math.isfinite(losses(Trainer(trainer.config, tmp_path, CPU, resume=True), 1)[0])
 
@@ -425,7 +426,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(
         monkeypatch.undo()
     assert {name: (tmp_path / name).read_bytes() for name in (CHECKPOINT, WEIGHTS)} == before
     assert not [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
-    assert Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True).clock.step == 6
+    assert Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True).counters.step == 6
 
 
 def test_at_most_a_minute_is_lost() -> None:
@@ -440,7 +441,7 @@ def test_checkpoints_come_by_the_clock(
     trainer = Trainer(replace(tiny, steps=14), tmp_path, CPU)
     saved: list[int] = []
     save = trainer.save
-    monkeypatch.setattr(trainer, "save", lambda: (saved.append(trainer.clock.step), save()))
+    monkeypatch.setattr(trainer, "save", lambda: (saved.append(trainer.counters.step), save()))
     trainer.run()
     # A step reads the clock twice, 10 s; so five steps are the first to take more than 45.
     assert saved == [5, 10, 14]
@@ -463,10 +464,10 @@ from pathlib import Path
 import torch
 from splinecli.training import loop
 from splinecli.training.config import TrainingConfig
-from splinecli.training.records import Records
+from splinecli.training.run_log import RunLog
 torch.set_num_threads(1)
 loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, loop.VALIDATION_PIXELS = 0.3, 3, 16
-Records.draw = lambda self, maps: None
+RunLog.draw = lambda self, maps: None
 config = TrainingConfig.from_dict(json.loads(sys.argv[1]))
 loop.Trainer(config, Path(sys.argv[2]), torch.device("cpu"), resume=sys.argv[3] == "resume").run()
 """
@@ -499,7 +500,7 @@ def test_a_killed_run_goes_on(tiny: TrainingConfig, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(loop, "REPORT_STEPS", 3)
     monkeypatch.setattr(loop, "VALIDATION_PIXELS", 16)
     taken_up = Trainer(config, folder, CPU, resume=True)
-    step = taken_up.clock.step
+    step = taken_up.counters.step
     kept = [p.detach().clone() for p in taken_up.network.parameters()]
     taken_up.config = replace(config, steps=step + 7)
     taken_up.run()

@@ -10,10 +10,10 @@ import torch
 
 from splinecli.networks.spline_net import SplineNet
 from splinecli.observation_map import cell_directions
+from splinecli.pixel_sets.source import SampledPixels
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import TrainingConfig
-from splinecli.training.sources import SampledScene
 from splinecli.training.validation import SHOWN_PIXELS, sample_maps, validation_deg
 
 
@@ -69,7 +69,7 @@ def test_gaps_of_the_truth_are_shown_as_gaps(network: SplineNet) -> None:
     light = torch.tensor([[[0.0, 0.0, 1.0], [0.3, 0.0, 0.95], [0.0, 0.3, 0.95]]]).expand(4, 3, 3)
     light = torch.nn.functional.normalize(light, dim=-1)
     ones = torch.ones(4, 3)
-    scene = SampledScene(light[:, 0], ones, light, ones > 0)
+    scene = SampledPixels(light[:, 0], ones, light, ones > 0)
     batch = PixelBatch(ones, light, ones > 0, scene, ones[:, :1])
     shown = sample_maps(network, batch)
     assert len(shown.truth) == 4

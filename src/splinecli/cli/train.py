@@ -16,7 +16,7 @@ from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
     from splinecli.training.config import TrainingConfig
-    from splinecli.training.records import Metrics
+    from splinecli.training.run_log import Metrics
 
 
 def train(
@@ -84,8 +84,9 @@ def train(
     from splinecli.devices import choose_device
     from splinecli.files import check_writable, held_folder
     from splinecli.training.config_files import parse_parameter
+    from splinecli.training.defaults import CHECKPOINT, WEIGHTS
     from splinecli.training.distributed import is_to_go_on, join_workers, leave_workers
-    from splinecli.training.loop import CHECKPOINT, WEIGHTS, Trainer
+    from splinecli.training.loop import Trainer
 
     if steps is not None and minutes is not None:
         raise UsageError("--steps and --minutes exclude each other")
@@ -117,8 +118,8 @@ def train(
         trainer = Trainer(
             settings, output, own_device, resume=resume, workers=workers, tensorboard=tensorboard
         )
-        if trainer.unheld:
-            names = ", ".join(trainer.unheld)
+        if trainer.single_scene_sets:
+            names = ", ".join(trainer.single_scene_sets)
             talk.warn(
                 f"{names}: a single scene, of which nothing is held back: validation is on training pixels"
             )
@@ -148,7 +149,7 @@ def _configure(
 ) -> TrainingConfig:
     from splinecli.training.checkpoint import read_checkpoint_config
     from splinecli.training.config_files import configure, configure_resumed
-    from splinecli.training.loop import CHECKPOINT
+    from splinecli.training.defaults import CHECKPOINT
 
     if not resume:
         return configure(preset, file, changes)

@@ -22,12 +22,13 @@ _SMALL, _LARGE = 8, 9  # points
 
 def observation_map_figure(
     sparse: NDArray[np.floating],
-    dense: NDArray[np.floating],
+    dense: NDArray[np.floating] | None,
     truth: NDArray[np.floating] | None,
     *,
-    pixels: NDArray[np.integer],
     error_deg: NDArray[np.floating],
-    title: str,
+    pixels: NDArray[np.integer] | None = None,
+    truth_label: str = "true map, all lights",
+    title: str = "",
     grid: Grid = "even",
 ) -> bytes:
     """A row for each of N pixels: its sparse map, LI-Net's dense map and the map of all lights; PNG.
@@ -36,28 +37,32 @@ def observation_map_figure(
     are shares of the largest observation, from 0 to 1. Empty cells are gray, the circle is the horizon.
 
     Args:
-        sparse, dense: (N, w, w), NaN in empty cells.
-        truth: (N, w, w), NaN where none of the capture's lights fell; None to leave it out.
-        pixels: (N, 2) row and column in the image.
-        error_deg: (N,) of the estimated normals.
+        sparse: (N, w, w), NaN in empty cells.
+        dense: the same; None for a network without a LI-Net.
+        truth: (N, w, w), NaN in cells without a value; None to leave it out.
+        error_deg: (N,) errors of the estimated normals, in degrees.
+        pixels: (N, 2) row and column in the image; None to leave them out.
+        truth_label: label of the true maps.
+        title: title of the figure; empty for none.
         grid: how lights fell on the cells.
     """
     from matplotlib.figure import Figure
 
-    columns = {"sparse map": sparse, "LI-Net's dense map": dense}
-    if truth is not None:
-        columns["true map, all lights"] = truth
+    labelled = {"sparse map": sparse, "LI-Net's dense map": dense, truth_label: truth}
+    columns = {label: maps for label, maps in labelled.items() if maps is not None}
     size = (_MAP_INCHES * len(columns) + 0.8, (_MAP_INCHES + 0.25) * len(sparse) + 0.7)
     figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(title, fontsize=_LARGE, parse_math=False)
+    if title:
+        figure.suptitle(title, fontsize=_LARGE, parse_math=False)
     axes = figure.subplots(len(sparse), len(columns), squeeze=False)
     for place, (name, maps) in enumerate(columns.items()):
         for axis, values in zip(axes[:, place], maps, strict=True):
             image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")
             _finish(axis, len(values), grid)
         axes[-1, place].set_xlabel(name, fontsize=_SMALL)
-    for axis, (row, column), error in zip(axes[:, 0], pixels, error_deg, strict=True):
-        axis.set_title(f"row {row}, column {column}: {error:.1f} deg off", fontsize=_SMALL, loc="left")
+    places = [""] * len(sparse) if pixels is None else [f"row {row}, column {col}: " for row, col in pixels]
+    for axis, place_in_image, error in zip(axes[:, 0], places, error_deg, strict=True):
+        axis.set_title(f"{place_in_image}{error:.1f} deg off", fontsize=_SMALL, loc="left")
     bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
     bar.set_label("share of the largest observation", fontsize=_SMALL)
     bar.ax.tick_params(labelsize=_SMALL)

@@ -1,6 +1,6 @@
-"""Checkpoints: one safetensors file that rebuilds a run exactly where it stood.
+"""Checkpoints: one safetensors file from which a run continues exactly where it stopped.
 
-There is no state of a random generator in it: what a step draws follows from the seed and the step's number.
+A checkpoint holds no state of a random generator. The draws of a step follow from the seed and the step number alone.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from splinecli.networks.weights import load_strictly, read_json_entry, read_tens
 from splinecli.training.config import TrainingConfig
 
 FORMAT = "splinecli-checkpoint-2"
+_COUNTERS_KEY = "clock"  # the name of this entry in checkpoints of every version so far
 
 
 @dataclass
-class Clock:
-    """How far a run has come."""
+class RunCounters:
+    """Steps, training pixels and seconds of training so far."""
 
     step: int = 0
     pixels: int = 0
@@ -37,10 +38,23 @@ def save_checkpoint(
     network: SplineNet,
     average: SplineNet,
     optimizer: torch.optim.Optimizer,
-    clock: Clock,
+    counters: RunCounters,
     sets: dict[str, str],
 ) -> None:
-    """Write the whole state of a run; `sets` are the SHA-256 of its pixel sets. Raises OutputError."""
+    """Write the whole state of a run.
+
+    Args:
+        path: the checkpoint file, replaced as a whole.
+        config: the configuration of the run.
+        network: the network that is trained.
+        average: the running average of its weights.
+        optimizer: the optimiser of `network`.
+        counters: how far the run has come.
+        sets: SHA-256 of each pixel set by path.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", network), ("average", average)):
         tensors |= {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
@@ -53,7 +67,7 @@ def save_checkpoint(
     metadata = {
         "format": FORMAT,
         "config": json.dumps(config.to_dict()),
-        "clock": json.dumps(asdict(clock)),
+        _COUNTERS_KEY: json.dumps(asdict(counters)),
         "sets": json.dumps(sets),
         "tensors_sha256": tensors_sha256(plain),
     }
@@ -61,7 +75,7 @@ def save_checkpoint(
 
 
 def read_checkpoint_config(path: Path) -> TrainingConfig:
-    """The configuration of the run behind a checkpoint. Raises ModelError."""
+    """Read the configuration of the run that wrote a checkpoint. Raises ModelError."""
     _, metadata = _read(path)
     return TrainingConfig.from_dict(read_json_entry(metadata, "config", path))
 
@@ -72,15 +86,19 @@ def load_checkpoint(
     average: SplineNet,
     optimizer: torch.optim.Optimizer,
     sets: dict[str, str],
-) -> Clock:
-    """Put a run's state back. Raises ModelError where the file, or one of the pixel sets, is not the run's."""
+) -> RunCounters:
+    """Restore networks and optimiser from a checkpoint, in place, and return the counters of the run.
+
+    Raises:
+        ModelError: the file is missing, damaged or from another network, or a pixel set has changed.
+    """
     tensors, metadata = _read(path)
     for name, sha256 in read_json_entry(metadata, "sets", path).items():
         if sets.get(name) != sha256:
             raise ModelError(
-                f"the pixel set {name} is not what it was when the run was begun",
+                f"the pixel set {name} has changed since the run was started",
                 path=path,
-                hint="Put it back as it was, or choose another -o and begin anew",
+                hint="Restore the pixel set, or start another run with another -o",
             )
     groups: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimizer": {}}
     for name, tensor in tensors.items():
@@ -95,11 +113,11 @@ def load_checkpoint(
         states.setdefault(int(index), {})[key] = tensor
     optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
     try:
-        return Clock(**read_json_entry(metadata, "clock", path))
+        return RunCounters(**read_json_entry(metadata, _COUNTERS_KEY, path))
     except TypeError as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    hint = "A run begins without --resume; where this file is damaged, remove it or choose another -o"
+    hint = "Start a run without --resume. If this file is damaged, remove it or choose another -o"
     return read_tensors(path, FORMAT, hint)

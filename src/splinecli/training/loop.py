@@ -19,19 +19,16 @@ from splinecli.files import check_writable, write_text
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
 from splinecli.synthesis.batches import PixelBatch, join_batches
-from splinecli.training.checkpoint import Clock, load_checkpoint, save_checkpoint
+from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
+from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers
 from splinecli.training.objective import Losses, Part, compute_losses, part_of_step
-from splinecli.training.records import Metrics, Records, none_for_nan
+from splinecli.training.run_log import Metrics, RunLog, none_for_nan
 from splinecli.training.sources import open_sources
 from splinecli.training.validation import sample_maps, validation_deg
 
-CHECKPOINT = "checkpoint.safetensors"
-WEIGHTS = "weights.safetensors"
 VALIDATION_PIXELS = 2048
-CHECKPOINT_SECONDS = 45.0
-REPORT_STEPS = 60
 
 # Random streams of a step, beside those of its shards, which are numbered from 0.
 # The last is that of process 0; the others' follow it.
@@ -101,7 +98,7 @@ class Trainer:
             )
         sources = open_sources(config, self.generator, validation_generator)
         self.source = sources.training
-        self.sets, self.unheld = sources.sets, sources.unheld
+        self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         if config.start_from and not resume:
@@ -116,22 +113,22 @@ class Trainer:
         )
         # Where it is emulated, bfloat16 is slower than float32 and gains nothing.
         self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
-        self.clock = Clock()
+        self.counters = RunCounters()
         if resume:
-            self.clock = load_checkpoint(
+            self.counters = load_checkpoint(
                 folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets
             )
         if self.workers.leads:
-            self.records = Records(folder, self.clock.step, tensorboard=tensorboard)
+            self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
             self.validation = sources.validation.draw(VALIDATION_PIXELS)
-            write_text(folder / "config.json", json.dumps(config.to_dict(), indent=2) + "\n")
+            write_text(folder / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")
 
     @property
     def progress(self) -> float:
         """How much of the run is over, 0 to 1."""
         if self.config.minutes > 0:
-            return min(1.0, self.clock.seconds / (60 * self.config.minutes))
-        return min(1.0, self.clock.step / self.config.steps)
+            return min(1.0, self.counters.seconds / (60 * self.config.minutes))
+        return min(1.0, self.counters.step / self.config.steps)
 
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
         """Train to the end and save on the way; `report` is called with progress and metrics now and then.
@@ -151,12 +148,12 @@ class Trainer:
         losses: dict[Part, list[Tensor]] = {}
         count = 0
         saved = time.monotonic()
-        started = saved - self.clock.seconds
+        started = saved - self.counters.seconds
         while self.progress < 1:
-            part = part_of_step(self.config, self.clock.step)
+            part = part_of_step(self.config, self.counters.step)
             losses.setdefault(part, []).append(self.step())
             count += 1
-            self.clock.seconds = self.workers.agree(time.monotonic() - started, self.device)
+            self.counters.seconds = self.workers.agree(time.monotonic() - started, self.device)
             due = self.progress >= 1 or time.monotonic() - saved > CHECKPOINT_SECONDS
             if not (due or count >= REPORT_STEPS):
                 continue
@@ -165,7 +162,7 @@ class Trainer:
                     self._check_weights()
                 means = [torch.stack(steps).mean(dim=0) for steps in losses.values()]
                 metrics = self._metrics(torch.stack(means), check=due)
-                self.records.append(metrics)
+                self.log.append(metrics)
                 if due:
                     self.save()
                     saved = time.monotonic()
@@ -177,12 +174,12 @@ class Trainer:
     def draw(self) -> tuple[PixelBatch, Tensor, bool]:
         """This process's part of the step's batch, the pixels' further turns in degrees, whether mirrored."""
         canonical = self.network.config.is_canonical
-        self.generator.manual_seed(stream_seed(self.config.seed, self.clock.step, _BATCH_STREAM))
+        self.generator.manual_seed(stream_seed(self.config.seed, self.counters.step, _BATCH_STREAM))
         mirrored = canonical and bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
         pixels = self.config.batch_size // self.config.shards
         batches, turns = [], []
         for shard in self.shards:
-            self.generator.manual_seed(stream_seed(self.config.seed, self.clock.step, shard))
+            self.generator.manual_seed(stream_seed(self.config.seed, self.counters.step, shard))
             batches.append(self.source.draw(pixels))
             turns.append(2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1)
         jitter_deg = self.config.turn_jitter_deg if canonical else 0.0
@@ -192,17 +189,17 @@ class Trainer:
         """One update on a fresh batch; returns the losses (6,), as in Losses, averaged over all processes."""
         config = self.config
         for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(config, self.clock.step, self.progress)
+            group["lr"] = learning_rate(config, self.counters.step, self.progress)
         batch, turn_deg, mirrored = self.draw()
         # Dropout draws from the global generator; seeded by the step, it is the same in a resumed run.
-        torch.manual_seed(stream_seed(config.seed, self.clock.step, _DROPOUT_STREAM + self.workers.rank))
+        torch.manual_seed(stream_seed(config.seed, self.counters.step, _DROPOUT_STREAM + self.workers.rank))
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
         losses = compute_losses(
             self.network,
             batch,
             config,
-            part=part_of_step(config, self.clock.step),
+            part=part_of_step(config, self.counters.step),
             turn_deg=turn_deg,
             mirrored=mirrored,
             bfloat16=self.bfloat16,
@@ -217,8 +214,8 @@ class Trainer:
                 raise self._not_finite(f"the {name} is {value.item()}")
         self.optimizer.step()
         self._follow()
-        self.clock.step += 1
-        self.clock.pixels += config.batch_size
+        self.counters.step += 1
+        self.counters.pixels += config.batch_size
         return numbers
 
     def save(self) -> None:
@@ -229,11 +226,11 @@ class Trainer:
             self.network,
             self.average,
             self.optimizer,
-            self.clock,
+            self.counters,
             self.sets,
         )
         save_weights(self.average, self.folder / WEIGHTS)
-        self.records.draw(sample_maps(self.average, self.validation))
+        self.log.draw(sample_maps(self.average, self.validation))
 
     def _check_weights(self) -> None:
         """Raise ModelError before anything that is not finite is saved."""
@@ -246,11 +243,11 @@ class Trainer:
         hint = f"Begin anew with {lower}"
         if (self.folder / CHECKPOINT).exists():
             hint = f"The last checkpoint is kept: --resume goes on from it with {lower}"
-        return ModelError(f"{problem} at step {self.clock.step}", path=self.folder, hint=hint)
+        return ModelError(f"{problem} at step {self.counters.step}", path=self.folder, hint=hint)
 
     def _follow(self) -> None:
         # A young average would remember the start for too long: its decay grows with the steps.
-        decay = min(self.config.average_decay, (1 + self.clock.step) / (10 + self.clock.step))
+        decay = min(self.config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
         with torch.no_grad():
             pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
             for averaged, current in pairs:
@@ -262,9 +259,9 @@ class Trainer:
         summed, averaged = Losses(*means.sum(dim=0).tolist()), Losses(*means.mean(dim=0).tolist())
         checked_deg = validation_deg(self.average, self.validation, bfloat16=self.bfloat16) if check else None
         return Metrics(
-            step=self.clock.step,
-            pixels=self.clock.pixels,
-            minutes=round(self.clock.seconds / 60, 3),
+            step=self.counters.step,
+            pixels=self.counters.pixels,
+            minutes=round(self.counters.seconds / 60, 3),
             learning_rate=self.optimizer.param_groups[0]["lr"],
             loss=float(summed.total),
             angle_deg=math.degrees(averaged.angle),

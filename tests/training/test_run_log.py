@@ -18,19 +18,9 @@ import torch
 
 from splinecli.errors import OutputError, UsageError
 from splinecli.training.config import TrainingConfig
+from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.loop import Trainer
-from splinecli.training.records import (
-    CURVES,
-    EVENTS,
-    MAPS,
-    METRICS,
-    Metrics,
-    Records,
-    curves_figure,
-    maps_figure,
-    none_for_nan,
-    read_metrics,
-)
+from splinecli.training.run_log import Metrics, RunLog, none_for_nan, read_metrics
 from splinecli.training.validation import SampleMaps
 
 ROWS = [
@@ -48,9 +38,9 @@ def sample(count: int = 3) -> SampleMaps:
 
 
 def test_metrics_round_trip(tmp_path: Path) -> None:
-    records = Records(tmp_path, 0)
+    log = RunLog(tmp_path, 0)
     for row in ROWS:
-        records.append(row)
+        log.append(row)
     assert read_metrics(tmp_path / METRICS) == ROWS
     text = (tmp_path / METRICS).read_text()
     header, first, *_ = text.splitlines()
@@ -64,73 +54,30 @@ def test_metrics_round_trip(tmp_path: Path) -> None:
     ("step", "kept"), [(0, 0), (49, 0), (50, 1), (99, 1), (100, 2), (124, 2), (10**6, 3)]
 )
 def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int) -> None:
-    records = Records(tmp_path, 0)
+    log = RunLog(tmp_path, 0)
     for row in ROWS:
-        records.append(row)
-    again = Records(tmp_path, step)
+        log.append(row)
+    again = RunLog(tmp_path, step)
     assert (tmp_path / METRICS).exists() == (kept > 0)
     again.append(replace(ROWS[2], step=10**6 + 1))
     assert read_metrics(tmp_path / METRICS) == [*ROWS[:kept], replace(ROWS[2], step=10**6 + 1)]
 
 
 def test_a_line_cut_short_is_dropped(tmp_path: Path) -> None:
-    records = Records(tmp_path, 0)
+    log = RunLog(tmp_path, 0)
     for row in ROWS[:2]:
-        records.append(row)
+        log.append(row)
     with (tmp_path / METRICS).open("a") as file:
         file.write("12")
-    Records(tmp_path, 100).append(ROWS[2])
+    RunLog(tmp_path, 100).append(ROWS[2])
     assert read_metrics(tmp_path / METRICS) == ROWS
 
 
 @pytest.mark.parametrize("text", ["", "step\n50\n", "step,loss\n50,1.0\n"])
 def test_a_file_of_another_version_is_begun_anew(tmp_path: Path, text: str) -> None:
     (tmp_path / METRICS).write_text(text)
-    Records(tmp_path, 50).append(ROWS[0])
+    RunLog(tmp_path, 50).append(ROWS[0])
     assert read_metrics(tmp_path / METRICS) == ROWS[:1]
-
-
-def test_curves_show_the_metrics() -> None:
-    loss, angle, maps = curves_figure(ROWS).axes
-    steps = [50, 100, 125]
-
-    def line(axes: Any, index: int) -> list[list[float]]:
-        return [list(map(float, values)) for values in axes.lines[index].get_data()]
-
-    assert loss.get_title() == "loss"
-    assert line(loss, 0) == [steps, [2.0, 1.0, 0.5]]
-    assert [text.get_text() for text in angle.get_legend().get_texts()] == ["training", "validation"]
-    assert line(angle, 0) == [steps, [20.0, 10.0, 8.0]]
-    assert line(angle, 1) == [[100, 125], [12.5, 9.0]]
-    assert [text.get_text() for text in maps.get_legend().get_texts()] == ["all cells", "cells with a light"]
-    assert line(maps, 0) == [steps, [0.2, 0.1, 0.08]]
-    assert line(maps, 1) == [steps, [0.1, 0.05, 0.04]]
-    assert {axes.get_xlabel() for axes in (loss, angle, maps)} == {"step"}
-    assert loss.get_yscale() == "linear"
-
-
-def test_wide_curves_are_logarithmic() -> None:
-    assert curves_figure([replace(ROWS[0], loss=50.0), *ROWS[1:]]).axes[0].get_yscale() == "log"
-    zero = [replace(ROWS[0], loss=50.0), replace(ROWS[1], loss=0.0)]
-    assert curves_figure(zero).axes[0].get_yscale() == "linear"
-
-
-def test_maps_are_shown_in_columns() -> None:
-    maps = sample()
-    figure = maps_figure(maps)
-    axes = np.array(figure.axes[:9], dtype=object).reshape(3, 3)
-    for row, cells in zip(axes, (maps.sparse, maps.dense, maps.truth), strict=True):
-        for axis, values in zip(row, cells, strict=True):
-            (image,) = axis.images
-            np.testing.assert_array_equal(np.ma.filled(image.get_array(), np.nan), values)
-            assert image.get_clim() == (0, 1)
-            assert image.get_extent()[2] > image.get_extent()[3]  # row 0, y = +1, on top
-    assert [row[0].get_ylabel() for row in axes] == [
-        "sparse map",
-        "LI-Net's dense map",
-        "true map, gaps filled",
-    ]
-    assert [axis.get_title() for axis in axes[0]] == ["1.2 deg", "20.0 deg", "3.0 deg"]
 
 
 def read_png(path: Path) -> np.ndarray:
@@ -140,18 +87,18 @@ def read_png(path: Path) -> np.ndarray:
 
 
 def test_pictures_are_written_and_renewed(tmp_path: Path) -> None:
-    records = Records(tmp_path, 0)
+    log = RunLog(tmp_path, 0)
     for row in ROWS[:2]:
-        records.append(row)
-    records.draw(sample(1))
+        log.append(row)
+    log.draw(sample(1))
     curves, maps = read_png(tmp_path / CURVES), read_png(tmp_path / MAPS)
     assert len(np.unique(curves.reshape(-1, 3), axis=0)) > 10
     # The colours of 8 x 8 random cells, thrice.
     assert len(np.unique(maps.reshape(-1, 3), axis=0)) > 100
-    records.append(ROWS[2])
-    records.draw(sample(2))
+    log.append(ROWS[2])
+    log.draw(sample(2))
     assert (read_png(tmp_path / CURVES) != curves).any()
-    assert read_png(tmp_path / MAPS).shape[1] > maps.shape[1]
+    assert read_png(tmp_path / MAPS).shape[0] > maps.shape[0]  # a row for each pixel
     assert sorted(path.name for path in tmp_path.iterdir()) == [CURVES, MAPS, METRICS]
 
 
@@ -165,8 +112,8 @@ def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_said_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    records = Records(tmp_path, 0)
-    records.append(ROWS[0])
+    log = RunLog(tmp_path, 0)
+    log.append(ROWS[0])
 
     class Full(io.StringIO):
         def write(self, text: str) -> int:
@@ -174,16 +121,16 @@ def test_a_full_disk_is_said_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(Path, "open", lambda *args, **kwargs: Full())
     with pytest.raises(OutputError, match=r"metrics\.csv: cannot be written \(No space left on device\)"):
-        records.append(ROWS[1])
+        log.append(ROWS[1])
 
 
 def test_tensorboard_s_events(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    records = Records(tmp_path, 0, tensorboard=True)
+    log = RunLog(tmp_path, 0, tensorboard=True)
     for row in ROWS:
-        records.append(row)
+        log.append(row)
     events = EventAccumulator(str(tmp_path / EVENTS))
     events.Reload()
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
@@ -202,9 +149,9 @@ def test_without_tensorboard_it_says_how_to_get_it(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(UsageError, match=r"Install it: pip install 'splinecli\[tensorboard\]'"):
-        Records(tmp_path, 0, tensorboard=True)
+        RunLog(tmp_path, 0, tensorboard=True)
     assert not (tmp_path / EVENTS).exists()
-    Records(tmp_path, 0).append(ROWS[0])
+    RunLog(tmp_path, 0).append(ROWS[0])
 
 
 def test_what_was_not_computed_is_left_empty() -> None:

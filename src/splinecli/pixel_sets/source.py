@@ -1,0 +1,146 @@
+"""Training batches from a pixel set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splinecli.observation_map import cell_directions, rotate_about_view_axis, sparse_map
+from splinecli.pixel_sets.dense_maps import fill_gaps
+from splinecli.pixel_sets.store import Entry, PixelSet
+from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
+from splinecli.synthesis.lights import draw_light_counts
+
+# Memory-mapped arrays are closed after this many bytes of them were read, so that their pages can be freed.
+_MAPPED_BYTES = 128 << 20
+# The operating system reads this much around the first byte of a page.
+_READ_AHEAD_BYTES = 64 << 10
+_LEAST_CONE_DEG, _MOST_CONE_DEG = 20, 90
+
+
+@dataclass(frozen=True)
+class SampledPixels:
+    """The truth behind P pixels of a pixel set, under up to F lights each.
+
+    Attributes:
+        normals: (P, 3) unit normals.
+        radiance: (P, F).
+        light_directions: (P, F, 3) unit vectors towards the lights.
+        known: (P, F), False for the padding of pixels with fewer lights.
+    """
+
+    normals: Tensor
+    radiance: Tensor
+    light_directions: Tensor
+    known: Tensor
+
+    def rotate(self, cosine: Tensor, sine: Tensor) -> SampledPixels:
+        """Rotate each pixel about the view axis by its own angle, given as cosine (P,) and sine (P,)."""
+        lights = rotate_about_view_axis(self.light_directions, cosine[:, None], sine[:, None])
+        return SampledPixels(
+            rotate_about_view_axis(self.normals, cosine, sine), self.radiance, lights, self.known
+        )
+
+    def dense_truth(self, size: int) -> DenseMap:
+        """Return the observation maps (P, 1, size, size) of all lights, with gaps interpolated."""
+        sampled = sparse_map(self.radiance, self.light_directions, self.known, size=size)
+        inside = cell_directions(size)[1].to(sampled.holds)
+        return fill_gaps(sampled.values, sampled.holds * inside, inside)
+
+
+class PixelSetSource:
+    """Draws pixels of some entries of a set, all with the same probability, under newly drawn lights.
+
+    As in CNN-PS (Ikehata, ECCV 2018), the lights of a pixel are drawn within a cone about the view axis. Its
+    half-angle is random, U(20, 90) degrees. Where the cone holds too few lights, the closest others join them.
+
+    Args:
+        pixel_set: the set.
+        entries: the entries to draw from.
+        config: number of lights and the faults of the capture.
+        generator: source of all random numbers; its device is that of the batches.
+    """
+
+    def __init__(
+        self,
+        pixel_set: PixelSet,
+        entries: Sequence[Entry],
+        config: CaptureConfig,
+        generator: torch.Generator,
+    ) -> None:
+        self.pixel_set = pixel_set
+        self.entries = tuple(entries)
+        self.config = config
+        self.generator = generator
+        self._ends = torch.tensor([entry.n_pixels for entry in entries]).cumsum(0)
+        self._observations: dict[int, NDArray[np.floating]] = {}
+        self._normals_and_lights: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        self._bytes_read = 0
+
+    def draw(self, pixels: int) -> PixelBatch:
+        """Draw a batch of P pixels."""
+        truth = self._sample(pixels)
+        counts = draw_light_counts(
+            pixels, self.config.min_lights, self.config.max_lights, self.config.usual_lights, self.generator
+        )
+        order, valid = self._choose_lights(truth, counts)
+        directions = truth.light_directions.gather(1, order[..., None].expand(*order.shape, 3))
+        return photograph(
+            truth, truth.radiance.gather(1, order), directions, valid, self.config, self.generator
+        )
+
+    def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return light indices (P, K) and which of them are used, counts (P,) in each row."""
+        uniform = torch.rand(truth.known.shape, generator=self.generator, device=self.generator.device)
+        cone = torch.rand(len(counts), 1, generator=self.generator, device=self.generator.device)
+        lowest_z = torch.deg2rad(_LEAST_CONE_DEG + (_MOST_CONE_DEG - _LEAST_CONE_DEG) * cone).cos()
+        z = truth.light_directions[..., 2]
+        # Lights within the cone have a random rank below 1. The others follow, the closest to the axis first.
+        rank = torch.where(z >= lowest_z, uniform, 2 - z).masked_fill(~truth.known, torch.inf)
+        order = rank.argsort(dim=1)[:, : int(counts.max())]
+        chosen = torch.arange(order.shape[1], device=counts.device) < counts[:, None]
+        return order, chosen & truth.known.gather(1, order)
+
+    def _sample(self, pixels: int) -> SampledPixels:
+        """Draw pixels and read them with all their lights."""
+        device = self.generator.device
+        flat = torch.randint(int(self._ends[-1]), (pixels,), generator=self.generator, device=device).cpu()
+        flat = flat.sort().values
+        entry_of_pixel = torch.searchsorted(self._ends, flat, right=True)
+        present = entry_of_pixel.bincount().nonzero().flatten().tolist()
+        lights = max(self.entries[index].n_lights for index in present)
+        radiance = np.zeros((pixels, lights), np.float32)
+        directions = np.zeros((pixels, lights, 3), np.float32)
+        directions[..., 2] = 1
+        known = np.zeros((pixels, lights), np.bool_)
+        normals = np.empty((pixels, 3), np.float32)
+        for index in present:
+            entry = self.entries[index]
+            observations, entry_normals, entry_directions = self._arrays(index)
+            here = entry_of_pixel == index
+            rows = (flat[here] - (self._ends[index] - entry.n_pixels)).numpy()
+            here = here.numpy()
+            radiance[here, : entry.n_lights] = observations[rows]
+            directions[here, : entry.n_lights] = entry_directions
+            known[here, : entry.n_lights] = True
+            normals[here] = entry_normals[rows]
+            self._bytes_read += len(rows) * (_READ_AHEAD_BYTES + observations[0].nbytes)
+        if self._bytes_read > _MAPPED_BYTES:
+            self._observations, self._bytes_read = {}, 0
+        return SampledPixels(
+            *(torch.from_numpy(array).to(device) for array in (normals, radiance, directions, known))
+        )
+
+    def _arrays(self, index: int) -> tuple[NDArray[np.floating], NDArray[np.float32], NDArray[np.float32]]:
+        """Return an entry's observations, which stay on disk, its normals and its light directions."""
+        if index not in self._observations:
+            pixels = self.pixel_set.load(self.entries[index])
+            self._observations[index] = pixels.observations
+            if index not in self._normals_and_lights:
+                self._normals_and_lights[index] = np.array(pixels.normals), np.array(pixels.light_directions)
+        return self._observations[index], *self._normals_and_lights[index]

@@ -1,0 +1,20 @@
+"""Names and intervals of training that the command line shows before it loads PyTorch."""
+
+from __future__ import annotations
+
+PRESET_NAMES = ("compact", "paper", "cnn-ps")
+DEFAULT_PRESET = "compact"
+
+CHECKPOINT_SECONDS = 45
+"""The checkpoint and the figures are renewed after this many seconds."""
+
+REPORT_STEPS = 60
+"""metrics.csv gets a line after this many steps, and with each checkpoint."""
+
+CHECKPOINT = "checkpoint.safetensors"
+WEIGHTS = "weights.safetensors"
+CONFIG = "config.json"
+METRICS = "metrics.csv"
+CURVES = "curves.png"
+MAPS = "maps.png"
+EVENTS = "tensorboard"

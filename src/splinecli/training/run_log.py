@@ -1,0 +1,135 @@
+"""The log of a run: metrics.csv, curves.png, maps.png and, on request, TensorBoard's event files."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from splinecli.errors import OutputError, UsageError
+from splinecli.files import refusals_as_output_errors, write_bytes, write_text
+from splinecli.pictures.observation_maps import observation_map_figure
+from splinecli.pictures.training_curves import training_curves
+from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
+from splinecli.training.validation import SampleMaps
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """One line of metrics.csv: means over the steps since the previous line.
+
+    A value that was not computed is None.
+
+    Attributes:
+        step: number of updates so far.
+        pixels: number of training pixels drawn so far.
+        minutes: training time so far.
+        learning_rate: the rate of the last update.
+        loss: the weighted sum of all terms. Where LI-Net and NE-Net are updated in turn, the sum of both losses.
+        angle_deg: mean angular error of the training pixels, in degrees.
+        map_error: mean absolute error of LI-Net's dense map. None without a LI-Net.
+        masked_map_error: the same over the cells of the sparse map.
+        symmetric, asymmetric: Ls and La, unweighted. None where their weights are 0.
+        validation_deg: mean angular error of the validation pixels, in degrees. None between checkpoints.
+    """
+
+    step: int
+    pixels: int
+    minutes: float
+    learning_rate: float
+    loss: float
+    angle_deg: float
+    map_error: float | None
+    masked_map_error: float | None
+    symmetric: float | None = None
+    asymmetric: float | None = None
+    validation_deg: float | None = None
+
+
+class RunLog:
+    """Writer of the log files in `folder`. Its methods raise OutputError when a file cannot be written."""
+
+    def __init__(self, folder: Path, step: int, *, tensorboard: bool = False) -> None:
+        """Open the log at a step and drop the lines of later steps, which the run is about to repeat.
+
+        Raises:
+            UsageError: `tensorboard` is set and the package is not installed.
+        """
+        self.folder = folder
+        _drop_lines_after(step, folder / METRICS)
+        self._events: Any = _open_events(folder / EVENTS, step) if tensorboard else None
+
+    def append(self, metrics: Metrics) -> None:
+        """Add a line to metrics.csv and to TensorBoard's event file."""
+        path, row = self.folder / METRICS, vars(metrics)
+        try:
+            is_new = not path.exists()
+            with path.open("a", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, row.keys())
+                if is_new:
+                    writer.writeheader()
+                writer.writerow({key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()})
+        except OSError as error:
+            raise OutputError(f"cannot be written ({error.strerror})", path=path) from error
+        if self._events is not None:
+            with refusals_as_output_errors(self.folder / EVENTS):
+                for key, value in row.items():
+                    if value is not None and key != "step":
+                        self._events.add_scalar(key, value, metrics.step)
+                self._events.flush()
+
+    def draw(self, maps: SampleMaps) -> None:
+        """Write curves.png and maps.png anew."""
+        rows = read_metrics(self.folder / METRICS)
+        columns = {field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)}
+        write_bytes(self.folder / CURVES, training_curves(columns))
+        figure = observation_map_figure(
+            maps.sparse, maps.dense, maps.truth, error_deg=maps.error_deg, truth_label="true map, gaps filled"
+        )
+        write_bytes(self.folder / MAPS, figure)
+
+
+def read_metrics(path: Path) -> list[Metrics]:
+    """Return the lines of a metrics.csv."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [_parse(row) for row in csv.DictReader(file)]
+
+
+def none_for_nan(value: float) -> float | None:
+    """Return the value, or None for NaN, which marks a term that was not computed."""
+    return None if math.isnan(value) else value
+
+
+def _parse(row: dict[str, str]) -> Metrics:
+    values: dict[str, Any] = {key: float(value) if value else None for key, value in row.items()}
+    return Metrics(**{**values, "step": int(row["step"]), "pixels": int(row["pixels"])})
+
+
+def _drop_lines_after(step: int, path: Path) -> None:
+    """Remove the lines of later steps from a metrics.csv, or the whole file where no line is left."""
+    if not path.exists():
+        return
+    header, *lines = path.read_text("utf-8").splitlines() or [""]
+    expected = ",".join(field.name for field in fields(Metrics))
+    # A full disk may cut the last line, and then its step may lack digits.
+    whole = [line.split(",") for line in lines if line.count(",") == expected.count(",")]
+    kept = [",".join(values) for values in whole if values[0].isdigit() and int(values[0]) <= step]
+    if kept and header == expected:
+        write_text(path, "\n".join([header, *kept]) + "\n")
+    else:  # The run stopped before its first checkpoint, or another version wrote the file.
+        with refusals_as_output_errors(path):
+            path.unlink()
+
+
+def _open_events(folder: Path, step: int) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise UsageError(
+            "--tensorboard needs the package tensorboard",
+            hint="Install it: pip install 'splinecli[tensorboard]'",
+        ) from error
+    with refusals_as_output_errors(folder):
+        return SummaryWriter(str(folder), purge_step=step + 1)

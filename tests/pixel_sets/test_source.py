@@ -1,0 +1,248 @@
+"""Batches from a pixel set hold the stored pixels, under drawn lights, and dense maps fill only gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splinecli.observation_map import cell_directions
+from splinecli.pixel_sets import source
+from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
+from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
+from splinecli.pixel_sets.store import PixelSet
+from splinecli.synthesis.batches import CaptureConfig, PixelBatch
+
+FAULTLESS = CaptureConfig(
+    min_lights=5, max_lights=10, usual_lights=8, light_direction_error_share=0.0,
+    light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
+)  # fmt: skip
+MakeSet = Callable[..., PixelSet]
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def source_of(pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0) -> PixelSetSource:
+    return PixelSetSource(pixel_set, pixel_set.entries, config, seeded(seed))
+
+
+def assert_same(one: PixelBatch, other: PixelBatch) -> None:
+    for name in ("observations", "light_directions", "valid", "exposure"):
+        assert torch.equal(getattr(one, name), getattr(other, name))
+    assert torch.equal(one.scene.normals, other.scene.normals)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtype: type) -> None:
+    pixel_set = make_set(dtype=dtype)
+    batch = source_of(pixel_set).draw(200)
+    stored = {entry.name: pixel_set.load(entry) for entry in pixel_set.entries}
+    seen = set()
+    for pixel, normal in enumerate(batch.scene.normals.numpy()):
+        name, row = next(
+            (name, int(np.flatnonzero((pixels.normals == normal).all(axis=1))[0]))
+            for name, pixels in stored.items()
+            if (pixels.normals == normal).all(axis=1).any()
+        )
+        seen.add(name)
+        valid = batch.valid[pixel].numpy()
+        used = set()
+        for direction, observed in zip(
+            batch.light_directions[pixel].numpy()[valid],
+            batch.observations[pixel].numpy()[valid],
+            strict=True,
+        ):
+            distance = np.abs(stored[name].light_directions - direction).max(axis=1)
+            light = int(distance.argmin())
+            assert distance[light] < 1e-6  # normalised once more
+            used.add(light)
+            expected = float(stored[name].observations[row, light]) * batch.exposure[pixel].item()
+            assert observed == pytest.approx(expected, rel=1e-6, abs=1e-9)
+        assert len(used) == valid.sum()  # no light twice
+        assert (batch.observations[pixel].numpy()[~valid] == 0).all()
+    assert seen == {"a", "b", "c"}
+
+
+def test_pixels_are_alike_likely(make_set: MakeSet) -> None:
+    pixel_set = make_set()
+    normals = source_of(pixel_set).draw(9000).scene.normals.numpy()
+    of_b = (normals[:, None] == pixel_set.load(pixel_set.entries[1]).normals).all(axis=2)
+    # 30 pixels of 90: a third, and a ninetieth each. Within four standard deviations of the binomial.
+    assert of_b.any(axis=1).sum() == pytest.approx(3000, abs=4 * np.sqrt(9000 * 2 / 9))
+    assert of_b.sum(axis=0) == pytest.approx(np.full(30, 100), abs=4 * np.sqrt(100))
+
+
+def test_as_many_lights_as_configured(make_set: MakeSet) -> None:
+    batch = source_of(make_set()).draw(400)
+    counts = batch.valid.sum(dim=1)
+    assert counts.min() == 5
+    assert counts.max() == 10
+    assert batch.valid.shape[1] == 10
+    usual = replace(FAULTLESS, min_lights=8, max_lights=8)
+    assert (source_of(make_set("other"), usual).draw(50).valid.sum(dim=1) == 8).all()
+
+
+def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeSet) -> None:
+    pixel_set = make_set(entries=[("a", "one", 20, 6), ("b", "two", 20, 12)])
+    config = replace(FAULTLESS, min_lights=20, max_lights=20, usual_lights=20)
+    batch = source_of(pixel_set, config).draw(100)
+    assert set(batch.valid.sum(dim=1).tolist()) == {6, 12}
+    few = batch.valid.sum(dim=1) == 6
+    normals = pixel_set.load(pixel_set.entries[0]).normals
+    assert all((normals == normal).all(axis=1).any() for normal in batch.scene.normals[few].numpy())
+
+
+def test_lights_lie_within_a_random_angle_and_then_closest_to_it(make_set: MakeSet) -> None:
+    # One pixel's lights: none of those left out beyond the angle is nearer the axis than one taken beyond it.
+    pixel_set = make_set(entries=[("a", "one", 50, 200)])
+    config = replace(FAULTLESS, min_lights=10, max_lights=10, usual_lights=10)
+    batch = source_of(pixel_set, config).draw(600)
+    largest = batch.light_directions[..., 2].acos().rad2deg().amax(dim=1)
+    # Of all 200 lights, 10 reach out to 70 or so nearly always; of a random cone only sometimes.
+    assert 0.15 < (largest < 50).float().mean() < 0.6
+    zeniths = np.sort(np.degrees(np.arccos(pixel_set.load(pixel_set.entries[0]).light_directions[:, 2])))
+    assert largest.min() >= zeniths[9] - 0.01  # ten lights reach at least as far as the ten innermost
+
+
+def test_pixels_with_fewer_lights_than_others_know_no_more_cells(make_set: MakeSet) -> None:
+    scene = source_of(make_set()).draw(300).scene
+    assert isinstance(scene, SampledPixels)
+    assert set(scene.known.sum(dim=1).tolist()) == {12, 25, 30}
+    dense = scene.dense_truth(32)
+    assert (dense.known.sum((1, 2, 3)) <= scene.known.sum(dim=1)).all()
+    assert (dense.filled >= dense.known).all()
+
+
+def analytic_scene(pixels: int = 6) -> tuple[SampledPixels, torch.Tensor]:
+    """Matte pixels under lights at the centres of a third of the cells."""
+    directions, inside = cell_directions()
+    lights = directions[inside][::3].expand(pixels, -1, 3)
+    normals = torch.nn.functional.normalize(torch.rand(pixels, 3, generator=seeded()) + 0.1, dim=1)
+    radiance = (lights @ normals[..., None])[..., 0].clamp(min=0)
+    return SampledPixels(normals, radiance, lights, torch.ones_like(radiance) > 0), normals
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns: int) -> None:
+    scene, normals = analytic_scene()
+    angle = torch.tensor(quarter_turns * torch.pi / 2).expand(6)
+    turned = scene.rotate(angle.cos().round(), angle.sin().round())
+    dense = turned.dense_truth(32)
+    assert (dense.known.sum((1, 2, 3)) == scene.radiance.shape[1]).all()
+    x, y, z = normals.unbind(1)
+    for _ in range(quarter_turns):
+        x, y = -y, x
+    rotated = torch.stack((x, y, z), dim=1)
+    torch.testing.assert_close(turned.normals, rotated)
+    analytic = (cell_directions()[0] @ rotated.T).permute(2, 0, 1)[:, None].clamp(min=0)
+    torch.testing.assert_close(dense.values * dense.known, analytic * dense.known)
+    # Interpolated between cells of 1 / 16, where n . l has a slope of about 1; along the rim, where l_z falls
+    # steeply and all neighbours lie further in, errors are larger.
+    filled = dense.filled - dense.known
+    error = ((dense.values - analytic) * filled).abs()
+    assert error.sum() / filled.sum() < 0.02
+    assert error[..., cell_directions()[0][..., 2] > 0.5].max() < 2 / 16
+
+
+def test_any_rotation_puts_each_light_into_its_cell() -> None:
+    scene, _ = analytic_scene(3)
+    known = torch.rand(scene.known.shape, generator=seeded(1)) < 0.3
+    scene = SampledPixels(scene.normals, scene.radiance, scene.light_directions, known)
+    angle = torch.tensor([0.3, -1.1, 2.5])
+    dense = scene.rotate(angle.cos(), angle.sin()).dense_truth(32)
+    for pixel in range(3):
+        found: dict[tuple[int, int], list[float]] = {}
+        cosine, sine = angle[pixel].cos().item(), angle[pixel].sin().item()
+        for light in known[pixel].nonzero()[:, 0]:
+            x, y, _ = scene.light_directions[pixel, light].tolist()
+            column = int((cosine * x - sine * y + 1) * 16)
+            row = int((1 - (sine * x + cosine * y)) * 16)
+            found.setdefault((row, column), []).append(scene.radiance[pixel, light].item())
+        inside = cell_directions()[1]
+        expected = {cell: np.mean(values) for cell, values in found.items() if inside[cell]}
+        assert {tuple(cell) for cell in dense.known[pixel, 0].nonzero().tolist()} == set(expected)
+        for cell, value in expected.items():
+            assert dense.values[pixel, 0][cell].item() == pytest.approx(value, abs=1e-6)
+
+
+def test_linear_maps_are_filled_about_right_and_known_cells_stay() -> None:
+    directions, inside = cell_directions()
+    linear = (0.5 + 0.3 * directions[..., 0] - 0.2 * directions[..., 1])[None, None]
+    disc = inside.float()[None, None]
+    known = (torch.rand(1, 1, 32, 32, generator=seeded()) < 0.4).float() * disc
+    dense = fill_gaps(linear * known, known, inside)
+    assert torch.equal(dense.known, known)
+    assert torch.equal(dense.values * known, linear * known)
+    # All but the rim, whose cells have neighbours on one side alone.
+    within = disc * (directions[..., 2] > 0.35)
+    assert (dense.filled * within).sum() > 0.85 * within.sum()
+    assert (dense.filled * (1 - disc)).sum() == 0
+    # The slope along a row or column is at most 0.3 / 16 a cell, and neighbours are asked first.
+    error = ((dense.values - linear) * dense.filled).abs()
+    assert error.max() < 2 * 0.5 / 16
+    assert error.sum() / disc.sum() < 0.3 * 0.3 / 16
+
+
+def test_a_single_gap_of_a_linear_map_is_filled_exactly() -> None:
+    rows, columns = torch.meshgrid(torch.arange(32.0), torch.arange(32.0), indexing="ij")
+    linear = (0.01 * rows + 0.02 * columns)[None, None]
+    known = torch.ones(1, 1, 32, 32)
+    known[0, 0, 10, 20] = 0
+    # The value of a cell that is not known plays no part.
+    given = torch.where(known > 0, linear, torch.tensor(77.0))
+    dense = fill_gaps(given, known, torch.ones(32, 32))
+    assert dense.values[0, 0, 10, 20].item() == pytest.approx(0.1 + 0.4, rel=1e-5)
+
+
+def test_gaps_are_filled_between_lights_and_not_beside_them() -> None:
+    _, inside = cell_directions()
+    known, values = torch.zeros(1, 1, 32, 32), torch.zeros(1, 1, 32, 32)
+    for row, column, value in ((16, 10, 0.2), (16, 12, 0.6), (5, 20, 0.9)):
+        known[0, 0, row, column], values[0, 0, row, column] = 1, value
+    dense = fill_gaps(values, known, inside)
+    # One gap lies between two lights, half way. A light alone says nothing of its neighbours.
+    assert dense.filled.sum() == 4
+    assert dense.values[0, 0, 16, 11].item() == pytest.approx(0.4)
+    assert torch.equal(dense.known, known)
+
+
+def test_nothing_is_filled_outside_the_disc_or_far_from_a_light() -> None:
+    _, inside = cell_directions()
+    known = torch.ones(1, 1, 32, 32)
+    known[0, 0, 8:24, 8:24] = 0
+    dense = fill_gaps(torch.full((1, 1, 32, 32), 0.5) * known, known * inside, inside)
+    assert not dense.filled[0, 0][~inside].any()
+    assert not dense.values[0, 0][~inside].any()
+    middle = slice(8 + FILL_ROUNDS, 24 - FILL_ROUNDS)
+    assert not dense.filled[0, 0, middle, middle].any()
+    np.testing.assert_allclose(dense.values[dense.filled > 0], 0.5, rtol=1e-6)
+
+
+def test_no_light_and_no_map() -> None:
+    dense = fill_gaps(torch.zeros(2, 1, 16, 16), torch.zeros(2, 1, 16, 16), cell_directions(16)[1])
+    assert not dense.values.any()
+    assert not dense.filled.any()
+
+
+def test_arrays_are_let_go_without_changing_what_is_drawn(
+    make_set: MakeSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pixel_set = make_set()
+    kept = source_of(pixel_set)
+    expected = [kept.draw(50) for _ in range(6)]
+    assert set(kept._observations) == {0, 1, 2}
+    assert kept._bytes_read > 300 * 65_536
+    # After 60 pixels, of what is mapped around each row.
+    monkeypatch.setattr(source, "_MAPPED_BYTES", 60 * 65_536)
+    freed = source_of(pixel_set)
+    open_after = []
+    for wanted in expected:
+        assert_same(freed.draw(50), wanted)
+        open_after.append(len(freed._observations))
+    assert open_after == [3, 0, 3, 0, 3, 0]
+    assert freed._bytes_read == 0
