@@ -1,12 +1,12 @@
-"""Capture + Estimator -> NormalEstimate, in tiles: what a method needs to work is bounded by one tile.
+"""From a Capture and an Estimator to a NormalEstimate.
 
-The normals themselves, and the errors, grow with the capture.
+The pixels are processed in tiles. The working memory of a method is that of one tile; only the results grow with the
+capture.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,21 +15,23 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import tells_confidence
+from splinecli.methods.estimator import Progress, tells_confidence
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
 TILE_PIXELS = 16_384
-_UNIT_TOLERANCE = 1e-2  # float16 and bfloat16 normals pass, zero ones and NaN do not
+_UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
 
 
 @dataclass(frozen=True)
 class NormalEstimate:
-    """The normals of one capture.
+    """The normals of one capture, and their errors where there is ground truth.
 
-    normal_map: (H, W, 3) float32, unit, zero outside the mask. error_map_deg: (H, W) float32, NaN where there
-    is no ground truth, or None without any; errors: its summary. seconds: spent estimating. confidence_map:
-    (H, W) float32, the probability that the normal is off by no more than CONFIDENT_DEG, zero outside the mask; None
-    where the method does not tell.
+    normal_map: (H, W, 3) float32, unit inside the mask and zero outside.
+    seconds: time spent on the estimation.
+    error_map_deg: (H, W) float32, NaN at pixels without ground truth; None if the capture has no ground truth.
+    errors: summary of error_map_deg, or None.
+    confidence_map: (H, W) float32, the probability that the normal is off by at most CONFIDENT_DEG; zero outside the
+        mask. None if the method has no confidence.
     """
 
     capture: Capture
@@ -41,7 +43,7 @@ class NormalEstimate:
 
     @property
     def expected_under_5(self) -> float | None:
-        """The share of the pixels whose normals are probably off by no more than 5 degrees; None without confidence."""
+        """Expected share of pixels whose normals are off by at most 5 degrees; None without confidence."""
         if self.confidence_map is None:
             return None
         return float(self.confidence_map[self.capture.mask].mean())
@@ -52,9 +54,18 @@ def estimate_normals(
     estimator: Estimator,
     *,
     tile_pixels: int = TILE_PIXELS,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> NormalEstimate:
-    """Run an estimator over a capture, `tile_pixels` at a time; `progress` is told the pixels just done."""
+    """Estimate the normals of a capture.
+
+    Args:
+        tile_pixels: number of pixels that the estimator gets at once.
+        progress: called with the number of pixels just finished: after each batch of the estimator (about 1,000 pixels
+            for networks), not only after each tile.
+
+    Raises:
+        SplinecliError: the estimator gave normals that are not unit vectors.
+    """
     started = time.perf_counter()
     normals = np.empty((capture.n_pixels, 3), np.float32)
     confidence = np.empty(capture.n_pixels, np.float32) if tells_confidence(estimator) else None
@@ -63,12 +74,10 @@ def estimate_normals(
         tile = capture.observations[rows]
         if confidence is not None and tells_confidence(estimator):
             normals[rows], confidence[rows] = estimator.estimate_with_confidence(
-                tile, capture.light_directions
+                tile, capture.light_directions, progress=progress
             )
         else:
-            normals[rows] = estimator.estimate(tile, capture.light_directions)
-        if progress is not None:
-            progress(len(tile))
+            normals[rows] = estimator.estimate(tile, capture.light_directions, progress=progress)
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
@@ -86,7 +95,7 @@ def estimate_normals(
 
 
 def _check_unit(normals: NDArray[np.float32], method: str) -> None:
-    # A zero normal would score 0 degrees, and NaN would drop out of a mean.
+    # A zero normal would count as an error of 0 degrees, and NaN would be left out of the mean.
     for start in range(0, len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
         if not (np.abs(length - 1) <= _UNIT_TOLERANCE).all():

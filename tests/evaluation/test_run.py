@@ -39,7 +39,9 @@ class Fake:
         self._truth = truth[truth.any(axis=1)].astype(np.float64)
         self._angles = np.radians(angles_deg)
 
-    def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+    def estimate(
+        self, observations: NDArray[np.float32], lights: NDArray[np.float64], *, progress: object = None
+    ) -> NDArray[np.float64]:
         angle = self._angles[len(self.lights) % len(self._angles)]
         self.lights.append(lights)
         self.observations.append(observations)
@@ -56,7 +58,9 @@ class Constant(Fake):
     def __init__(self, vector: Sequence[float]) -> None:
         self.name, self._vector, self.lights = "constant", vector, []
 
-    def estimate(self, observations: NDArray[np.float32], lights: NDArray[np.float64]) -> NDArray[np.float64]:
+    def estimate(
+        self, observations: NDArray[np.float32], lights: NDArray[np.float64], *, progress: object = None
+    ) -> NDArray[np.float64]:
         self.lights.append(lights)
         return np.tile(self._vector, (len(observations), 1))
 
@@ -163,7 +167,9 @@ def test_only_pixels_with_ground_truth_are_estimated(write_dome: WriteDome) -> N
 
 def test_a_part_of_the_pixels(write_dome: WriteDome) -> None:
     class Spy(Constant):
-        def estimate(self, observations: NDArray[Any], lights: NDArray[Any]) -> NDArray[np.float64]:
+        def estimate(
+            self, observations: NDArray[Any], lights: NDArray[Any], *, progress: object = None
+        ) -> NDArray[np.float64]:
             seen.append(observations[:, 0])
             return super().estimate(observations, lights)
 

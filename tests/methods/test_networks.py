@@ -1,4 +1,4 @@
-"""SPLINE-Net as an estimator: batches and views."""
+"""SPLINE-Net as an estimator: batches, rotations, progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from splinecli.methods.networks import NetworkEstimator, views
+from splinecli.methods.networks import NetworkEstimator, rotations_of
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
@@ -79,25 +79,25 @@ def test_no_pixels() -> None:
     assert network.estimate(np.empty((0, 10), np.float32), lights).shape == (0, 3)
 
 
-def test_views_of_a_network_without_canonical_azimuth_divide_the_circle() -> None:
-    assert views(1, canonical=False) == [(0, False)]
-    assert views(4, canonical=False) == [(0, False), (90, False), (180, False), (270, False)]
+def test_rotations_of_a_network_without_canonical_azimuth_divide_the_circle() -> None:
+    assert rotations_of(1, canonical=False) == [(0, False)]
+    assert rotations_of(4, canonical=False) == [(0, False), (90, False), (180, False), (270, False)]
 
 
-def test_views_of_a_canonical_network() -> None:
-    assert views(1, canonical=True) == [(0, False)]
-    assert views(2, canonical=True) == [(0, False), (0, True)]
-    assert views(4, canonical=True) == [(-10, False), (-10, True), (10, False), (10, True)]
-    assert views(6, canonical=True) == [(t, m) for t in (-10.0, 0.0, 10.0) for m in (False, True)]
+def test_rotations_of_a_canonical_network() -> None:
+    assert rotations_of(1, canonical=True) == [(0, False)]
+    assert rotations_of(2, canonical=True) == [(0, False), (0, True)]
+    assert rotations_of(4, canonical=True) == [(-10, False), (-10, True), (10, False), (10, True)]
+    assert rotations_of(6, canonical=True) == [(t, m) for t in (-10.0, 0.0, 10.0) for m in (False, True)]
     for rotations in range(1, 20):
-        several = views(rotations, canonical=True)
+        several = rotations_of(rotations, canonical=True)
         assert len(set(several)) == rotations
         # Training turns by up to 15 degrees.
         assert max(abs(turn) for turn, _ in several) <= 15
 
 
-def test_four_views_of_the_paper_network_make_it_fourfold_symmetric() -> None:
-    # Turning the lights by 90 degrees puts the four views in another order, no more.
+def test_four_rotations_of_the_paper_network_make_it_fourfold_symmetric() -> None:
+    # Turning the lights by 90 degrees only changes the order of the four rotations.
     observations, lights = pixels(4)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     for rotations, symmetric in ((4, True), (1, False)):
@@ -111,7 +111,7 @@ def test_four_views_of_the_paper_network_make_it_fourfold_symmetric() -> None:
         assert np.allclose(there, here @ quarter.T, atol=1e-4) == symmetric
 
 
-def test_two_views_of_a_canonical_network_make_it_mirror_symmetric() -> None:
+def test_two_rotations_of_a_canonical_network_make_it_mirror_symmetric() -> None:
     observations, lights = pixels(10)
     for rotations, symmetric in ((2, True), (1, False)):
         network = NetworkEstimator(
@@ -124,6 +124,16 @@ def test_two_views_of_a_canonical_network_make_it_mirror_symmetric() -> None:
         assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
 
 
-def test_several_views_give_unit_vectors() -> None:
+def test_several_rotations_give_unit_vectors() -> None:
     network = estimator(random_network(COMPACT), precision="float32", rotations=5)
     np.testing.assert_allclose(np.linalg.norm(network.estimate(*pixels(30)), axis=1), 1, rtol=1e-5)
+
+
+def test_progress_is_reported_after_each_batch_and_changes_no_bit() -> None:
+    """The bar of a large capture must not wait for a whole tile of 16,384 pixels."""
+    observations, lights = pixels(2500)
+    network = estimator(random_network(COMPACT), precision="float32")
+    done: list[int] = []
+    watched = network.estimate(observations, lights, progress=done.append)
+    assert done == [1024, 1024, 452]
+    assert watched.tobytes() == network.estimate(observations, lights).tobytes()

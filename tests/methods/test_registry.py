@@ -68,7 +68,7 @@ def test_options_reach_the_network(weights: str) -> None:
     assert estimator.weights["name"] == "tiny"
     assert len(estimator.weights["sha256"]) == 64
     assert vars(estimator)["batch_size"] == 7
-    assert len(vars(estimator)["_views"]) == 4
+    assert len(vars(estimator)["_rotations"]) == 4
 
 
 def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:

@@ -1,4 +1,4 @@
-"""Methods that are a function of a batch of pixels, in torch: batches, devices, and the scale of the intensities."""
+"""Estimators made of one torch function: they split the pixels into batches and scale each pixel."""
 
 from __future__ import annotations
 
@@ -11,25 +11,30 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
+from splinecli.methods.estimator import Progress
 from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.observation_map import map_scale
 
 Solve = Callable[[Tensor, Tensor], Tensor]
-"""(observations (P, F) with a largest value of 1 each, light directions (F, 3)) -> normals (P, 3), of any length.
+"""(observations (P, F), the largest of each pixel 1; light directions (F, 3)) -> normals (P, 3) of any length.
 
-All observations are finite and none is negative. A zero vector says that the pixel has no normal.
+All observations are finite and none is negative. A zero vector means that the pixel has no normal.
 """
 
 
 @dataclass(frozen=True)
 class BatchedEstimator:
-    """A method as an estimator: `solve` on batches of pixels.
+    """An estimator that calls `solve` on batches of pixels, in float64.
 
     Args:
         name: the method's name in the registry.
-        solve: see Solve. Every pixel is divided by its largest observation first: thresholds and priors then mean
-            the same for dark and bright pixels, and scaling the images changes nothing.
-        batch_size: pixels at a time.
+        solve: see Solve. Each pixel is first divided by its largest observation. Thresholds and priors then mean
+            the same for dark and bright pixels, and the scale of the images does not matter.
+        device: the torch device.
+        batch_size: pixels per batch.
+
+    Raises:
+        UsageError: batch_size is below 1.
     """
 
     name: str
@@ -48,16 +53,20 @@ class BatchedEstimator:
         return f"{self.name} {self.precision}"
 
     def estimate(
-        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        *,
+        progress: Progress | None = None,
     ) -> NDArray[np.float32]:
-        """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
 
         def solve_scaled(batch: Tensor, lights: Tensor) -> Tensor:
             batch = batch.clamp(min=0)
-            found = self.solve(batch / map_scale(batch), lights)
-            # Lengths tell nothing and may be tiny: in two steps, for normalize takes such vectors for zero.
-            largest = found.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
-            return torch.nn.functional.normalize(found / largest, dim=1)
+            normals = self.solve(batch / map_scale(batch), lights)
+            # The length may be tiny, and normalize would treat such a vector as zero. So divide in two steps.
+            largest = normals.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
+            return torch.nn.functional.normalize(normals / largest, dim=1)
 
         return estimate_in_batches(
             solve_scaled,
@@ -66,6 +75,7 @@ class BatchedEstimator:
             batch_size=self.batch_size,
             device=self.device,
             dtype=torch.float64,
+            progress=progress,
         )
 
 
@@ -79,17 +89,24 @@ def estimate_in_batches(
     device: str,
     dtype: torch.dtype,
     columns: int = 3,
+    progress: Progress | None = None,
 ) -> NDArray[np.float32]:
-    """What `solve` makes of the observations as they are: unit normals (P, 3), or zero, which becomes (0, 0, 1).
+    """Call `solve` on batches of observations and return its results (P, columns) as float32.
 
     Args:
-        columns: that `solve` gives: the normal's three, and others behind them, which are kept as they are.
+        solve: returns unit normals in its first three columns. Zero vectors are replaced by (0, 0, 1).
+        observations: (P, F); `solve` gets them unscaled.
+        light_directions: (F, 3).
+        columns: number of columns that `solve` returns. Those behind the normal are not changed.
+        progress: called after each batch with the number of its pixels.
     """
     lights = torch.as_tensor(light_directions, dtype=dtype, device=device)
     results = np.empty((len(observations), columns), np.float32)
     for start in range(0, len(observations), batch_size):
         batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)
-        found = solve(batch, lights)
-        found[~found[:, :3].any(dim=1), :3] = found.new_tensor(TOWARDS_CAMERA)
-        results[start : start + batch_size] = found.cpu().numpy()
+        solved = solve(batch, lights)
+        solved[~solved[:, :3].any(dim=1), :3] = solved.new_tensor(TOWARDS_CAMERA)
+        results[start : start + batch_size] = solved.cpu().numpy()
+        if progress is not None:
+            progress(len(batch))
     return results

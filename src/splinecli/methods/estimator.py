@@ -1,19 +1,23 @@
-"""What every method of photometric stereo looks like from outside."""
+"""The interface that every method of photometric stereo implements."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+Progress = Callable[[int], object]
+"""A function that an estimator calls with the number of pixels that it has just finished."""
+
 
 class Estimator(Protocol):
-    """Normals from observations, pixel by pixel.
+    """A method that estimates normals from observations, pixel by pixel.
 
-    name: the method's name in the registry; weights: name and SHA-256 of the weights it uses, or None.
-    device and precision: what it computes on and in, for the report.
-    fingerprint: name, weights and settings in one text, so that equal ones give equal normals, but for rounding.
+    name: the method's name in the registry. weights: name and SHA-256 of its weights, or None if it has none.
+    device, precision: where and in which number format it computes; the report states both.
+    fingerprint: name, weights and settings as one string. Equal fingerprints give equal normals, apart from rounding.
     """
 
     @property
@@ -28,43 +32,52 @@ class Estimator(Protocol):
     def fingerprint(self) -> str: ...
 
     def estimate(
-        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        *,
+        progress: Progress | None = None,
     ) -> NDArray[np.floating]:
-        """Unit normals (P, 3), x right, y up, z to the camera.
+        """Estimate unit normals (P, 3); x right, y up, z to the camera.
+
+        A pixel that is dark under every light has no normal. It gets (0, 0, 1).
 
         Args:
-            observations: (P, F) linear, already divided by the lights' intensities.
+            observations: (P, F) linear, already divided by the light intensities.
             light_directions: (F, 3) unit vectors towards the lights.
-
-        A pixel that no light reaches has no normal; it gets (0, 0, 1), the least surprising one.
+            progress: called after each batch with the number of its pixels.
         """
         ...
 
 
 CONFIDENT_DEG = 5.0
-"""Confidence is the probability that a normal is off by no more than this."""
+"""Confidence is the probability that a normal is off by at most this angle."""
 
 
 @runtime_checkable
 class ConfidentEstimator(Estimator, Protocol):
-    """An estimator that may know how sure it is.
+    """An estimator that can also estimate its own accuracy.
 
-    tells_confidence: whether it does; with other weights it may not.
+    tells_confidence: whether its weights allow that.
     """
 
     @property
     def tells_confidence(self) -> bool: ...
 
     def estimate_with_confidence(
-        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        *,
+        progress: Progress | None = None,
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Normals (P, 3) as `estimate` gives them, and the probability (P,) that each is within CONFIDENT_DEG.
+        """Estimate normals (P, 3) as `estimate` does, and the probability (P,) that each is within CONFIDENT_DEG.
 
-        0 for a pixel that no light reaches.
+        The probability is 0 for a pixel that is dark under every light.
         """
         ...
 
 
 def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:
-    """Whether the estimator knows how sure it is."""
+    """Return whether the estimator can estimate its own accuracy."""
     return isinstance(estimator, ConfidentEstimator) and estimator.tells_confidence

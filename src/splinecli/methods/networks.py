@@ -1,4 +1,4 @@
-"""SPLINE-Net and CNN-PS as estimators: batches, devices, precision, the average over several views of a pixel."""
+"""SPLINE-Net and CNN-PS as estimators. They average the normals of several rotations of each pixel's lights."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
-from splinecli.methods.estimator import CONFIDENT_DEG
+from splinecli.methods.estimator import CONFIDENT_DEG, Progress
 from splinecli.networks.error_head import probability_within
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
 
 Precision = Literal["float32", "bfloat16"]
 
-VIEW_SPAN_DEG = 20.0
-"""Canonical networks know turns of up to 15 degrees either way; their views stay well inside."""
+ROTATION_SPAN_DEG = 20.0
+"""Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees either way."""
 
 
 class NetworkEstimator:
@@ -28,11 +28,10 @@ class NetworkEstimator:
     Args:
         name: the method's name in the registry.
         loaded: the network with its name and checksum.
-        rotations: R, the number of views averaged. A network without a canonical azimuth sees the lights
-            turned by 360 k / R degrees about the view axis, as CNN-PS does. For one with a canonical azimuth
-            such turns change nothing; its views are mirror images and small turns across 20 degrees, which
-            move the lights over the borders of the cells.
-        batch_size: pixels at a time; memory grows with it (about 0.25 MB a pixel).
+        device: the torch device.
+        precision: the number format of the convolutions.
+        rotations: number R of averaged estimates, see `rotations_of`.
+        batch_size: pixels per batch; memory grows with it (about 0.25 MB a pixel).
 
     Raises:
         ModelError: the weights are the other method's.
@@ -65,55 +64,70 @@ class NetworkEstimator:
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         self.batch_size = batch_size
         self.network = loaded.network.to(device)
-        self._views = views(rotations, canonical=loaded.network.config.is_canonical)
+        self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
 
     def estimate(
-        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        *,
+        progress: Progress | None = None,
     ) -> NDArray[np.float32]:
-        """Unit normals (P, 3) from observations (P, F) under lights (F, 3)."""
-        return self._in_batches(observations, light_directions)[:, :3]
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
+        return self._in_batches(observations, light_directions, progress)[:, :3]
 
     @property
     def tells_confidence(self) -> bool:
         return self.network.config.error_head
 
     def estimate_with_confidence(
-        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        *,
+        progress: Progress | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Unit normals (P, 3), and the probability (P,) that each is within CONFIDENT_DEG, averaged over the views.
+        """Estimate unit normals (P, 3) and the probability (P,) that each is within CONFIDENT_DEG.
 
-        Raises UsageError where the weights have no error head.
+        The probability is the mean over the rotations.
+
+        Raises:
+            UsageError: the weights have no error head.
         """
         if not self.tells_confidence:
-            raise UsageError(f"the weights {self.weights['name']!r} do not tell how sure they are")
-        found = self._in_batches(observations, light_directions)
-        return found[:, :3], found[:, 3]
+            raise UsageError(f"the weights {self.weights['name']!r} cannot estimate the confidence")
+        results = self._in_batches(observations, light_directions, progress)
+        return results[:, :3], results[:, 3]
 
     def _in_batches(
-        self, observations: NDArray[np.float32], light_directions: NDArray[np.float64]
+        self,
+        observations: NDArray[np.float32],
+        light_directions: NDArray[np.float64],
+        progress: Progress | None,
     ) -> NDArray[np.float32]:
         return estimate_in_batches(
-            self._average_views,
+            self._average_rotations,
             observations,
             light_directions,
             batch_size=self.batch_size,
             device=self.device,
             dtype=torch.float32,
             columns=4,
+            progress=progress,
         )
 
-    def _average_views(self, batch: Tensor, lights: Tensor) -> Tensor:
-        """Normals and confidence (P, 4), the latter 0 without an error head."""
+    def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
+        """Return normals and confidence (P, 4). The confidence is 0 without an error head."""
         total = batch.new_zeros(len(batch), 4)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            for turn, mirror in self._views:
+            for turn, mirror in self._rotations:
                 normals, error = self.network(batch, lights, turn_deg=turn, mirror=mirror)
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3] += probability_within(error, CONFIDENT_DEG)
         unit = torch.nn.functional.normalize(total[:, :3], dim=-1)
-        found = torch.cat((unit, total[:, 3:] / len(self._views)), dim=1)
-        return found.masked_fill(batch.amax(dim=1, keepdim=True) <= 0, 0)
+        averaged = torch.cat((unit, total[:, 3:] / len(self._rotations)), dim=1)
+        return averaged.masked_fill(batch.amax(dim=1, keepdim=True) <= 0, 0)
 
     @torch.inference_mode()
     def maps(
@@ -123,15 +137,15 @@ class NetworkEstimator:
         all_observations: NDArray[np.float32],
         all_directions: NDArray[np.float64],
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """What the network sees and interpolates of pixels, and what they show under all of the capture's lights.
+        """Return the observation maps of some pixels: the network's input, LI-Net's output, and all observations.
 
         Args:
             observations, all_observations: (P, F) and (P, F') of the same pixels.
             light_directions, all_directions: (F, 3) and (F', 3).
 
         Returns:
-            Sparse maps, LI-Net's dense maps, and sparse maps of all lights, each (P, w, w) in the pixels' frames, as
-            shares of the largest of the F observations; NaN in cells that hold nothing.
+            The sparse maps, LI-Net's dense maps, and the sparse maps of all lights. Each is (P, w, w) in the pixels'
+            own frames, divided by the largest of the pixel's F observations, and NaN in empty cells.
         """
         device, network = self.device, self.network
         maps = network.build_maps(
@@ -158,11 +172,16 @@ class NetworkEstimator:
         return known(maps.sparse, maps.holds), known(dense, inside), known(every.values, every.holds)
 
 
-def views(rotations: int, *, canonical: bool) -> list[tuple[float, bool]]:
-    """The (turn in degrees, mirrored) of each of R views."""
+def rotations_of(count: int, *, canonical: bool) -> list[tuple[float, bool]]:
+    """Return (angle in degrees, mirrored) of each of `count` rotations of the lights about the view axis.
+
+    A network without a canonical azimuth gets the angles 360 k / count, as CNN-PS does. Such angles change nothing for
+    a network with a canonical azimuth. It gets small angles across ROTATION_SPAN_DEG, which move the lights over the
+    borders of the cells, and each angle once more with mirrored lights.
+    """
     if not canonical:
-        return [(360.0 * k / rotations, False) for k in range(rotations)]
-    turns = (rotations + 1) // 2
-    span = VIEW_SPAN_DEG if turns > 1 else 0.0
+        return [(360.0 * k / count, False) for k in range(count)]
+    turns = (count + 1) // 2
+    span = ROTATION_SPAN_DEG if turns > 1 else 0.0
     step = span / max(turns - 1, 1)
-    return [(step * (k // 2) - span / 2, k % 2 == 1) for k in range(rotations)]
+    return [(step * (k // 2) - span / 2, k % 2 == 1) for k in range(count)]
