@@ -22,7 +22,7 @@ ROOMS = [
     {"networks", "devices"},
     {"fits", "calibration"},
     {"capture", "observation_map", "surface"},
-    {"normals", "files", "transfer"},
+    {"normals", "files", "transfer", "solve_3x3"},
     {"errors", "__init__"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splinecli.fits.lambertian import fit_lambertian, solve_3x3
+from splinecli.fits.lambertian import fit_lambertian
 from splinecli.normals import angle_between_deg
 
 
@@ -87,16 +87,3 @@ def test_too_few_lit_lights_still_give_a_finite_answer(lit: int) -> None:
     assert scaled.norm() > 0
     if lit == 0:
         assert error_deg(scaled, torch.tensor([[0.0, 0.0, 1.0]])).max() < 1e-3
-
-
-def test_solve_3x3_agrees_with_lapack() -> None:
-    generator = torch.Generator().manual_seed(0)
-    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
-    vector = torch.randn(1000, 3, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close(
-        solve_3x3(matrix, vector), torch.linalg.solve(matrix, vector), rtol=1e-9, atol=1e-9
-    )
-
-
-def test_solve_3x3_of_a_singular_matrix_is_finite() -> None:
-    assert torch.isfinite(solve_3x3(torch.zeros(2, 3, 3), torch.ones(2, 3))).all()

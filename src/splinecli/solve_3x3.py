@@ -1,0 +1,75 @@
+"""Closed-form solutions of many 3 x 3 systems at once: about ten times as fast as LAPACK.
+
+Use `inverse_3x3`. It takes NumPy arrays and torch tensors alike, gives the covariance too, and limits its pivots from
+below, so that the result stays positive definite.
+
+`solve_by_cramer` is for the Lambertian fit alone. The shipped networks start from that fit, and their stored
+predictions depend on its last bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+SMALLEST_DETERMINANT = 1e-12
+"""`solve_by_cramer` replaces determinants that are nearer to zero by this value."""
+
+
+def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
+    """Invert symmetric positive matrices, given and returned as their xx, yy, zz, xy, xz, yz, each (P,).
+
+    The factors of A = L D L' are inverted. No pivot falls below `smallest` or, because rounding leaves no more of it,
+    below 1e-14 of the trace. The inverse is therefore positive definite even where the matrix has rank 1 or 2.
+    """
+    xx, yy, zz, xy, xz, yz = entries
+    floor = smallest + 1e-14 * (xx + yy + zz)
+    first = xx.clip(floor)
+    l21, l31 = xy / first, xz / first
+    second = (yy - l21 * xy).clip(floor)
+    l32 = (yz - l31 * xy) / second
+    third = (zz - l31 * xz - l32 * l32 * second).clip(floor)
+    # The inverse of L has ones on its diagonal and these entries below it.
+    m21, m31, m32 = -l21, l21 * l32 - l31, -l32
+    return (
+        1 / first + m21 * m21 / second + m31 * m31 / third,
+        1 / second + m32 * m32 / third,
+        1 / third,
+        m21 / second + m31 * m32 / third,
+        m31 / third,
+        m32 / third,
+    )
+
+
+def multiply_symmetric(entries: Sequence[Any], vector: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """Multiply symmetric matrices, given as in `inverse_3x3`, by vectors given as their x, y, z, each (P,)."""
+    xx, yy, zz, xy, xz, yz = entries
+    x, y, z = vector
+    return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+
+
+def solve_by_cramer(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Solve matrix (P, 3, 3) @ x = vector (P, 3) for x (P, 3) by Cramer's rule.
+
+    The matrices must be scaled such that a determinant of SMALLEST_DETERMINANT means singular.
+    """
+    import torch
+    from torch.linalg import cross
+
+    first, second, third = matrix.unbind(-1)
+    minor = cross(second, third)
+    determinant = _dot(first, minor)[..., None]
+    solution = torch.stack(
+        (_dot(vector, minor), _dot(first, cross(vector, third)), _dot(first, cross(second, vector))), dim=-1
+    )
+    limit = torch.full_like(determinant, SMALLEST_DETERMINANT)
+    return solution / torch.where(determinant.abs() < SMALLEST_DETERMINANT, limit, determinant)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Return the dot products (P,) of vectors (P, 3), as `(a * b).sum(-1)` does but faster."""
+    x, y, z = (a * b).unbind(-1)
+    return x + y + z
