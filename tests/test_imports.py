@@ -23,6 +23,7 @@ ROOMS = [
     {"fits", "calibration"},
     {"capture", "observation_map", "surface"},
     {"normals", "files", "transfer", "solve_3x3"},
+    {"extras"},
     {"errors", "__init__"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -168,8 +168,8 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
     result = run("train", "-o", "run", "--steps", 1, "--tensorboard")
     assert (result.code, result.out) == (2, "")
     assert result.err == (
-        "splinecli: --tensorboard needs the package tensorboard."
-        " Install it: pip install 'splinecli[tensorboard]'.\n"
+        "splinecli: --tensorboard needs the package tensorboard, which is not installed."
+        " Run pip install 'splinecli[tensorboard]'.\n"
     )
 
 

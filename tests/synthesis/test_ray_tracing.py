@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 import numpy as np
 import pytest
 
-from splinecli.errors import UsageError
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.ray_tracing import OFFSET, Tracer, import_extra
+from splinecli.synthesis.ray_tracing import OFFSET, Tracer
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 trimesh: Any = pytest.importorskip("trimesh", reason="needs the extra 'render'")
@@ -77,13 +75,3 @@ def test_a_convex_body_shades_what_faces_away_and_nothing_else() -> None:
 def test_no_rays_are_no_hits() -> None:
     rays, hits = Tracer(ball()).first_hits(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     assert len(rays) == len(hits.position) == 0
-
-
-def test_a_missing_package_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str) -> Any:
-        raise ModuleNotFoundError(name)
-
-    monkeypatch.setattr(importlib, "import_module", refuse)
-    with pytest.raises(UsageError, match="rendering needs the extra packages") as caught:
-        import_extra("embreex.rtcore_scene")
-    assert caught.value.hint == "Install them with: pip install 'splinecli[render]'"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import builtins
 import csv
 import errno
 import io
 import math
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -140,15 +139,9 @@ def test_tensorboard_s_events(tmp_path: Path) -> None:
 
 
 def test_without_tensorboard_it_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = builtins.__import__
-
-    def without(name: str, *args: Any) -> Any:
-        if "tensorboard" in name:
-            raise ImportError(name)
-        return original(name, *args)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(UsageError, match=r"Install it: pip install 'splinecli\[tensorboard\]'"):
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
+    with pytest.raises(UsageError, match=r"Run pip install 'splinecli\[tensorboard\]'"):
         RunLog(tmp_path, 0, tensorboard=True)
     assert not (tmp_path / EVENTS).exists()
     RunLog(tmp_path, 0).append(ROWS[0])

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.extras import import_extra
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.ray_tracing import import_extra
 
 Field = Callable[[Floats], Floats]
 
@@ -123,7 +123,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     values = _sample(field, axes, spacing)
     if not values.min() < 0 < values.max():
         return None
-    measure = import_extra("skimage.measure")
+    measure = import_extra("skimage.measure", "render")
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
     vertices, faces = _largest_part(vertices, faces)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.extras import import_extra
 
 Floats = NDArray[np.floating]
 
@@ -37,9 +38,7 @@ def read_mesh(path: str | Path) -> Mesh:
         InputError: the file is missing, not a mesh, or has no faces.
         UsageError: the extra `render` is not installed.
     """
-    from splinecli.synthesis.ray_tracing import import_extra
-
-    trimesh = import_extra("trimesh")
+    trimesh = import_extra("trimesh", "render")
     if not Path(path).is_file():
         raise InputError("there is no such mesh file", path=path)
     try:

@@ -6,14 +6,12 @@ when a scene is made.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.errors import UsageError
+from splinecli.extras import import_extra
 from splinecli.synthesis.meshes import Floats, Mesh
 
 # Rays start this far above the surface, in the camera's frame of half-width 1: float32 leaves hits uncertain by
@@ -21,21 +19,6 @@ from splinecli.synthesis.meshes import Floats, Mesh
 OFFSET = 1e-4
 # Points whose shadows are traced together.
 TRACED_ROWS = 16_384
-
-
-def import_extra(module: str) -> ModuleType:
-    """A module of the extra `render`.
-
-    Raises:
-        UsageError: it is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise UsageError(
-            "rendering needs the extra packages",
-            hint="Install them with: pip install 'splinecli[render]'",
-        ) from error
 
 
 @dataclass(frozen=True)
@@ -70,9 +53,9 @@ class Tracer:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self._scene = import_extra("embreex.rtcore_scene").EmbreeScene()
+        self._scene = import_extra("embreex.rtcore_scene", "render").EmbreeScene()
         corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
-        import_extra("embreex.mesh_construction").TriangleMesh(self._scene, corners)
+        import_extra("embreex.mesh_construction", "render").TriangleMesh(self._scene, corners)
         facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(facing, axis=1, keepdims=True)
         self._facet_normals = (facing / np.maximum(length, 1e-30)).astype(np.float32)

@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from splinecli.errors import OutputError, UsageError
+from splinecli.errors import OutputError
+from splinecli.extras import import_extra
 from splinecli.files import refusals_as_output_errors, write_bytes, write_text
 from splinecli.pictures.observation_maps import observation_map_figure
 from splinecli.pictures.training_curves import training_curves
@@ -124,12 +125,6 @@ def _drop_lines_after(step: int, path: Path) -> None:
 
 
 def _open_events(folder: Path, step: int) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise UsageError(
-            "--tensorboard needs the package tensorboard",
-            hint="Install it: pip install 'splinecli[tensorboard]'",
-        ) from error
+    writer = import_extra("torch.utils.tensorboard", "tensorboard").SummaryWriter
     with refusals_as_output_errors(folder):
-        return SummaryWriter(str(folder), purge_step=step + 1)
+        return writer(str(folder), purge_step=step + 1)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.extras import import_extra
 
 if TYPE_CHECKING:
     import rawpy
@@ -95,12 +96,10 @@ def _full_scale(raw: rawpy.RawPy) -> int:
 
 
 def _import_rawpy(path: Path) -> ModuleType:
-    try:
-        import rawpy
-    except ImportError:
-        raise InputError(
-            "camera RAW files need rawpy, which is not installed",
-            path=path,
-            hint="Run pip install 'splinecli[raw]', or export the photographs as 16-bit linear TIFF",
-        ) from None
-    return rawpy
+    return import_extra(
+        "rawpy",
+        "raw",
+        error=InputError,
+        path=path,
+        otherwise="export the photographs as 16-bit linear TIFF",
+    )

@@ -29,7 +29,7 @@ def predict(observations: Array, weights: Array, light_directions: Array) -> Arr
     xx, yy, zz, xy, xz, yz = (weights @ products).T
     covariance = inverse_3x3((xx + _PRIOR, yy + _PRIOR, zz + _PRIOR, xy, xz, yz), _PRIOR)
     right_side = (weights * observations) @ light_directions
-    scaled_normals = np.stack(multiply_symmetric(covariance, right_side.T), axis=1)
+    scaled_normals = np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
     predicted: Array = scaled_normals @ light_directions.T
     return predicted
 

@@ -1,0 +1,45 @@
+"""Import of optional packages, which pip installs as extras of splinecli."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+from splinecli.errors import SplinecliError, UsageError
+
+_PROBLEMS = {
+    "raw": "camera RAW files need rawpy, which is not installed",
+    "render": "rendering needs embreex, scikit-image and trimesh, which are not all installed",
+    "tensorboard": "--tensorboard needs the package tensorboard, which is not installed",
+}
+"""The message for each extra."""
+
+
+def import_extra(
+    module: str,
+    extra: str,
+    *,
+    error: type[SplinecliError] = UsageError,
+    path: Path | None = None,
+    otherwise: str | None = None,
+) -> ModuleType:
+    """Import a module of an extra when it is used for the first time.
+
+    Args:
+        module: full name of the module.
+        extra: "raw", "render" or "tensorboard".
+        error: the exception to raise.
+        path: the file that cannot be read without the module, for the message.
+        otherwise: another way out, for the message.
+
+    Raises:
+        UsageError, or `error`: the module is not installed. The message names the command that installs it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as cause:
+        alternative = f", or {otherwise}" if otherwise else ""
+        raise error(
+            _PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
+        ) from cause

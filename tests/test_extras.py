@@ -1,0 +1,52 @@
+"""Optional packages: what the message says when one is not installed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splinecli.errors import InputError, UsageError
+from splinecli.extras import import_extra
+
+
+def test_an_installed_module_is_returned() -> None:
+    assert import_extra("numpy", "render") is np
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "message"),
+    [
+        (
+            "embreex.rtcore_scene",
+            "render",
+            "rendering needs embreex, scikit-image and trimesh, which are not all installed."
+            " Run pip install 'splinecli[render]'.",
+        ),
+        (
+            "torch.utils.tensorboard",
+            "tensorboard",
+            "--tensorboard needs the package tensorboard, which is not installed."
+            " Run pip install 'splinecli[tensorboard]'.",
+        ),
+    ],
+)
+def test_the_message_names_the_packages_and_the_command(
+    module: str, extra: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError) as caught:
+        import_extra(module, extra)
+    assert str(caught.value) == message
+
+
+def test_another_error_with_a_file_and_another_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(InputError) as caught:
+        import_extra("rawpy", "raw", error=InputError, path=Path("a.nef"), otherwise="export it")
+    assert str(caught.value) == (
+        "a.nef: camera RAW files need rawpy, which is not installed."
+        " Run pip install 'splinecli[raw]', or export it."
+    )
