@@ -1,6 +1,6 @@
 """Unit normals: length, angles, and the pictures they are stored in.
 
-Frame: x right, y up, z to the camera (docs/conventions.md).
+Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations

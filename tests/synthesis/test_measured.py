@@ -293,7 +293,7 @@ def test_a_share_needs_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"W2": None}, "found no array 'W2'. docs/conventions.md lists all seven"),
+        ({"W2": None}, "found no array 'W2'. docs/files-and-frames.md lists all seven"),
         ({"names": np.array(["a", "b", "a"])}, r"shape \(3,\), expected a list of different texts"),
         ({"names": np.arange(3)}, "names of type int64"),
         ({"names": np.array([], dtype=str)}, r"shape \(0,\), expected a list of different texts"),

@@ -72,7 +72,7 @@ def test_refused(values: dict[str, Any], message: str) -> None:
 def test_presets_by_name() -> None:
     compact = preset("compact")
     assert compact == TrainingConfig(network=NetworkConfig(fits=("ls", "iw12", "iw12-all", "ia14")))
-    # The paper's section 4; its code where that is silent (docs/training.md).
+    # The paper's section 4; its code where that is silent (docs/train.md).
     paper = preset("paper")
     assert (paper.batch_size, paper.learning_rate, paper.steps) == (128, 1e-4, 200_000)
     assert (paper.beta1, paper.beta2, paper.weight_decay) == (0.9, 0.999, 0.0)

@@ -22,7 +22,7 @@ _ClickUsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `splinecli ARGS` and return the exit code (the contract is in docs/conventions.md)."""
+    """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
     _mend_streams()
     command = typer.main.get_command(app)
     try:

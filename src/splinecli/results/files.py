@@ -74,7 +74,7 @@ def report_of(
     read_seconds: float,
     warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """The report of the contract (docs/conventions.md), all but `seconds.write` and `files`.
+    """The report of the contract (docs/infer.md), all but `seconds.write` and `files`.
 
     Args:
         options: what was asked for.

@@ -40,7 +40,7 @@ def result_page(
     length again. The page says so. Its figures are the report's, of all pixels.
 
     Args:
-        report: of the contract (docs/conventions.md); `seconds.write` and `files` may be missing.
+        report: of the contract (docs/infer.md); `seconds.write` and `files` may be missing.
         normal_map: (H, W, 3), unit in the mask (H, W); x right, y up, z to the camera.
         albedo: (H, W, 3), linear, as albedo_map gives it.
         confidence_map: (H, W), probabilities.

@@ -1,7 +1,7 @@
 """The pinhole camera of integration and meshes: viewing rays and the focal length from a camera matrix.
 
 A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns count to the right, rows count down, and
-(0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of docs/conventions.md: x right, y up,
+(0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of docs/files-and-frames.md: x right, y up,
 z to the camera.
 """
 

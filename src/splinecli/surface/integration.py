@@ -1,7 +1,7 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of things.
 
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022. `bilateral_equations` has the
-equations, `laplacian` the linear solver. Frame: x right, y up, z to the camera (docs/conventions.md).
+equations, `laplacian` the linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations

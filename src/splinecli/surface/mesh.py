@@ -1,8 +1,8 @@
 """Triangle meshes of height and depth maps, and their files.
 
-Frame: x right, y up, z to the camera (docs/conventions.md). For an orthographic camera, coordinates are in pixels and
-the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the origin is the
-camera.
+Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera, coordinates are in
+pixels and the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the
+origin is the camera.
 """
 
 from __future__ import annotations

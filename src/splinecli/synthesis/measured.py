@@ -4,7 +4,7 @@ Data: Matusik, Pfister, Brand and McMillan, "A Data-Driven Reflectance Model", S
 materials). Networks: Sztrajman, Rainer, Ritschel and Weyrich, "Neural BRDF Representation and Importance
 Sampling", Computer Graphics Forum 40(6), 2021: from the half vector and the difference vector (Rusinkiewicz, "A
 New Change of Variables for Efficient BRDF Representation", 1998) to the BRDF in RGB, 1 / sr, without the cosine.
-The files that hold them (docs/conventions.md) are read and checked in measured_files.py.
+The files that hold them (docs/files-and-frames.md) are read and checked in measured_files.py.
 """
 
 from __future__ import annotations

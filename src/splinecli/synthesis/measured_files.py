@@ -27,7 +27,7 @@ _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
 
 
 def read_measured(path: str | Path, device: torch.device | str = "cpu") -> MeasuredLibrary:
-    """The plausible materials of a file (docs/conventions.md), in float32 on `device`.
+    """The plausible materials of a file (docs/files-and-frames.md), in float32 on `device`.
 
     A material is dropped, its name and the reason kept in `dropped`, where
     - light from one direction is thrown back by more than BRIGHTEST, or a value is not finite;
@@ -148,7 +148,9 @@ def _check_form(arrays: dict[str, NDArray[Any]], path: Path) -> list[str]:
     """The materials' names. Raises InputError for arrays that are missing, no numbers, or do not fit together."""
     for key in ("names", *_LAYERS):
         if key not in arrays:
-            raise InputError(f"found no array {key!r}", path=path, hint="docs/conventions.md lists all seven")
+            raise InputError(
+                f"found no array {key!r}", path=path, hint="docs/files-and-frames.md lists all seven"
+            )
     names = arrays["names"]
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names) or len(set(names.tolist())) < len(names):
         raise InputError(

@@ -39,7 +39,7 @@ class PixelGeneratorConfig(CaptureConfig):
     second_wall_share: float = 0.2
     ambient_share: float = 0.5
     mixed_share: float = 0.2
-    # Share of the materials that come from a file of measured ones (docs/conventions.md), and its path.
+    # Share of the materials that come from a file of measured ones (docs/files-and-frames.md), and its path.
     measured_share: float = 0.0
     measured_materials: str = ""
 

@@ -178,7 +178,7 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
             raise ModelError(f"training setting {name!r} is {value!r}; expected {expected}")
 
 
-# The paper's text (section 4) where it speaks, the authors' code where it does not: docs/training.md.
+# The paper's text (section 4) where it speaks, the authors' code where it does not: docs/train.md.
 PRESETS = {
     "compact": TrainingConfig(network=NetworkConfig(fits=("ls", "iw12", "iw12-all", "ia14"))),
     "paper": TrainingConfig(

@@ -61,7 +61,7 @@ def compute_losses(
     mirrored: bool = False,
     bfloat16: bool = False,
 ) -> Losses:
-    """The losses of the paper, eqs. 5 and 8 as field by field in docs/training.md.
+    """The losses of the paper, eqs. 5 and 8 as field by field in docs/train.md.
 
     LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
     NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). Where both are updated, the sum,

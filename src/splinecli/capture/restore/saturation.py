@@ -36,7 +36,7 @@ def restore_saturated(
     of a robust Lambertian fit to the pixel (least absolute deviations by reweighting) or its stored value, whichever is
     brighter; the fit is made of the restored values in turn, so that a saturated one pulls at it from below alone.
     Leaving them out would leave a pixel with its darkest observations, and taking them as they are would bend its
-    normal to the lights' middle: docs/conventions.md has figures. Pixels that are saturated under every light stay.
+    normal to the lights' middle: docs/measurements.md has figures. Pixels that are saturated under every light stay.
 
     Args:
         saturated: (P, F).
