@@ -14,7 +14,7 @@ case $out in
 esac
 cd "$(dirname "$0")/.."
 
-# stdout is the report and nothing else; the same text is in $out/medallion/report.json.
+# stdout is a list of reports and nothing else; the same report is in $out/medallion/report.json.
 "${SPLINECLI:-splinecli}" infer examples/medallion -o "$out" --overwrite --json > /dev/null
 
 "${PYTHON:-python3}" - "$out/medallion/report.json" <<'END'

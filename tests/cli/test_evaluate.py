@@ -39,7 +39,7 @@ def test_files_and_table(dataset, run, golden):
 
 
 def test_the_draw_of_infer_is_the_first_of_evaluate(dataset, run):
-    report = json.loads(
+    (report,) = json.loads(
         run("infer", dataset / "shaded", "--method", "ls", "--n-lights", 5, "--seed", 3, "--json").out
     )
     document = json.loads(

@@ -58,7 +58,7 @@ def test_imported_weights_run(run, make_capture):
     cv2.imwrite("few.png", few)
     weights = ("--weights", "new/official.safetensors")
     result = run("infer", make_capture("sphere"), "--mask", "few.png", *weights, "--json")
-    report = json.loads(result.out)
+    (report,) = json.loads(result.out)
     assert (report["weights"]["name"], report["n_pixels"]) == ("official", 16)
     quiet = run(
         "import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors", "--overwrite", "-q"

@@ -139,7 +139,7 @@ def test_who_does_not_tell_how_sure_it_is(capture, run, method):
     assert read_report(Path("out/sphere"))["expected_under_5"] is None
     assert "Confidence map" not in Path("out/sphere/page.html").read_text("utf-8")
     result = run("infer", capture, "--method", method, "--maps", "confidence", "--overwrite")
-    assert (result.code, f"method {method} does not tell how sure it is" in result.err) == (2, True)
+    assert (result.code, f"method {method} gives no confidence" in result.err) == (2, True)
 
 
 def test_a_mask_is_found_where_there_is_none(capture, run):
@@ -159,7 +159,7 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
     again = run(
         "infer", capture, "--method", "ls", "--mask", "out/sphere/found_mask.png", "-o", "again", "--json"
     )
-    assert json.loads(again.out)["n_pixels"] == report["n_pixels"]
+    assert json.loads(again.out)[0]["n_pixels"] == report["n_pixels"]
     both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite")
     assert (both.code, "exclude each other" in both.err) == (2, True)
     for path in capture.glob("image*.png"):
@@ -183,8 +183,8 @@ def test_overexposed_photographs(capture, run):
     for path in capture.glob("image*.png"):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
         cv2.imwrite(str(path), np.minimum(picture * 65_535 // 57_000, 65_535).astype(np.uint16))
-    after = json.loads(run("infer", capture, "--method", "ls", "--json", "--overwrite").out)
-    assert json.loads(before)["angular_error_deg"]["mean"] < 0.01
+    (after,) = json.loads(run("infer", capture, "--method", "ls", "--json", "--overwrite").out)
+    assert json.loads(before)[0]["angular_error_deg"]["mean"] < 0.01
     assert after["angular_error_deg"]["mean"] < 0.1
     assert any("saturated" in warning for warning in after["warnings"])
 
@@ -269,7 +269,7 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
 
 def test_json_is_the_report_and_nothing_else(capture, run):
     result = run("infer", capture, "--method", "ls", "--json")
-    assert json.loads(result.out) == read_report(Path("out/sphere"))
+    assert json.loads(result.out) == [read_report(Path("out/sphere"))]
     assert result.err == ""
 
 
@@ -278,12 +278,12 @@ def test_quiet_says_nothing(capture, run):
 
 
 def test_lights_by_index_and_by_draw(capture, run):
-    chosen = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
+    (chosen,) = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
     assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])
     draws = [
         json.loads(
             run("infer", capture, "--method", "ls", "--n-lights", 4, "--seed", s, "--json", "--overwrite").out
-        )
+        )[0]
         for s in (0, 0, 1)
     ]
     assert [draw["n_lights"] for draw in draws] == [4, 4, 4]
@@ -295,7 +295,7 @@ def test_files_given_go_before_the_folders(capture, run):
     (capture / "light_directions.txt").unlink()
     np.savetxt("l.txt", lights)
     cv2.imwrite("m.png", np.pad(np.full((2, 3), 255, np.uint8), ((4, 18), (5, 16))))
-    report = json.loads(
+    (report,) = json.loads(
         run("infer", capture, "--method", "ls", "--lights", "l.txt", "--mask", "m.png", "--json").out
     )
     assert report["n_pixels"] == 6
@@ -304,7 +304,7 @@ def test_files_given_go_before_the_folders(capture, run):
 
 def test_network_on_a_matte_sphere(capture, run):
     """All that is shipped, from the command line: a matte sphere without shadows is easy."""
-    report = json.loads(run("infer", capture, "--precision", "float32", "--json").out)
+    (report,) = json.loads(run("infer", capture, "--precision", "float32", "--json").out)
     assert report["method"] == "spline-net"
     assert report["weights"]["name"] == "spline-net"
     assert len(report["weights"]["sha256"]) == 64
@@ -378,13 +378,6 @@ def test_usage_errors_end_a_batch_at_once(arguments, capture, make_capture, run,
     assert not Path("out").exists()
 
 
-def test_a_batch_with_an_existing_output_computes_nothing(capture, make_capture, run):
-    make_capture("second")
-    run("infer", "second", "--method", "ls")
-    assert run("infer", capture, "second", "--method", "ls", "--format", "png").code == 5
-    assert [path.name for path in Path("out").iterdir()] == ["second"]
-
-
 def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     make_capture("second")
     broken = make_capture("third") / "image3.png"
@@ -392,31 +385,88 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     broken.write_bytes(b"no picture")
     captures = ("sphere", "second", "third")
     first = run("infer", *captures, "--method", "ls")
-    assert (first.code, "3 captures: 2 done, 0 finished before, 1 bad" in first.err) == (3, True)
+    assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
     before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
     broken.write_bytes(whole)
     again = run("infer", *captures, "--method", "ls")
     assert again.code == 0
     assert again.out.startswith("out/third: ")
-    assert "out/second: finished before, left as it is\n" in again.err
-    assert again.err.endswith("3 captures: 1 done, 2 finished before, 0 bad; see out/index.html\n")
+    assert "out/second: already done, skipped\n" in again.err
+    assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
     assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
-    # The same in JSON has all reports; with other options, or a file missing, nothing is taken for finished.
+    # The same in JSON has all reports.
     reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
     assert [report["capture"] for report in reports] == list(captures)
-    assert run("infer", *captures, "--method", "ls", "--n-lights", 4).code == 5
-    light = Path("second/light_directions.txt")
+
+
+def change_light_file(capture: Path) -> tuple[str, ...]:
+    light = capture / "light_directions.txt"
     light.write_text(light.read_text() + "# measured anew\n")
-    assert run("infer", *captures, "--method", "ls").code == 5
-    assert run("infer", *captures, "--method", "ls", "--overwrite").code == 0
-    assert run("infer", *captures, "--method", "ls").code == 0
+    return ()
+
+
+def remove_a_result(capture: Path) -> tuple[str, ...]:
+    (Path("out") / capture / "normals.png").unlink()
+    return ()
+
+
+def change_the_version(capture: Path) -> tuple[str, ...]:
+    path = Path("out") / capture / "report.json"
+    path.write_text(path.read_text().replace('"version": "', '"version": "0.0.'))
+    return ()
+
+
+CHANGES = {
+    "other options (n_lights)": lambda _: ("--n-lights", "4"),
+    "other input files": change_light_file,
+    "without normals.png": remove_a_result,
+    "of version 0.0.": change_the_version,
+}
+
+
+@pytest.mark.parametrize("reason", CHANGES)
+@pytest.mark.parametrize("others", [(), ("second",)], ids=["one", "several"])
+def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason, others):
+    """One capture and several obey the same rules."""
+    make_capture("second")
+    call = ("infer", capture, *others, "--method", "ls")
+    assert run(*call).code == 0
+    extra = CHANGES[reason](capture)
+    before = (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere")))
+    kept = run(*call, *extra)
+    assert (kept.code, kept.out) == (5, "")
+    line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
+    assert reason in line
+    assert "Add --update to redo what changed, --overwrite to redo everything" in line
+    assert (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere"))) == before
+    first, *_ = json.loads(run(*call, *extra, "--json").out)
+    assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
+    updated = run(*call, *extra, "--update")
+    assert updated.code == 0
+    assert Path("out/sphere/normals.npy").stat().st_mtime_ns > before[0]
+    if others and not extra:
+        assert "out/second: already done, skipped" in updated.err
+    assert run(*call, *extra).code == 0
+
+
+def test_update_keeps_files_of_others(capture, run):
+    Path("out/sphere").mkdir(parents=True)
+    Path("out/sphere/normals.png").write_text("drawn by hand")
+    result = run("infer", capture, "--method", "ls", "--update")
+    assert result.code == 5
+    assert "out/sphere: holds normals.png, but no report.json. Add --overwrite" in result.err
+    assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
+    both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
+    assert (both.code, "exclude each other" in both.err) == (2, True)
+
+
+def test_another_object_of_the_same_name(capture, make_capture, run):
+    make_capture("third")
+    assert run("infer", capture, "--method", "ls").code == 0
     Path("others").mkdir()
     Path("others/sphere").symlink_to(Path("third").absolute())
-    other = run("infer", "others/sphere", "second", "--method", "ls")  # another object of that name
-    assert (other.code, "out/sphere: holds results already, but of other options" in other.err) == (5, True)
-    (Path("out/second/normals.png")).unlink()
-    assert run("infer", *captures, "--method", "ls").code == 5
-    assert run("infer", *captures, "--method", "ls", "--overwrite").code == 0
+    other = run("infer", "others/sphere", "--method", "ls")
+    assert (other.code, "out/sphere: holds results of other input files" in other.err) == (5, True)
 
 
 def test_links_are_called_by_their_own_names(capture, run):
@@ -440,7 +490,7 @@ def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
         (holder / name).write_bytes((capture / "mask.png").read_bytes())
     result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
     assert result.code == 0
-    assert result.err.endswith("2 captures: 2 done, 0 finished before, 0 bad; see out/index.html\n")
+    assert result.err.endswith("2 captures: 2 done; see out/index.html\n")
     assert {path.name for path in Path("out").iterdir()} == {"index.html", "Ball_specular", "Ball_metallic"}
     assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
     # An object with several kinds is passed over among others, under its own name.
@@ -515,7 +565,8 @@ def test_a_defect_is_called_one(capture, run, monkeypatch):
     assert result.code == 1
     assert "ZeroDivisionError: oops" in result.err
     assert result.err.endswith(
-        "splinecli: this is a defect of splinecli; please report it with the lines above.\n"
+        "splinecli: sphere: ZeroDivisionError: oops. This is a defect of splinecli."
+        " Please report it with the lines above.\n"
     )
 
 

@@ -94,7 +94,7 @@ def test_a_run_and_its_continuation(run):
 
 def test_the_weights_work(run, make_capture, no_pictures):
     run("train", "-o", "run", "--steps", 1, "--quiet")
-    report = json.loads(
+    (report,) = json.loads(
         run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
     )
     assert report["weights"]["name"] == "weights"
@@ -112,7 +112,7 @@ def test_a_run_on_pixel_sets(run, make_capture):
     assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
-    report = json.loads(
+    (report,) = json.loads(
         run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
     )
     assert report["angular_error_deg"]["mean"] < 10

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import JsonOption, OverwriteOption, QuietOption
-from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def calibrate(
     from splinecli.results.files import encode_png
     from splinecli.transfer import parse_transfer
 
-    talk = Talk(quiet=quiet)
+    talk = Messages(quiet=quiet)
     gamma = parse_transfer(transfer)
     if gamma != 1 and not (gray_ball or gray_card):
         raise UsageError(

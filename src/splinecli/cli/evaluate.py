@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import (
     BatchSizeOption,
     Device,
@@ -26,7 +27,6 @@ from splinecli.cli.options import (
     complete_methods,
     parse_indices,
 )
-from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def evaluate(
     options = MethodOptions(weights, rotations, batch_size, device.value, precision.value)
     estimators = [make_estimator(name, options) for name in methods]
     on_gpu = any(estimator.device.startswith("cuda") for estimator in estimators)
-    talk = Talk(quiet=quiet)
+    talk = Messages(quiet=quiet)
     not_drawn: list[str] = []
     with held_folder(output):
         store = TrialStore(output / TRIALS, fresh=overwrite)
@@ -229,7 +229,7 @@ def _draw_figures(
     estimators: list[Estimator],
     evaluations: list[Evaluation],
     pixels: list[tuple[int, int]],
-    talk: Talk,
+    talk: Messages,
 ) -> tuple[list[CaptureFigure], list[str]]:
     """Of the captures that were scored under the first protocol; and what stood in the way of the others."""
     from splinecli.evaluation.capture_figures import capture_figures, file_stems

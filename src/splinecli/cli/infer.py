@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import (
     AmbientOption,
+    AsStoredOption,
     BatchSizeOption,
     Device,
     DeviceOption,
@@ -26,16 +28,27 @@ from splinecli.cli.options import (
     RotationsOption,
     SeedOption,
     TransferOption,
+    UpdateOption,
     WeightsOption,
     complete_list,
     complete_methods,
     parse_indices,
-    parse_radiometry,
     split_commas,
 )
-from splinecli.cli.talk import Talk
-from splinecli.errors import InputError, OutputError, UsageError
-from splinecli.pipeline.infer import Job, inputs_sha256
+from splinecli.errors import SplinecliError, UsageError
+
+if TYPE_CHECKING:
+    from splinecli.pipeline.batch import Outcome, Redo
+
+
+_WORDS = {
+    "done": "done",
+    "skipped": "already done",
+    "changed": "changed but kept",
+    "missing": "missing",
+    "failed": "failed",
+}
+"""How the last line counts the outcomes."""
 
 
 def infer(
@@ -69,6 +82,7 @@ def infer(
     transfer: TransferOption = "linear",
     ambient: AmbientOption = None,
     flat_field: FlatFieldOption = None,
+    as_stored: AsStoredOption = False,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="Results go to OUT/<capture name>/.")
     ] = Path("out"),
@@ -119,144 +133,103 @@ def infer(
         NormalConvention, typer.Option(help="Green of the PNG: opengl is y up, directx is y down.")
     ] = NormalConvention.opengl,
     overwrite: OverwriteOption = False,
+    update: UpdateOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """Estimate the normal map of each CAPTURE.
 
-    A capture is a folder of images taken by a fixed camera under different lights, with a light file (in it, or given
-    by --lights). Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there is ground
-    truth. A bad capture among several is named and passed over; the exit code is then 3. Those that were finished
-    before with the same options are left as they are. OUT/index.html links the results of several.
+    A CAPTURE is a folder of images of one object, taken by a fixed camera under different lights, with a light file in
+    it or given by --lights. Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there
+    is ground truth. With several captures, OUT/index.html links the results.
+
+    Captures that are already done are skipped. A capture whose files or options have changed since is named and keeps
+    its results, unless --update or --overwrite is given. A capture that fails does not stop the others. The exit code
+    is that of the worst capture.
     """
-    from splinecli.capture import capture_name
-    from splinecli.capture.lights.draws import check_draw_settings
-    from splinecli.capture.record import check_light_indices
-    from splinecli.files import check_free, write_text
-    from splinecli.methods import MethodOptions, check_method
-    from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, finished_report
-    from splinecli.results.index import INDEX, check_index_free, has_index, index_page, with_earlier
+    from splinecli.pipeline.batch import error_document, infer_batch, worst_exit_code
+    from splinecli.pipeline.options import InferOptions
+    from splinecli.results.files import MAPS, NORMALS
 
-    if n_lights is not None and light_indices is not None:
-        raise UsageError("--n-lights and --light-indices exclude each other")
-    if mask is not None and auto_mask:
-        raise UsageError("--mask and --auto-mask exclude each other")
-    check_method(method)
-    indices = None if light_indices is None else parse_indices(light_indices, "--light-indices")
-    if n_lights is not None:
-        check_draw_settings(n_lights, 1, seed)
-    if indices is not None:
-        check_light_indices(indices, max(indices) + 1)
-    radiometry = parse_radiometry(transfer, ambient, flat_field)
-    _refuse_same_names(captures)
-    options = {
-        "method": method, "weights": weights, "rotations": rotations, "precision": precision.value,
-        "n_lights": n_lights, "seed": seed if n_lights is not None else None, "light_indices": indices,
-        "lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth,
-        "auto_mask": auto_mask, "transfer": transfer, "ambient": ambient, "flat_field": flat_field,
-        "formats": formats, "convention": convention.value, "maps": maps, "surface": surface, "html": html,
-    }  # fmt: skip
-    options = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
-    files = {"lights": lights, "intensities": intensities, "mask": mask, "ground_truth": ground_truth}
-
-    def inputs_of(folder: Path) -> str:
-        from splinecli.capture import open_capture
-
-        try:
-            return inputs_sha256(open_capture(folder, radiometry=radiometry, **files), weights)
-        except InputError:
-            return ""  # told when its turn comes
-
-    if len(captures) > 1:
-        check_index_free(output, overwrite=overwrite)
-    finished = {}
-    for folder in captures:
-        target = output / capture_name(folder)
-        report = (
-            None
-            if overwrite or len(captures) == 1
-            else finished_report(target, options, partial(inputs_of, folder))
-        )
-        if report is None:
-            if len(captures) > 1 and not overwrite and (target / REPORT).is_file():
-                raise OutputError(
-                    "holds results already, but of other options, other inputs or another version",
-                    path=target,
-                    hint="Add --overwrite to make all anew, or choose another place with -o",
-                )
-            check_free(target, OWN_FILES, overwrite=overwrite)
-        else:
-            finished[folder] = report
-    job = Job(
-        radiometry=radiometry,
-        files=files,
-        output=output,
-        formats=split_commas(formats, "--format", list(NORMALS)),
+    if overwrite and update:
+        raise UsageError("--overwrite and --update exclude each other")
+    options = InferOptions(
+        lights=_text(lights),
+        intensities=_text(intensities),
+        mask=_text(mask),
         auto_mask=auto_mask,
-        surface=surface,
-        html=html,
-        asked=options,
-        maps=[] if maps is None else split_commas(maps, "--maps", list(MAPS)),
-        convention=convention.value,
+        ground_truth=_text(ground_truth),
+        transfer=transfer,
+        ambient=_text(ambient),
+        flat_field=_text(flat_field),
+        as_stored=as_stored,
         n_lights=n_lights,
-        seed=seed,
-        light_indices=indices,
+        seed=seed if n_lights is not None else 0,
+        light_indices=None
+        if light_indices is None
+        else tuple(parse_indices(light_indices, "--light-indices")),
         method=method,
-        options=MethodOptions(weights, rotations, batch_size, device.value, precision.value),
-        talk=Talk(quiet=quiet),
+        weights=weights,
+        rotations=rotations,
+        batch_size=batch_size,
+        device=device.value,
+        precision=precision.value,
+        output=str(output),
+        formats=tuple(split_commas(formats, "--format", list(NORMALS))),
+        maps=() if maps is None else tuple(split_commas(maps, "--maps", list(MAPS))),
+        html=html,
+        surface=surface,
+        convention=convention.value,
     )
-    if "confidence" in job.maps:
-        _ = job.estimator  # refuses methods that do not tell it before anything is read
-    reports, exit_code = [], 0
-    for folder in captures:
-        if folder in finished:
-            reports.append(finished[folder])
-            job.talk.say(f"{output / capture_name(folder)}: finished before, left as it is")
-            continue
-        try:
-            source, capture, read_seconds = job.read(folder)
-        except (InputError, UsageError) as error:
-            if len(captures) == 1:
-                raise
-            exit_code = InputError.exit_code
-            print(f"splinecli: {error}", file=sys.stderr)
-            report = {"capture": capture_name(folder), "error": str(error)}
+    messages = Messages(quiet=quiet)
+    outcomes: list[Outcome] = []
+    documents: list[dict[str, Any]] = []
+    try:
+        redo: Redo = "all" if overwrite else "changed" if update else "nothing"
+        for outcome in infer_batch(captures, options, messages, redo=redo):
+            outcomes.append(outcome)
+            documents.append(outcome.report)
+            _show(outcome, output, messages, with_summary=not (quiet or as_json))
+        if len(captures) == 1:
+            pass
+        elif any(outcome.status == "missing" for outcome in outcomes):
+            messages.say("Nothing was computed.")
         else:
-            report = job.estimate(source, capture, read_seconds)
-            if not (quiet or as_json):
-                print(_summary(report, output))
-        reports.append(report)
-    if len(captures) > 1 or has_index(output):
-        write_text(output / INDEX, index_page(with_earlier(reports, output)))
-    if len(captures) > 1:
-        _say_how_it_went(reports, len(finished), output, job.talk)
-    if as_json:
-        print(json.dumps(reports[0] if len(captures) == 1 else reports, indent=2))
-    return exit_code
+            _show_table(outcomes, output, messages)
+    except SplinecliError as error:
+        documents.append(error_document(error))
+        raise
+    finally:
+        if as_json:
+            print(json.dumps(documents, indent=2))
+    return worst_exit_code(outcome.exit_code for outcome in outcomes)
 
 
-def _say_how_it_went(reports: Sequence[dict[str, Any]], n_finished: int, output: Path, talk: Talk) -> None:
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: bool) -> None:
+    """Print what became of a capture. Failures are printed even with --quiet."""
+    if outcome.status == "done":
+        if with_summary:
+            print(_summary(outcome.report, output))
+    elif outcome.status == "skipped":
+        messages.say(f"{output / outcome.capture}: already done, skipped")
+    else:
+        print(f"{outcome.trace}splinecli: {outcome.report['error']}", file=sys.stderr)
+
+
+def _show_table(outcomes: Sequence[Outcome], output: Path, messages: Messages) -> None:
     from splinecli.results.index import HEADER, INDEX, row_of
 
-    good = [row_of(report) for report in reports if "error" not in report]
+    good = [row_of(outcome.report) for outcome in outcomes if outcome.status in ("done", "skipped")]
     if good:
         columns = [column for column in zip(HEADER, *good, strict=True) if any(column[1:])]
-        talk.table(list(zip(*columns, strict=True)))
-    counts = f"{len(good) - n_finished} done, {n_finished} finished before, {len(reports) - len(good)} bad"
-    talk.say(f"{len(reports)} captures: {counts}; see {output / INDEX}")
-
-
-def _refuse_same_names(captures: list[Path]) -> None:
-    from splinecli.capture import capture_name
-
-    seen: dict[str, Path] = {}
-    for folder in captures:
-        other = seen.setdefault(capture_name(folder), folder)
-        if other is not folder:
-            raise UsageError(
-                f"{other} and {folder} have the same name, so their results would overwrite each other",
-                hint="Run them one by one with different -o",
-            )
+        messages.table(list(zip(*columns, strict=True)))
+    counts = Counter(_WORDS[outcome.status] for outcome in outcomes)
+    text = ", ".join(f"{counts[word]} {word}" for word in _WORDS.values() if counts[word])
+    messages.say(f"{len(outcomes)} captures: {text}; see {output / INDEX}")
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import (
     AmbientOption,
     FlatFieldOption,
@@ -16,7 +17,6 @@ from splinecli.cli.options import (
     TransferOption,
     parse_radiometry,
 )
-from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def info(
         if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
             raise UsageError(f"{plot} would lie among the photographs, and count as one the next time")
         check_free(plot.parent, [plot.name], overwrite=overwrite)
-    talk = Talk(quiet=quiet)
+    talk = Messages(quiet=quiet)
     with talk.progress("reading", len(source.files.images)) as advance:
         summary = summarise_capture(source, progress=lambda: advance(1))
     if plot is not None:

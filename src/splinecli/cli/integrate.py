@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import (
     JsonOption,
     NormalConvention,
@@ -17,7 +18,6 @@ from splinecli.cli.options import (
     complete_list,
     split_commas,
 )
-from splinecli.cli.talk import Talk
 from splinecli.errors import InputError
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def integrate(
     matrix = None if camera_matrix is None else _read_matrix(camera_matrix)
     vertex_colours = None if colours is None else _read_colours(colours, inside.shape)
     started = time.perf_counter()
-    with Talk(quiet=quiet).progress("integrating", 1.0) as advance:
+    with Messages(quiet=quiet).progress("integrating", 1.0) as advance:
         done = 0.0
 
         def progress(iteration: int, most: int) -> None:

@@ -86,6 +86,13 @@ FlatFieldOption = Annotated[
         "--flat-field", metavar="DIR", help="Images of something evenly white, one for each light or for all."
     ),
 ]
+AsStoredOption = Annotated[
+    bool,
+    typer.Option(
+        "--as-stored",
+        help="Use the stored values alone: restore no saturated pixels, estimate no intensities.",
+    ),
+]
 WeightsOption = Annotated[
     str | None,
     typer.Option(
@@ -115,6 +122,9 @@ BatchSizeOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")]
+UpdateOption = Annotated[
+    bool, typer.Option("--update", help="Redo captures that changed, skip those that are done.")
+]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")
 ]
@@ -145,16 +155,7 @@ def parse_indices(text: str, option: str) -> list[int]:
 
 
 def parse_radiometry(transfer: str, ambient: Path | None, flat_field: Path | None) -> RadiometricCalibration:
-    """What --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
-    from splinecli.capture import RadiometricCalibration
-    from splinecli.capture.layouts.image_lists import check_not_empty, list_images
-    from splinecli.transfer import parse_transfer
+    """Return what --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
+    from splinecli.pipeline.options import radiometric_calibration
 
-    flats = (
-        ()
-        if flat_field is None
-        else list_images(flat_field, leave_out_stems=("ambient", "mask"), leave_out=())
-    )
-    if flat_field is not None:
-        check_not_empty(flats, flat_field)
-    return RadiometricCalibration(parse_transfer(transfer), ambient, flats)
+    return radiometric_calibration(transfer, ambient, flat_field)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import JsonOption, QuietOption, SeedOption
-from splinecli.cli.talk import Talk
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def prepare(
     # Wrong ones are refused before anything is made.
     folders = [folder for source in sources or [] for folder in find_captures(source)]
     plan = _plan(scenes, mesh or [], seed, size, lights, measured, measured_share)
-    talk = Talk(quiet=quiet)
+    talk = Messages(quiet=quiet)
     skipped: list[dict[str, str]] = []
     with held_folder(output):
         writer = PixelSetWriter(output)

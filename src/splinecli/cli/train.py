@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli.console import Messages
 from splinecli.cli.options import Device, DeviceOption, QuietOption, complete_weights
-from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def train(
         settings = replace(settings, minutes=minutes)
     check_writable(output)
     workers, own_device = join_workers(choose_device(device.value))
-    talk = Talk(quiet=quiet or not workers.leads)
+    talk = Messages(quiet=quiet or not workers.leads)
     with ExitStack() as stack:
         stack.callback(leave_workers)
         workers.shards(settings.shards)  # refused before the folder is made

@@ -1,175 +1,199 @@
-"""What `infer` does with each capture: read, estimate, make what else was asked for, write."""
+"""Estimate the normals of one capture: read it, run the method, write the results."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splinecli.cli.talk import Talk
 from splinecli.errors import UsageError
+from splinecli.pipeline.finished import inputs_sha256
+from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.pipeline.options import InferOptions
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture, CaptureSource, RadiometricCalibration
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splinecli.capture import Capture, CaptureSource
     from splinecli.inference import NormalEstimate
-    from splinecli.methods import Estimator, MethodOptions
-    from splinecli.normals import Convention
+    from splinecli.methods import Estimator
+
+SCHEMA = 1
+"""Of report.json. It rises when a field changes its meaning."""
+
+RESTORED, AS_STORED = "restored", "as stored"
+"""How a capture was read: see CaptureSource.read."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """What the command line asked for, the same for every capture."""
+def infer_capture(
+    folder: Path, options: InferOptions, observer: Observer = SILENT, *, estimator: Estimator | None = None
+) -> dict[str, Any]:
+    """Estimate the normals of the capture in `folder` and return the report.
 
-    radiometry: RadiometricCalibration
-    files: dict[str, Path | None]
-    output: Path
-    formats: list[str]
-    maps: list[str]
-    auto_mask: bool
-    surface: bool
-    html: bool
-    asked: dict[str, Any]
-    convention: Convention
-    n_lights: int | None
-    seed: int
-    light_indices: list[int] | None
-    method: str
-    options: MethodOptions
-    talk: Talk
+    The results go to `options.output`/<capture name>/, where they replace earlier ones. They appear whole or not at
+    all.
 
-    @cached_property
-    def estimator(self) -> Estimator:
-        """Made when the first capture has turned out to be one: loading a network takes a second."""
-        from splinecli.methods import make_estimator
-        from splinecli.methods.estimator import tells_confidence
+    Args:
+        folder: the capture.
+        options: how to read it, which method to run, what to write.
+        observer: receives warnings and progress.
+        estimator: what `make_method(options)` returned; it saves time in a batch.
 
-        estimator = make_estimator(self.method, self.options)
-        if self.options.weights is not None and estimator.weights is None:
-            raise UsageError(f"method {self.method} uses no weights", hint="Leave --weights out")
-        if "confidence" in self.maps and not tells_confidence(estimator):
-            raise UsageError(
-                f"method {self.method} does not tell how sure it is", hint="Leave confidence out of --maps"
-            )
-        return estimator
+    Raises:
+        InputError: the capture cannot be read.
+        UsageError: the options do not fit the capture or the method.
+        ModelError: the weights cannot be used.
+        OutputError: the results cannot be written.
+    """
+    from splinecli.inference import estimate_normals
+    from splinecli.results.files import report_of, write_estimate
 
-    def read(self, folder: Path) -> tuple[CaptureSource, Capture, float]:
-        """The capture under the lights asked for, whence it comes, and the seconds that it took."""
-        from splinecli.capture import open_capture
-
-        started = time.perf_counter()
-        source = open_capture(folder, radiometry=self.radiometry, **self.files)
-        if self.auto_mask:
-            with self.talk.progress(f"{source.files.name}: finding the object", source.n_lights) as advance:
-                source = source.find_mask(lambda: advance(1))
-        chosen = self._choose_lights(source)
-        count = source.n_lights if chosen is None else len(chosen)
-        with self.talk.progress(f"{source.files.name}: reading", count) as advance:
-            capture = source.read(chosen, progress=lambda: advance(1))
-        return source, capture, time.perf_counter() - started
-
-    def estimate(self, source: CaptureSource, capture: Capture, read_seconds: float) -> dict[str, Any]:
-        """Estimate and write the normals; returns the report."""
-        from splinecli.inference import estimate_normals
-        from splinecli.results.files import report_of, write_estimate
-
-        estimator = self.estimator
-        with self.talk.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
-            estimate = estimate_normals(capture, estimator, progress=advance)
-        warnings = [*capture.warnings]
-        if estimator.weights is not None:
-            from splinecli.networks.weights import untrained_warning
-
-            warnings += untrained_warning(estimator.weights["sha256"], capture.n_lights)
-        for warning in warnings:
-            self.talk.warn(f"{capture.name}: {warning}")
-        inputs = inputs_sha256(source, self.options.weights)
-        report = report_of(
-            estimate, estimator, self.asked, inputs, read_seconds=read_seconds, warnings=warnings
-        )
-        return write_estimate(
+    source, capture, read_seconds = _read(folder, options, observer)
+    if estimator is None:
+        estimator = make_method(options)
+    with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
+        estimate = estimate_normals(capture, estimator, progress=advance)
+    warnings = [*capture.warnings, *_method_warnings(estimator, capture)]
+    for warning in warnings:
+        observer.warn(f"{capture.name}: {warning}")
+    report = {
+        "schema": SCHEMA,
+        **report_of(
             estimate,
-            report,
-            self.output / capture.name,
-            formats=self.formats,
-            convention=self.convention,
-            more=self._make_more(source, estimate, report),
+            estimator,
+            options.as_dict(),
+            inputs_sha256(source, options.weights),
+            read_seconds=read_seconds,
+            warnings=warnings,
+        ),
+        "reading": AS_STORED if options.as_stored else RESTORED,
+    }
+    return write_estimate(
+        estimate,
+        report,
+        Path(options.output) / capture.name,
+        formats=options.formats,
+        convention=options.convention,
+        more=_further_files(source, estimate, report, options, observer),
+    )
+
+
+def make_method(options: InferOptions) -> Estimator:
+    """Return the estimator that the options ask for. Loading a network takes about a second.
+
+    Raises:
+        UsageError: the method uses no weights or gives no confidence, and the options ask for it.
+        ModelError: the weights cannot be used.
+    """
+    from splinecli.methods import make_estimator
+    from splinecli.methods.estimator import tells_confidence
+
+    estimator = make_estimator(options.method, options.method_options)
+    if options.weights is not None and estimator.weights is None:
+        raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
+    if "confidence" in options.maps and not tells_confidence(estimator):
+        raise UsageError(
+            f"method {options.method} gives no confidence", hint="Leave confidence out of --maps"
         )
-
-    def _make_more(
-        self, source: CaptureSource, estimate: NormalEstimate, report: dict[str, Any]
-    ) -> list[Callable[[Path], None]]:
-        """What else was asked for, made and ready to be written."""
-        from splinecli.results.files import (
-            albedo_picture,
-            write_albedo,
-            write_confidence,
-            write_mask,
-            write_preview,
-        )
-
-        capture = estimate.capture
-        more: list[Callable[[Path], None]] = []
-        albedo = colours = None
-        if "albedo" in self.maps or self.html:
-            from splinecli.results.albedo import albedo_map
-
-            with self.talk.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
-                albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
-            colours = albedo_picture(albedo, capture.mask)
-            if "albedo" in self.maps:
-                more.append(partial(write_albedo, albedo, capture.mask))
-        if "confidence" in self.maps and estimate.confidence_map is not None:
-            more.append(partial(write_confidence, estimate.confidence_map))
-        if "preview" in self.maps:
-            more.append(partial(write_preview, estimate))
-        if source.found_mask is not None:
-            more.append(partial(write_mask, capture.mask))
-        if self.surface:
-            from splinecli.surface.integration import integrate_normals
-            from splinecli.surface.mesh import surface_mesh
-            from splinecli.surface.surface_files import write_surface
-
-            with self.talk.progress(f"{capture.name}: integrating", 1) as advance:
-                depth = integrate_normals(estimate.normal_map, capture.mask)
-                advance(1)
-            mesh = surface_mesh(depth, capture.mask, colours=colours)
-            more.append(partial(write_surface, depth=depth, mesh=mesh))
-        if self.html:
-            from splinecli.files import write_text
-            from splinecli.results.files import PAGE
-            from splinecli.results.page import result_page
-
-            page = result_page(
-                report,
-                estimate.normal_map,
-                capture.mask,
-                albedo=albedo,
-                confidence_map=estimate.confidence_map,
-                error_map_deg=estimate.error_map_deg,
-            )
-            more.append(lambda folder: write_text(folder / PAGE, page))
-        return more
-
-    def _choose_lights(self, source: CaptureSource) -> Sequence[int] | None:
-        if self.n_lights is None:
-            return self.light_indices
-        from splinecli.capture.lights.draws import draw_lights
-
-        return draw_lights(source.light_directions, self.n_lights, trials=1, seed=self.seed)[0]
+    return estimator
 
 
-def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
-    """Changes when any file that is read for the capture does."""
-    import hashlib
+def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture, float]:
+    """Return the opened capture, the capture under the chosen lights, and the seconds that reading took."""
+    started = time.perf_counter()
+    source = options.open(folder)
+    name = source.files.name
+    if options.auto_mask:
+        with observer.progress(f"{name}: finding the object", source.n_lights) as advance:
+            source = source.find_mask(lambda: advance(1))
+    indices = _choose_lights(source, options)
+    count = source.n_lights if indices is None else len(indices)
+    with observer.progress(f"{name}: reading", count) as advance:
+        capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
+    return source, capture, time.perf_counter() - started
 
-    from splinecli.evaluation.trials import place_size_and_time, stamp_files
-    from splinecli.files import file_sha256
 
-    flats = [place_size_and_time(path) for path in source.radiometry.flat_field]
-    own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
-    stamps = [*stamp_files(source.files), flats, own_weights]
-    return hashlib.sha256(json.dumps(stamps).encode()).hexdigest()
+def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int] | None:
+    if options.n_lights is None:
+        return options.light_indices
+    from splinecli.capture.lights.draws import draw_lights
+
+    return draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
+
+
+def _method_warnings(estimator: Estimator, capture: Capture) -> Sequence[str]:
+    if estimator.weights is None:
+        return ()
+    from splinecli.networks.weights import untrained_warning
+
+    return untrained_warning(estimator.weights["sha256"], capture.n_lights)
+
+
+def _further_files(
+    source: CaptureSource,
+    estimate: NormalEstimate,
+    report: dict[str, Any],
+    options: InferOptions,
+    observer: Observer,
+) -> list[Callable[[Path], None]]:
+    """Compute what else the options ask for. Each function that is returned writes some files into a folder."""
+    from splinecli.results import files
+
+    capture = estimate.capture
+    writers: list[Callable[[Path], None]] = []
+    albedo = colours = None
+    if "albedo" in options.maps or options.html:
+        from splinecli.results.albedo import albedo_map
+
+        with observer.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
+            albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
+        colours = files.albedo_picture(albedo, capture.mask)
+        if "albedo" in options.maps:
+            writers.append(partial(files.write_albedo, albedo, capture.mask))
+    if "confidence" in options.maps and estimate.confidence_map is not None:
+        writers.append(partial(files.write_confidence, estimate.confidence_map))
+    if "preview" in options.maps:
+        writers.append(partial(files.write_preview, estimate))
+    if source.found_mask is not None:
+        writers.append(partial(files.write_mask, capture.mask))
+    if options.surface:
+        writers.append(_surface(estimate, colours, observer))
+    if options.html:
+        writers.append(_page(estimate, albedo, report))
+    return writers
+
+
+def _surface(
+    estimate: NormalEstimate, colours: NDArray[np.uint8] | None, observer: Observer
+) -> Callable[[Path], None]:
+    from splinecli.surface.integration import integrate_normals
+    from splinecli.surface.mesh import surface_mesh
+    from splinecli.surface.surface_files import write_surface
+
+    mask = estimate.capture.mask
+    with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
+        depth = integrate_normals(estimate.normal_map, mask)
+        advance(1)
+    mesh = surface_mesh(depth, mask, colours=colours)
+    return partial(write_surface, depth=depth, mesh=mesh)
+
+
+def _page(
+    estimate: NormalEstimate, albedo: NDArray[np.float32] | None, report: dict[str, Any]
+) -> Callable[[Path], None]:
+    from splinecli.files import write_text
+    from splinecli.results.files import PAGE
+    from splinecli.results.page import result_page
+
+    page = result_page(
+        report,
+        estimate.normal_map,
+        estimate.capture.mask,
+        albedo=albedo,
+        confidence_map=estimate.confidence_map,
+        error_map_deg=estimate.error_map_deg,
+    )
+    return lambda folder: write_text(folder / PAGE, page)

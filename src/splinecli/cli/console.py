@@ -1,0 +1,95 @@
+"""Messages, warnings, tables and progress of the commands, on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from splinecli.pipeline.observer import Advance, Observer
+
+LINE_SECONDS = 30.0
+"""Seconds between two lines of progress where stderr is not a terminal."""
+
+
+class Messages(Observer):
+    """Writes for people, on stderr. With `quiet` it writes nothing.
+
+    On a terminal, progress is a bar. Elsewhere it is a line every LINE_SECONDS.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        self.quiet = quiet
+
+    def say(self, message: str) -> None:
+        """Print a line."""
+        if not self.quiet:
+            print(message, file=sys.stderr)
+
+    def warn(self, message: str) -> None:
+        """Print a line that begins with "splinecli: warning:"."""
+        self.say(f"splinecli: warning: {message}")
+
+    def table(self, rows: Sequence[Sequence[str]]) -> None:
+        """Print a table: a header row, then rows of a name and numbers."""
+        if self.quiet:
+            return
+        from rich.console import Console
+        from rich.table import Table
+
+        header, *body = rows
+        table = Table(box=None, pad_edge=False)
+        for position, name in enumerate(header):
+            table.add_column(name, justify="right" if position else "left")
+        for row in body:
+            table.add_row(*row)
+        Console(stderr=True, markup=False, highlight=False).print(table)
+
+    @contextmanager
+    def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Advance]:
+        """Show the progress of a stage; yields `advance(amount, note="")`, which moves it."""
+        if self.quiet:
+            yield lambda amount, note="": None
+        elif sys.stderr.isatty():
+            with _bar(label, total, start) as advance:
+                yield advance
+        else:
+            yield self._lines(label, total, start)
+
+    def _lines(self, label: str, total: float, start: float) -> Advance:
+        done, shown = start, time.monotonic()
+
+        def advance(amount: float, note: str = "") -> None:
+            nonlocal done, shown
+            done += amount
+            now = time.monotonic()
+            if now - shown >= LINE_SECONDS and done < total:
+                shown = now
+                self.say(f"{label}: {100 * done / total:.0f} %" + (f", {note}" if note else ""))
+
+        return advance
+
+
+@contextmanager
+def _bar(label: str, total: float, start: float) -> Iterator[Advance]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f}%"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(label, total=total, note="")
+        bar.update(task, completed=start)
+
+        def advance(amount: float, note: str = "") -> None:
+            bar.update(task, advance=amount)
+            if note:
+                bar.update(task, note=note)
+
+        yield advance

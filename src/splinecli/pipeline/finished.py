@@ -1,0 +1,78 @@
+"""Decide whether the results in a folder are still those of the capture and the options."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splinecli import __version__
+from splinecli.errors import SplinecliError
+from splinecli.pipeline.options import InferOptions
+
+if TYPE_CHECKING:
+    from splinecli.capture import CaptureSource
+
+
+@dataclass(frozen=True)
+class EarlierResults:
+    """What a folder of results holds before a run.
+
+    Args:
+        report: the report in the folder if these results are still good, else None.
+        changed: why they are not, in words; empty if they are, or if there are none.
+        ours: whether `infer` wrote them, so that --update may replace them.
+    """
+
+    report: dict[str, Any] | None = None
+    changed: str = ""
+    ours: bool = True
+
+
+def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierResults:
+    """Compare the results in `target` with the capture in `folder` and the options. Raises InputError."""
+    from splinecli.results.files import OWN_FILES, REPORT
+
+    try:
+        report = json.loads((target / REPORT).read_text("utf-8"))
+        earlier = InferOptions.from_dict(report["options"])
+        version, stamp, names = report["version"], report["inputs_sha256"], list(report["files"])
+    except (OSError, ValueError, KeyError, TypeError, SplinecliError):
+        found = next((name for name in OWN_FILES if (target / name).exists()), None)
+        if found is None:
+            return EarlierResults()
+        # A report of another version may have other options, but it is one of ours.
+        if found != REPORT and not (target / REPORT).is_file():
+            return EarlierResults(changed=f"holds {found}, but no {REPORT}", ours=False)
+        return EarlierResults(changed="holds results of another version")
+    if version != __version__:
+        return EarlierResults(changed=f"holds results of version {version}")
+    if earlier != options:
+        return EarlierResults(changed=f"holds results of other options ({_differences(earlier, options)})")
+    missing = [name for name in names if not (target / name).is_file()]
+    if missing:
+        return EarlierResults(changed=f"holds results without {missing[0]}")
+    if stamp != inputs_sha256(options.open(folder), options.weights):
+        return EarlierResults(changed="holds results of other input files")
+    return EarlierResults(report)
+
+
+def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
+    """Return a digest that changes when any file that is read for the capture changes."""
+    from splinecli.evaluation.trials import place_size_and_time, stamp_files
+    from splinecli.files import file_sha256
+
+    flats = [place_size_and_time(path) for path in source.radiometry.flat_field]
+    own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
+    stamps = [*stamp_files(source.files), flats, own_weights]
+    return hashlib.sha256(json.dumps(stamps).encode()).hexdigest()
+
+
+def _differences(earlier: InferOptions, options: InferOptions) -> str:
+    return ", ".join(
+        option.name
+        for option in fields(options)
+        if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
+    )

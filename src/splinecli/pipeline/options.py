@@ -1,0 +1,167 @@
+"""The options of `infer`, as one frozen record that can be written as JSON and pickled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from splinecli.errors import InputError, UsageError
+from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
+from splinecli.normals import Convention
+
+if TYPE_CHECKING:
+    from splinecli.capture import CaptureSource, RadiometricCalibration
+
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "bfloat16"]
+
+EQUAL = "equal"
+"""Value of `intensities` that makes all lights equally bright."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InferOptions:
+    """How `infer` reads a capture, estimates its normals, and what it writes.
+
+    Two records are equal if they give the same results. `output`, `device` and `batch_size` do not count.
+
+    Args:
+        lights, mask, ground_truth: files that replace those of the capture.
+        intensities: a file of light intensities, or "equal".
+        auto_mask: find the object where the capture has no mask.
+        transfer: the curve of the images: linear, srgb or gamma:G.
+        ambient: an image without any of the lights.
+        flat_field: a folder of images of an evenly white surface.
+        as_stored: use the stored values alone. By default, saturated pixels are restored and unknown light
+            intensities are estimated.
+        n_lights, seed: use this many lights, drawn with this seed. None for all lights.
+        light_indices: use these lights, counted from 0.
+        method: a name that `splinecli.methods.method_names` lists.
+        weights: a shipped name or a file. None for the method's own.
+        rotations, batch_size: of a network. None for the method's own.
+        output: results go to `output`/<capture name>/.
+        formats: names of `splinecli.results.files.NORMALS`.
+        maps: names of `splinecli.results.files.MAPS`.
+        html: also write page.html. surface: also write the depth map and the mesh.
+        convention: direction of the green channel in PNG files.
+
+    Raises:
+        UsageError: a value is unknown, or two options contradict each other.
+    """
+
+    lights: str | None = None
+    intensities: str | None = None
+    mask: str | None = None
+    auto_mask: bool = False
+    ground_truth: str | None = None
+    transfer: str = "linear"
+    ambient: str | None = None
+    flat_field: str | None = None
+    as_stored: bool = False
+    n_lights: int | None = None
+    seed: int = 0
+    light_indices: tuple[int, ...] | None = None
+    method: str = DEFAULT_METHOD
+    weights: str | None = None
+    rotations: int | None = None
+    batch_size: int | None = field(default=None, compare=False)
+    device: Device = field(default="auto", compare=False)
+    precision: Precision = "auto"
+    output: str = field(default="out", compare=False)
+    formats: tuple[str, ...] = ("png", "npy")
+    maps: tuple[str, ...] = ()
+    html: bool = False
+    surface: bool = False
+    convention: Convention = "opengl"
+
+    def __post_init__(self) -> None:
+        from splinecli.capture.lights.draws import check_draw_settings
+        from splinecli.capture.record import check_light_indices
+        from splinecli.results.files import MAPS, NORMALS
+        from splinecli.transfer import parse_transfer
+
+        if self.n_lights is not None and self.light_indices is not None:
+            raise UsageError("--n-lights and --light-indices exclude each other")
+        if self.mask is not None and self.auto_mask:
+            raise UsageError("--mask and --auto-mask exclude each other")
+        check_method(self.method)
+        if self.n_lights is not None:
+            check_draw_settings(self.n_lights, 1, self.seed)
+        if self.light_indices is not None:
+            check_light_indices(self.light_indices, max(self.light_indices, default=0) + 1)
+        parse_transfer(self.transfer)
+        _check_one_of("precision", self.precision, get_args(Precision))
+        _check_one_of("device", self.device, get_args(Device))
+        _check_one_of("convention", self.convention, get_args(Convention))
+        for name in self.formats:
+            _check_one_of("format", name, NORMALS)
+        for name in self.maps:
+            _check_one_of("map", name, MAPS)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the options as values that JSON can hold."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> InferOptions:
+        """Return the options that `as_dict` wrote. Raises TypeError for an unknown name, UsageError as above."""
+        given: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+        }
+        return cls(**given)
+
+    @property
+    def method_options(self) -> MethodOptions:
+        """The part of the options that concerns the method."""
+        return MethodOptions(self.weights, self.rotations, self.batch_size, self.device, self.precision)
+
+    def check_files(self) -> None:
+        """Raise InputError if a file that the options name does not exist, or --flat-field holds no images."""
+        intensities = None if self.intensities == EQUAL else self.intensities
+        for name in (self.lights, intensities, self.mask, self.ground_truth, self.ambient):
+            if name is not None and not Path(name).is_file():
+                problem = "is a folder, expected a file" if Path(name).is_dir() else "the file does not exist"
+                raise InputError(problem, path=name)
+        self.radiometric_calibration()
+
+    def radiometric_calibration(self) -> RadiometricCalibration:
+        """Return how the images' values become linear light. Raises InputError."""
+        return radiometric_calibration(self.transfer, self.ambient, self.flat_field)
+
+    def open(self, folder: Path) -> CaptureSource:
+        """Open the capture in the folder under these options. Raises InputError."""
+        from splinecli.capture import open_capture
+
+        return open_capture(
+            folder,
+            lights=self.lights,
+            intensities=self.intensities,
+            mask=self.mask,
+            ground_truth=self.ground_truth,
+            radiometry=self.radiometric_calibration(),
+        )
+
+
+def radiometric_calibration(
+    transfer: str, ambient: str | Path | None, flat_field: str | Path | None
+) -> RadiometricCalibration:
+    """Return what --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
+    from splinecli.capture import RadiometricCalibration
+    from splinecli.capture.layouts.image_lists import check_not_empty, list_images
+    from splinecli.transfer import parse_transfer
+
+    flats: tuple[Path, ...] = ()
+    if flat_field is not None:
+        folder = Path(flat_field)
+        flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
+        check_not_empty(flats, folder)
+    return RadiometricCalibration(parse_transfer(transfer), None if ambient is None else Path(ambient), flats)
+
+
+def _check_one_of(what: str, value: str, allowed: Mapping[str, Any] | tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise UsageError(f"no {what} named {value!r}; expected one of {', '.join(allowed)}")
