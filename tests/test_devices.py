@@ -1,4 +1,4 @@
-"""Devices and precision."""
+"""Devices, precision and threads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from splinecli.devices import choose_device, choose_precision
+from splinecli import devices
+from splinecli.devices import (
+    cgroup_quotas,
+    choose_device,
+    choose_precision,
+    count_available_cores,
+    use_available_cores,
+)
 from splinecli.errors import UsageError
 
 
@@ -43,3 +50,60 @@ def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions() -> 
         pytest.skip("only x86 Linux lists its instructions so, and only torch from 2.10 knows them")
     native = bool({"avx512_bf16", "amx_bf16"} & flags)
     assert choose_precision("auto", torch.device("cpu")) == ("bfloat16" if native else "float32")
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def test_quota_of_a_control_group(tmp_path: Path) -> None:
+    write(tmp_path / "cpu.max", "max 100000\n")
+    write(tmp_path / "jobs/cpu.max", "300000 100000\n")
+    write(tmp_path / "jobs/ours/cpu.max", "400000 100000\n")
+    # The group above limits this one, too.
+    assert sorted(cgroup_quotas("0::/jobs/ours\n", tmp_path)) == [3, 4]
+    assert cgroup_quotas("0::/\n", tmp_path) == []
+
+
+def test_quota_inside_a_container_that_shows_the_host_s_path(tmp_path: Path) -> None:
+    write(tmp_path / "cpu.max", "150000 100000\n")
+    assert cgroup_quotas("0::/docker/0123abcd\n", tmp_path) == [1.5]
+
+
+def test_quota_of_version_1(tmp_path: Path) -> None:
+    groups = "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n"
+    write(tmp_path / "cpu,cpuacct/cpu.cfs_quota_us", "-1\n")
+    write(tmp_path / "cpu,cpuacct/cpu.cfs_period_us", "100000\n")
+    assert cgroup_quotas(groups, tmp_path) == []
+    write(tmp_path / "cpu,cpuacct/box/cpu.cfs_quota_us", "50000\n")
+    write(tmp_path / "cpu,cpuacct/box/cpu.cfs_period_us", "100000\n")
+    assert cgroup_quotas(groups, tmp_path) == [0.5]
+
+
+@pytest.mark.parametrize(
+    ("machine", "affinity", "quotas", "expected"),
+    [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
+)
+def test_available_cores(
+    machine: int | None,
+    affinity: int,
+    quotas: list[float],
+    expected: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(devices.os, "cpu_count", lambda: machine)
+    monkeypatch.setattr(devices.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
+    monkeypatch.setattr(devices, "cgroup_quotas", lambda *_: quotas)
+    assert count_available_cores() == expected
+
+
+@pytest.mark.parametrize(("threads", "cores", "expected"), [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
+def test_threads_are_only_ever_lowered(
+    threads: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [threads]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: now[0])
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: now.__setitem__(0, count))
+    monkeypatch.setattr(devices, "count_available_cores", lambda: cores)
+    assert use_available_cores() == now[0] == expected

@@ -1,16 +1,24 @@
-"""Which device to compute on, and in which precision."""
+"""Choice of the device, the number format, and the number of threads."""
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Literal
 
 import torch
 
 from splinecli.errors import UsageError
 
+_CGROUPS = Path("/sys/fs/cgroup")
+
 
 def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
-    """The device of this name; "auto" takes a CUDA GPU where there is one. Raises UsageError."""
+    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU.
+
+    Raises:
+        UsageError: the name is unknown, or there is no CUDA GPU.
+    """
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
     available = torch.cuda.is_available()
@@ -22,13 +30,86 @@ def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
 def choose_precision(
     name: Literal["auto", "float32", "bfloat16"], device: torch.device
 ) -> Literal["float32", "bfloat16"]:
-    """ "auto" takes bfloat16 where the device computes in it natively, float32 elsewhere."""
+    """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
     if name != "auto":
         return name
     if device.type == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    # Without the instructions a CPU emulates bfloat16, slower than float32.
+    # A CPU without the instructions emulates bfloat16, which is slower than float32.
     return "bfloat16" if _cpu_has_bfloat16() else "float32"
+
+
+def use_available_cores() -> int:
+    """Limit PyTorch's threads to the cores that this process may use, and return their number.
+
+    Call it once before a long computation. PyTorch starts one thread per core of the machine, even where a container
+    may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
+    ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
+    """
+    threads = min(torch.get_num_threads(), count_available_cores())
+    if threads < torch.get_num_threads():
+        torch.set_num_threads(threads)
+    return threads
+
+
+def count_available_cores() -> int:
+    """Return the number of cores that this process may use, at least 1.
+
+    It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its control group, which
+    containers and job schedulers set (Linux).
+    """
+    limits = [float(os.cpu_count() or 1)]
+    if hasattr(os, "sched_getaffinity"):
+        limits.append(len(os.sched_getaffinity(0)))
+    try:
+        groups = Path("/proc/self/cgroup").read_text("utf-8")
+    except OSError:
+        groups = ""  # not Linux
+    limits += cgroup_quotas(groups, _CGROUPS)
+    return max(1, int(min(limits)))
+
+
+def cgroup_quotas(groups: str, mount: Path) -> list[float]:
+    """Return the CPU quotas, in cores, of a process's control groups and of the groups above them.
+
+    Args:
+        groups: text of /proc/PID/cgroup: lines "0::/group" (version 2) or "N:controllers:/group" (version 1).
+        mount: folder where the control groups are mounted.
+    """
+    quotas = []
+    for line in groups.splitlines():
+        _, controllers, group = line.split(":", 2)
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        top = mount / controllers if controllers else mount
+        if controllers and not top.is_dir():
+            top = mount / "cpu"
+        folder = top / group.lstrip("/")
+        # Inside a container the path may be that of the host, which does not exist here. The top always does.
+        for place in (folder, *folder.parents):
+            quotas += _quota_v1(place) if controllers else _quota_v2(place)
+            if place == top:
+                break
+    return quotas
+
+
+def _quota_v2(folder: Path) -> list[float]:
+    """Read "QUOTA PERIOD" in microseconds from cpu.max; the quota is "max" where there is none."""
+    fields = _read_fields(folder / "cpu.max")
+    return [float(fields[0]) / float(fields[1])] if len(fields) == 2 and fields[0] != "max" else []
+
+
+def _quota_v1(folder: Path) -> list[float]:
+    """Read quota and period from their own files; the quota is -1 where there is none."""
+    fields = _read_fields(folder / "cpu.cfs_quota_us") + _read_fields(folder / "cpu.cfs_period_us")
+    return [float(fields[0]) / float(fields[1])] if len(fields) == 2 and float(fields[0]) > 0 else []
+
+
+def _read_fields(path: Path) -> list[str]:
+    try:
+        return path.read_text("utf-8").split()
+    except OSError:
+        return []
 
 
 def _cpu_has_bfloat16() -> bool:
