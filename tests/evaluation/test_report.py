@@ -59,7 +59,7 @@ def test_one_evaluation() -> None:
         "Pixels scored": "at most 500 of each capture, at random",
         "splinecli": __version__,
     }
-    assert {"Notes", "Captures passed over", "Results with 10 lights", "Figures"} <= set(page.text["h2"])
+    assert {"Notes", "Skipped captures", "Results with 10 lights", "Figures"} <= set(page.text["h2"])
     assert {"Ball is round.", ": bear: no images."} <= set(page.text["li"])
     assert any(words.startswith("ls is better than iw12 by") for words in page.text["li"])
     assert page.text["figcaption"] == ["A plot"]

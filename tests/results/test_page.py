@@ -1,4 +1,4 @@
-"""The page stands alone, takes names for text, holds the normals it was given, and lights them as Lambert would."""
+"""The page loads nothing, escapes names, stores the normals exactly, and lights them by Lambert's law."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from browser import OpenPage
 from html_page import HtmlPage
 from splinecli.normals import angle_between_deg, unit
-from splinecli.results.files import albedo_picture
+from splinecli.pictures.maps import albedo_picture
+from splinecli.results import page as page_module
 from splinecli.results.page import LONGEST_SIDE, result_page
 from splinecli.transfer import decode_transfer, encode_srgb
 
@@ -49,7 +50,7 @@ def sphere(side: int = SIDE) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
 
 
 class Page(HtmlPage):
-    """What a page holds, and its pictures decoded."""
+    """The text of a page and its pictures."""
 
     @property
     def facts(self) -> dict[str, str]:
@@ -71,7 +72,7 @@ class Page(HtmlPage):
         return np.asarray(picture[..., ::-1], np.uint8)
 
     def normals(self) -> NDArray[np.float64]:
-        """As the page's script unpacks them; zero outside the mask."""
+        """Normals (H, W, 3) as the page's script decodes them, zero outside the mask."""
         high, low = self.picture("Normal map").astype(int), self.picture("").astype(int)
         return unit(((high * 32 + low) / 8191 * 2 - 1) * high.any(axis=2, keepdims=True))
 
@@ -115,14 +116,14 @@ def test_figures_and_pictures() -> None:
         "Size": "296 × 321",
         "Likely within 5°": "81% of the pixels",
         "Seconds": "read 0.6, estimate 0.008",
-        "Computed on": "cpu, float32",
+        "Device": "cpu, float32",
     }
     assert page.text["li"] == ["The images are 8-bit."]
     assert page.alternative_texts == ["Normal map", "Albedo map", "Confidence map", "Error map", ""]
     assert (page.picture("Albedo map")[20, 20] == 255).all()  # the brightest hundredth is white
     assert (page.picture("Confidence map")[20, 20] == 153).all()
     assert (page.picture("Error map")[~mask] == 255).all()
-    assert {"0°", "30° and beyond"} <= set(page.text["span"])
+    assert {"0°", "30° or more"} <= set(page.text["span"])
 
 
 def test_what_is_not_given_is_absent() -> None:
@@ -132,10 +133,10 @@ def test_what_is_not_given_is_absent() -> None:
     )
     page = Page(html)
     assert page.alternative_texts == ["Normal map", ""]
-    assert not {"Weights", "Mean", "Likely within 5°", "Shown at"} & set(page.facts)
+    assert not {"Weights", "Mean", "Likely within 5°", "Size on this page"} & set(page.facts)
     assert "Warnings" not in page.text["h2"]
     assert 'id="coloured"' not in html
-    assert "beyond" not in "".join(page.text["figcaption"])
+    assert "or more" not in "".join(page.text["figcaption"])
 
 
 def test_names_are_text() -> None:
@@ -162,7 +163,7 @@ def test_the_normals_survive() -> None:
 
 
 def test_large_maps_are_reduced() -> None:
-    """Two faces side by side: means of what is equal are the same, and the background does not take part."""
+    """Two flat faces side by side keep their normals and colours: the background does not change the means."""
     width, height = 2 * LONGEST_SIDE, 301
     faces = unit(np.array([[0.6, 0.2, 0.5], [-0.9, 0.1, 0.3]], np.float32))
     mask = np.ones((height, width), bool)
@@ -173,7 +174,7 @@ def test_large_maps_are_reduced() -> None:
     page = Page(result_page(REPORT, normals, mask, albedo=albedo, error_map_deg=errors))
     decoded = page.normals()
     assert decoded.shape == (150, LONGEST_SIDE, 3)
-    assert page.facts["Shown at"] == "1600 × 150"
+    assert page.facts["Size on this page"] == "1600 × 150"
     for face, half in zip(faces, np.split(decoded, 2, axis=1), strict=True):
         shown = half.any(axis=2)
         assert shown[51:].all()
@@ -182,7 +183,7 @@ def test_large_maps_are_reduced() -> None:
     shown = decoded.any(axis=2)
     for name in ("Albedo map", "Error map"):
         colours = page.picture(name)[shown].astype(int)
-        assert np.ptp(colours, axis=0).max() <= 1  # of rounding, nothing of the background
+        assert np.ptp(colours, axis=0).max() <= 1  # rounding alone, no background
 
 
 def view(open_page: OpenPage, html: str, fragment: str, *, webgl: bool = True) -> NDArray[np.uint8]:
@@ -226,6 +227,21 @@ def test_an_enlarged_view_interpolates_normals(open_page: OpenPage) -> None:
     # Away from the outline and the terminator, whose bends four pixels cannot follow.
     smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
     assert np.abs(seen - expected[..., None])[smooth].max() <= 3
+
+
+def test_the_script_decodes_what_the_page_encodes(
+    open_page: OpenPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The number of stored bits is written once, in page.py: other numbers work as well."""
+    normals, mask = sphere()
+    expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
+    for webgl in (True, False):
+        monkeypatch.setattr(page_module, "LOW_BITS", 3)
+        seen = view(
+            open_page, result_page(REPORT, normals, mask), "light=-0.7,0.5&specular=0", webgl=webgl
+        ).astype(int)
+        bright = expected > 100  # 11 bits are too few for the steep part of sRGB's curve
+        assert np.abs(seen - expected[..., None])[bright].max() <= 2
 
 
 def test_a_glossy_sphere_of_two_colours(open_page: OpenPage) -> None:

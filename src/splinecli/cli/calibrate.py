@@ -79,7 +79,7 @@ def calibrate(
     from splinecli.capture.linearise import is_display_encoded
     from splinecli.files import check_free, write_bytes, write_text
     from splinecli.pictures.calibration import calibration_picture
-    from splinecli.results.files import encode_png
+    from splinecli.pictures.png import encode_png
     from splinecli.transfer import parse_transfer
 
     talk = Messages(quiet=quiet)

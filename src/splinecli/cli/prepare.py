@@ -59,9 +59,9 @@ def prepare(
     from splinecli.capture import find_captures
     from splinecli.files import check_writable, held_folder, write_bytes
     from splinecli.pictures.contact_sheet import contact_sheet
+    from splinecli.pictures.png import encode_png
     from splinecli.pixel_sets.preparation import add_capture, add_scene, name_captures
     from splinecli.pixel_sets.store import PixelSetWriter
-    from splinecli.results.files import encode_png
 
     if not sources and not scenes and not mesh:
         raise UsageError("nothing to prepare", hint="Name a SOURCE, or ask for --scenes N or --mesh FILE")

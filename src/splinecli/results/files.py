@@ -1,14 +1,12 @@
-"""What `infer` writes for a capture: the normal map's files, the error map and the report, whole or not at all."""
+"""The files that `infer` writes for a capture: their names, and functions that write them, all or none."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli import __version__
-from splinecli.errors import OutputError
 from splinecli.files import current_umask, refusals_as_output_errors
 from splinecli.inference import NormalEstimate
-from splinecli.methods import Estimator
 from splinecli.normals import Convention, encode_picture
+from splinecli.pictures.maps import albedo_picture as albedo_picture
+from splinecli.pictures.maps import confidence_picture, preview_picture
+from splinecli.pictures.png import encode_png as encode_png
+from splinecli.results.report import report_of as report_of
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT
-from splinecli.transfer import encode_srgb
 
 NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
+"""The file of the normal map in each format."""
+
 ERROR_MAP = "error_map.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
@@ -34,7 +35,8 @@ MAPS = {
     "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
     "preview": (PREVIEW,),
 }
-"""The files of each map that is written where it is asked for."""
+"""The files of each optional map."""
+
 OWN_FILES = (
     *NORMALS.values(),
     ERROR_MAP,
@@ -45,9 +47,7 @@ OWN_FILES = (
     PAGE,
     REPORT,
 )
-
-RAKING_LIGHT = (-0.72, 0.48, 0.5)
-"""Of the preview: low, from the upper left, as relief is looked at."""
+"""All files that `infer` and `integrate` may write into a capture's folder of results."""
 
 
 def finished_report(
@@ -65,48 +65,6 @@ def finished_report(
     return report if same else None
 
 
-def report_of(
-    estimate: NormalEstimate,
-    estimator: Estimator,
-    options: dict[str, Any],
-    inputs: str,
-    *,
-    read_seconds: float,
-    warnings: Sequence[str],
-) -> dict[str, Any]:
-    """The report of the contract (docs/infer.md), all but `seconds.write` and `files`.
-
-    Args:
-        options: what was asked for.
-        inputs: SHA-256 over what tells that the files read are the same.
-    """
-    capture, expected = estimate.capture, estimate.expected_under_5
-    return {
-        "capture": capture.name,
-        "method": estimator.name,
-        "weights": estimator.weights,
-        "n_lights": capture.n_lights,
-        "light_indices": list(capture.light_indices),
-        "estimated_intensities": None
-        if capture.estimated_intensities is None
-        else capture.estimated_intensities.round(4).tolist(),
-        "n_pixels": capture.n_pixels,
-        "image_size": [capture.mask.shape[1], capture.mask.shape[0]],
-        "device": estimator.device,
-        "precision": estimator.precision,
-        "seconds": {"read": round(read_seconds, 3), "estimate": round(estimate.seconds, 3)},
-        "peak_memory_mib": peak_memory_mib(),
-        "warnings": list(warnings),
-        "angular_error_deg": None
-        if estimate.errors is None
-        else {name: round(value, 4) for name, value in asdict(estimate.errors).items()},
-        "expected_under_5": None if expected is None else round(expected, 4),
-        "options": options,
-        "inputs_sha256": inputs,
-        "version": __version__,
-    }
-
-
 def write_estimate(
     estimate: NormalEstimate,
     report: dict[str, Any],
@@ -116,14 +74,21 @@ def write_estimate(
     convention: Convention,
     more: Sequence[Callable[[Path], None]] = (),
 ) -> dict[str, Any]:
-    """Write the files into `folder`, replacing those of an earlier run there; returns the finished report.
+    """Write the results of a capture into `folder` and return the finished report.
+
+    The files replace those of an earlier run in the folder. They are first written into a temporary folder beside it,
+    so that a failure or Ctrl-C leaves the earlier files as they were.
 
     Args:
+        estimate: the result.
+        report: what report_of returned.
+        folder: the capture's folder of results; it need not exist.
         formats: keys of NORMALS.
-        more: what writes further ones of OWN_FILES into a folder, such as write_albedo.
+        convention: whether green is y up or y down in pictures of normals.
+        more: functions that write further files of OWN_FILES into a folder, such as write_albedo.
 
-    Everything is written into a folder beside it first, so that a failure or Ctrl-C leaves nothing half-done.
-    Raises OutputError.
+    Raises:
+        OutputError: a file cannot be written.
     """
     started = time.perf_counter()
     with refusals_as_output_errors(folder):
@@ -133,9 +98,7 @@ def write_estimate(
             for form in formats:
                 write_normals(estimate, form, stage / NORMALS[form], convention)
             if estimate.error_map_deg is not None:
-                from splinecli.pictures.error_map import error_map_picture
-
-                (stage / ERROR_MAP).write_bytes(encode_png(error_map_picture(estimate.error_map_deg)))
+                write_error_map(estimate.error_map_deg, stage)
             for write in more:
                 write(stage)
             files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
@@ -144,13 +107,13 @@ def write_estimate(
             (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
             _publish(stage, folder)
         finally:
-            # Also on Ctrl-C: nothing half-written stays behind.
+            # This also runs on Ctrl-C.
             shutil.rmtree(stage, ignore_errors=True)
     return report
 
 
 def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: Convention) -> None:
-    """The normal map as a 16-bit or 8-bit PNG picture, or as float32 NPY or TIFF."""
+    """Write the normal map as a 16-bit or 8-bit PNG picture, or as a float32 NPY or TIFF file."""
     if form in ("png", "png8"):
         bits = 8 if form == "png8" else 16
         picture = encode_picture(estimate.normal_map, estimate.capture.mask, bits=bits, convention=convention)
@@ -163,69 +126,38 @@ def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: C
         tifffile.imwrite(path, estimate.normal_map, photometric="rgb")
 
 
+def write_error_map(error_map_deg: NDArray[np.float32], folder: Path) -> None:
+    """Write a picture of an error map (H, W) in degrees, NaN where there is no error."""
+    from splinecli.pictures.error_map import error_map_picture
+
+    (folder / ERROR_MAP).write_bytes(encode_png(error_map_picture(error_map_deg)))
+
+
 def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], folder: Path) -> None:
-    """An albedo map (H, W, 3), linear, as float32 NPY and as a picture."""
+    """Write a linear albedo map (H, W, 3) as a float32 NPY file and as a picture."""
     np.save(folder / ALBEDO, albedo, allow_pickle=False)
     (folder / ALBEDO_PICTURE).write_bytes(encode_png(albedo_picture(albedo, mask)))
 
 
 def write_confidence(confidence_map: NDArray[np.float32], folder: Path) -> None:
-    """A confidence map (H, W) as float32 NPY and as a gray picture, 1 white."""
+    """Write a confidence map (H, W) as a float32 NPY file and as a gray picture."""
     np.save(folder / CONFIDENCE, confidence_map, allow_pickle=False)
     (folder / CONFIDENCE_PICTURE).write_bytes(encode_png(confidence_picture(confidence_map)))
 
 
 def write_mask(mask: NDArray[np.bool_], folder: Path) -> None:
-    """A mask (H, W) as a black and white picture."""
+    """Write a mask (H, W) as a black and white picture."""
     (folder / FOUND_MASK).write_bytes(encode_png(mask * np.uint8(255)))
 
 
 def write_preview(estimate: NormalEstimate, folder: Path) -> None:
-    """The shaded picture."""
+    """Write a shaded picture of the surface."""
     picture = preview_picture(estimate.normal_map, estimate.capture.mask)
     (folder / PREVIEW).write_bytes(encode_png(picture))
 
 
-def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """An albedo map (H, W, 3) as an 8-bit sRGB picture; white is the brightest hundredth of the mask (H, W)."""
-    white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
-    return encode_srgb(albedo / white)
-
-
-def confidence_picture(confidence_map: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A confidence map (H, W) as an 8-bit gray picture (H, W): the share of white is the probability."""
-    return np.rint(255 * confidence_map).astype(np.uint8)
-
-
-def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The surface, matte white under RAKING_LIGHT, as an 8-bit sRGB picture; black outside the mask (H, W)."""
-    light = np.array(RAKING_LIGHT, np.float32)
-    shading = (normal_map @ (light / np.linalg.norm(light))) * mask
-    return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
-
-
-def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:
-    """PNG of an RGB (H, W, 3) or gray (H, W) picture, 8 or 16 bits."""
-    import cv2
-
-    done, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
-    if not done:
-        raise OutputError("the picture could not be encoded as PNG")
-    return encoded.tobytes()
-
-
-def peak_memory_mib() -> int | None:
-    """Largest memory of this process so far in MiB; None where the system does not say."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
-
-
 def _publish(stage: Path, folder: Path) -> None:
-    """Move the finished files to their place; where that fails, those of an earlier run come back."""
+    """Move the files from `stage` to `folder`. If that fails, put back the files of the earlier run."""
     if not folder.exists():
         stage.chmod(0o777 & ~current_umask())
         stage.rename(folder)
@@ -235,7 +167,7 @@ def _publish(stage: Path, folder: Path) -> None:
     earlier.mkdir()
     try:
         for name in OWN_FILES:
-            # A mask that was found before may have been mended since, and be what this run has read.
+            # The user may have edited the mask of an earlier run and passed it to this run: keep it.
             if (folder / name).exists() and (name != FOUND_MASK or name in new):
                 (folder / name).replace(earlier / name)
         for name in new:

@@ -64,7 +64,7 @@ def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
                 "files": [(name, f"{folder}/{quote(name)}") for name in files],
             }
         )
-    return render("index.html", title=f"{len(reports)} captures", rows=rows)
+    return render("index.html", title=f"{len(reports)} captures", header=HEADER, rows=rows)
 
 
 def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Mapping[str, Any]]:

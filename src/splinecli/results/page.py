@@ -1,4 +1,4 @@
-"""What `infer` found for a capture, as one HTML file: a view under a light that can be moved, pictures and figures."""
+"""The results of one capture as one HTML file: a view under a movable light, pictures of the maps, figures."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from numpy.typing import NDArray
 
 from splinecli.normals import unit
 from splinecli.pictures.error_map import TOP_DEG, colour_errors
-from splinecli.results.files import RAKING_LIGHT, albedo_picture, confidence_picture, encode_png
+from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture
+from splinecli.pictures.png import Picture, encode_png
 from splinecli.results.templates import render
 
 LONGEST_SIDE = 1600
-"""Pixels. Larger maps are reduced to it: a screen shows no more, and a page is to be mailed."""
+"""Largest width or height of the maps on a page in pixels: a screen shows no more, and the file stays small."""
 
 LOW_BITS = 5
-"""Below the 8 of a picture: 13 bits keep a normal within 0.01 degrees, where 8 bits would band a highlight. Those of
-16 would be noise, which no PNG compresses, and half of the page. The page's script knows this number, too."""
+"""Bits of a normal's component below the 8 bits of a picture.
 
-_SIZE = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
+13 bits keep a normal within 0.01 degrees, where 8 bits would show bands in a highlight. More bits would be noise,
+which PNG cannot compress, and would make the file twice as large.
+"""
+
+_TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 
 def result_page(
@@ -33,31 +37,32 @@ def result_page(
     confidence_map: NDArray[np.float32] | None = None,
     error_map_deg: NDArray[np.float32] | None = None,
 ) -> str:
-    """One HTML file that holds all it shows, and asks no network for anything.
+    """Return one HTML file that contains everything it shows and loads nothing from a network.
 
-    Maps with a side of more than LONGEST_SIDE pixels are reduced to it, keeping their proportions: each pixel of the
-    page is the mean over the area it covers, of what lies in the mask (or has an error) there; mean normals get unit
-    length again. The page says so. Its figures are the report's, of all pixels.
+    Maps with a side over LONGEST_SIDE pixels are reduced to it, with their proportions kept. A pixel of a reduced map
+    is the mean of the values that are in the mask (or have an error) in its area; mean normals are scaled to unit
+    length. The page states its size then. The figures on the page are those of the report, over all pixels.
 
     Args:
-        report: of the contract (docs/infer.md); `seconds.write` and `files` may be missing.
-        normal_map: (H, W, 3), unit in the mask (H, W); x right, y up, z to the camera.
-        albedo: (H, W, 3), linear, as albedo_map gives it.
+        report: a report of `infer` (docs/infer.md); `seconds.write` and `files` may be missing.
+        normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
+        mask: (H, W), not empty.
+        albedo: (H, W, 3), linear, from albedo_map.
         confidence_map: (H, W), probabilities.
-        error_map_deg: (H, W) degrees, NaN where there is none.
+        error_map_deg: (H, W) degrees, NaN where there is no error.
 
     Raises:
         OutputError: a picture cannot be encoded.
     """
-    normals, shown = _reduced(normal_map, mask)
-    high, low = encode_halves(unit(normals), shown)
+    normals, shown = _reduce(normal_map, mask)
+    high, low = split_normals(unit(normals), shown)
     albedo_png = confidence_png = error_png = None
     if albedo is not None:
-        albedo_png = _data_url(albedo_picture(_reduced(albedo, mask)[0], shown))
+        albedo_png = _data_url(albedo_picture(_reduce(albedo, mask)[0], shown))
     if confidence_map is not None:
-        confidence_png = _data_url(confidence_picture(_reduced(confidence_map[..., None], mask)[0][..., 0]))
+        confidence_png = _data_url(confidence_picture(_reduce(confidence_map[..., None], mask)[0][..., 0]))
     if error_map_deg is not None:
-        errors, known = _reduced(error_map_deg[..., None], np.isfinite(error_map_deg))
+        errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg))
         error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan), TOP_DEG))
     height, width = shown.shape
     return render(
@@ -68,7 +73,9 @@ def result_page(
         errors=_errors(report),
         width=width,
         height=height,
-        light=unit(np.array(RAKING_LIGHT))[:2].round(4).tolist(),
+        light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
+        low_scale=2**LOW_BITS,
+        largest_code=_largest_code(),
         high=_data_url(high),
         low=_data_url(low),
         albedo=albedo_png,
@@ -79,22 +86,29 @@ def result_page(
     )
 
 
-def encode_halves(
-    normals: NDArray[np.float32], mask: NDArray[np.bool_]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Unit normals (H, W, 3) as two 8-bit RGB pictures: the upper 8 bits of (n + 1) / 2, and the LOW_BITS below.
+def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[Picture, Picture]:
+    """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the LOW_BITS below.
 
-    The first is the usual picture of a normal map; both are black outside the mask (H, W), where the first alone
-    tells, as no unit normal is near (-1, -1, -1). Neither has an alpha channel, by which a browser would multiply.
+    The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel that is black in
+    the first picture is outside, since no unit normal is near (-1, -1, -1). The pictures have no alpha channel,
+    because a browser would multiply the colours by it.
     """
-    codes = np.rint((normals + 1) / 2 * (2 ** (8 + LOW_BITS) - 1)).astype(np.uint16) * mask[..., None]
+    codes = np.rint((normals + 1) / 2 * _largest_code()).astype(np.uint16) * mask[..., None]
     return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
 
 
-def _reduced(
+def _largest_code() -> int:
+    """Return the number that stands for a component of 1."""
+    return int(2 ** (8 + LOW_BITS) - 1)
+
+
+def _reduce(
     values: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Values (H, W, C) with no side over LONGEST_SIDE: means over what is known; known where any of an area is."""
+    """Return values (H, W, C) and their mask, both reduced until no side is over LONGEST_SIDE pixels.
+
+    A reduced value is the mean of the known values in its area, and is known if one of them is.
+    """
     import cv2
 
     height, width = known.shape
@@ -109,18 +123,18 @@ def _reduced(
 
 
 def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> list[tuple[str, str]]:
-    """Terms and their values; `reduced`: width and height of a page's maps that are not the capture's."""
+    """Return terms and values; `reduced` is the width and height of the page's maps if they were reduced."""
     weights, expected = report["weights"], report["expected_under_5"]
     return [
         ("Method", report["method"]),
         *([] if weights is None else [("Weights", weights["name"])]),
         ("Lights", str(report["n_lights"])),
         ("Pixels", f"{report['n_pixels']:,}"),
-        ("Size", _SIZE.join(map(str, report["image_size"]))),
+        ("Size", _TIMES.join(map(str, report["image_size"]))),
         *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels")]),
-        *([] if reduced is None else [("Shown at", _SIZE.join(map(str, reduced)))]),
+        *([] if reduced is None else [("Size on this page", _TIMES.join(map(str, reduced)))]),
         ("Seconds", ", ".join(f"{step} {seconds:g}" for step, seconds in report["seconds"].items())),
-        ("Computed on", f"{report['device']}, {report['precision']}"),
+        ("Device", f"{report['device']}, {report['precision']}"),
     ]
 
 
@@ -138,10 +152,10 @@ def _errors(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _error_colours() -> str:
-    """The error map's colours from 0 to its top, as stops of a CSS gradient."""
+    """Return the colours of the error map, from 0 to TOP_DEG, as stops of a CSS gradient."""
     stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None], TOP_DEG)[0]
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in stops)
 
 
-def _data_url(picture: NDArray[np.uint8]) -> str:
+def _data_url(picture: Picture) -> str:
     return f"data:image/png;base64,{base64.b64encode(encode_png(picture)).decode('ascii')}"

@@ -1,10 +1,10 @@
-"""The HTML pages' templates, in `assets`: each extends base.html, which holds what all pages share."""
+"""The templates of the HTML pages, in `assets`. Every page extends base.html; parts.html has shared parts."""
 
 from __future__ import annotations
 
 
 def render(template: str, **values: object) -> str:
-    """The page of a template of this name, every value escaped; a value that it lacks is a defect."""
+    """Return the page that a template makes of the values. Values are escaped; a missing value is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from splinecli import __version__

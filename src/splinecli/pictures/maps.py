@@ -1,0 +1,41 @@
+"""Pictures of the maps of one capture: albedo, confidence, and a preview of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.normals import unit
+from splinecli.pictures.png import Picture
+from splinecli.transfer import encode_srgb
+
+PREVIEW_LIGHT = (-0.72, 0.48, 0.5)
+"""Light direction of the preview: low, from the upper left, which shows relief best."""
+
+WHITE_QUANTILE = 0.99
+"""White in a picture of an albedo map is this quantile of the pixels' largest channel."""
+
+
+def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> Picture:
+    """Return an albedo map as an sRGB picture (H, W, 3), scaled so that the brightest 1 % of the pixels are white.
+
+    Args:
+        albedo: (H, W, 3), linear.
+        mask: (H, W), not empty; the scale depends on these pixels alone.
+    """
+    white = max(float(np.quantile(albedo[mask].max(axis=1), WHITE_QUANTILE)), 1e-12)
+    return encode_srgb(albedo / white)
+
+
+def confidence_picture(confidence_map: NDArray[np.float32]) -> Picture:
+    """Return a map of probabilities (H, W) as a gray picture (H, W): 0 is black, 1 is white."""
+    return np.rint(255 * confidence_map).astype(np.uint8)
+
+
+def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> Picture:
+    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT.
+
+    It is black outside the mask (H, W).
+    """
+    shading = (normal_map @ unit(np.array(PREVIEW_LIGHT, np.float32))) * mask
+    return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)

@@ -1,0 +1,68 @@
+"""The report that `infer` writes for a capture, report.json."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from splinecli import __version__
+from splinecli.inference import NormalEstimate
+from splinecli.methods import Estimator
+
+
+def report_of(
+    estimate: NormalEstimate,
+    estimator: Estimator,
+    options: Mapping[str, Any],
+    inputs: str,
+    *,
+    read_seconds: float,
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """Return the report of an estimate (docs/infer.md), all but `seconds.write` and `files`, which write_estimate adds.
+
+    Args:
+        estimate: the result.
+        estimator: the method that made it.
+        options: the options of the run, ready for JSON.
+        inputs: a digest that changes when an input file changes.
+        read_seconds: seconds that reading the capture took.
+        warnings: what the user should know about the result.
+    """
+    capture = estimate.capture
+    intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
+    height, width = capture.mask.shape
+    return {
+        "capture": capture.name,
+        "method": estimator.name,
+        "weights": estimator.weights,
+        "n_lights": capture.n_lights,
+        "light_indices": list(capture.light_indices),
+        "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
+        "n_pixels": capture.n_pixels,
+        "image_size": [width, height],
+        "device": estimator.device,
+        "precision": estimator.precision,
+        "seconds": {"read": round(read_seconds, 3), "estimate": round(estimate.seconds, 3)},
+        "peak_memory_mib": peak_memory_mib(),
+        "warnings": list(warnings),
+        "angular_error_deg": None
+        if errors is None
+        else {name: round(value, 4) for name, value in asdict(errors).items()},
+        "expected_under_5": None if expected is None else round(expected, 4),
+        "options": options,
+        "inputs_sha256": inputs,
+        "version": __version__,
+    }
+
+
+def peak_memory_mib() -> int | None:
+    """Return the largest memory that this process has used in MiB, or None if the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))

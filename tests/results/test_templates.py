@@ -1,0 +1,57 @@
+"""The pages share one head, one set of colours and one list of terms, and open without errors in a browser."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+
+import cv2
+import numpy as np
+import pytest
+
+from browser import OpenPage
+from splinecli.evaluation.records import Evaluation, Protocol, Result
+from splinecli.evaluation.report import html_report
+from splinecli.results.index import index_page
+
+ASSETS = resources.files("splinecli") / "assets"
+PAGES = ("index.html", "page.html", "report.html")
+RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_heads_colours_and_lists_are_written_once(name):
+    template = (ASSETS / name).read_text("utf-8")
+    assert template.startswith('{% extends "base.html" %}')
+    for tag in ("meta", "html", "head", "title", "caption", "dl", "dt"):
+        assert f"<{tag}" not in template
+    assert not re.findall(r"(?<![&\w'\"])#[0-9a-f]{3,8}\b", template), "colours belong into base.html"
+
+
+def test_the_index_shows_its_pictures(open_page: OpenPage, tmp_path):
+    """Its security policy lets it load the pictures beside it."""
+    (tmp_path / "a & b").mkdir()
+    cv2.imwrite(str(tmp_path / "a & b/normals.png"), RED)
+    report = {
+        "capture": "a & b", "n_lights": 10, "n_pixels": 48, "angular_error_deg": {"mean": 2.5},
+        "expected_under_5": 0.9, "warnings": [], "seconds": {"read": 1.0}, "files": ["normals.png", "report.json"],
+    }  # fmt: skip
+    page = open_page(index_page([report, {"capture": "x" * 200, "error": "y" * 200}]), width=400)
+    picture = page.locator("img")
+    picture.scroll_into_view_if_needed()
+    shot = cv2.imdecode(np.frombuffer(picture.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert (np.abs(shot.astype(int) - RED[0, 0]).max(axis=2) <= 2).mean() > 0.5
+    assert page.locator("th").all_inner_texts()[:3] == ["capture", "normals", "lights"]
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+
+
+def test_the_report_fits_a_narrow_screen(open_page: OpenPage):
+    png = cv2.imencode(".png", np.repeat(RED, 50, axis=1))[1].tobytes()
+    results = tuple(
+        Result(m, c, 10, (5.0, 5.5, 6.0), 0.1) for m in ("ls", "iw12") for c in ("x" * 60, "y" * 60)
+    )
+    page = open_page(
+        html_report([Evaluation(Protocol(10, 3), results, ())], [("figure", png)], []), width=400
+    )
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+    assert page.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)") == 400
