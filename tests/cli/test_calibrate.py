@@ -1,4 +1,4 @@
-"""`splinecli calibrate`: its files, its words and its refusals, on made-up mirror balls."""
+"""`splinecli calibrate`: its files, messages and errors, on synthetic mirror balls."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def normals():
 
 
 def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
-    """The ball shows each lamp as a soft spot where the normal halves view and light."""
+    """Write images of a ball that shows each lamp as a soft spot, where the normal halves view and light."""
     folder.mkdir()
     n, inside = normals()
     for number, light in enumerate(lights):
@@ -59,13 +59,13 @@ def test_one_ball(run):
     result = run("calibrate", "ball")
     assert (result.code, result.out) == (0, "calibration/light_directions.txt\n")
     assert result.err.startswith("ball: circle 60.")
-    assert "from picture, 100 % of the outline" in result.err
+    assert "from picture, 100 % of the outline visible" in result.err
     assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
     assert cv2.imread("calibration/calibration.png").shape == (222, 800, 3)
     assert not Path("calibration/light_intensities.txt").exists()
 
 
-def test_the_outline_that_is_given(run):
+def test_an_outline_given_by_the_user(run):
     write_balls(Path("ball"))
     result = run("calibrate", "ball", "--circle", "60,48,40", "--json", "-o", "out")
     report = json.loads(result.out)
@@ -100,17 +100,17 @@ def test_the_normals_are_not_the_lights(run):
     np.savetxt("right.txt", LIGHTS)
     result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")
     assert result.code == 0
-    assert "the compared file is 13." in result.err
+    assert "the compared file differs by 13." in result.err
     assert (
-        "warning: The compared light file holds the ball's normals at the highlights, not the lights"
+        "warning: The compared file contains the normals of the ball at the highlights instead of the light"
         in result.err
     )
     result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "right.txt", "--overwrite")
-    assert "degrees off" in result.err
+    assert "the compared file differs by 0." in result.err
     assert "warning" not in result.err
 
 
-def test_balls_that_disagree_and_an_unsure_outline(run):
+def test_balls_that_disagree_and_an_uncertain_outline(run):
     write_balls(Path("one"))
     write_balls(Path("two"), LIGHTS[::-1])
     result = run("calibrate", "one", "two", "--circle", "60,48,40", "--circle", "60,48,40")
@@ -120,7 +120,7 @@ def test_balls_that_disagree_and_an_unsure_outline(run):
     cv2.imwrite("half.png", mask)
     result = run("calibrate", "one", "--mask", "half.png", "-o", "half")
     assert result.code == 0
-    assert "warning: one: the ball's outline is unsure (" in result.err
+    assert "warning: one: the outline of the ball is uncertain (" in result.err
 
 
 def test_refusals(run, golden):
@@ -161,3 +161,32 @@ def test_refusals(run, golden):
         messages.append(result.err.replace(f"{Path.cwd()}/", ""))
     golden("calibrate_refusals.txt", "".join(messages))
     assert not Path("calibration").exists()
+
+
+def test_quiet_prints_nothing(run):
+    write_balls(Path("ball"))
+    result = run("calibrate", "ball", "-q")
+    assert (result.code, result.out, result.err) == (0, "", "")
+    assert Path("calibration/light_directions.txt").exists()
+
+
+def test_intensities_of_earlier_lights_are_removed(run):
+    write_balls(Path("ball"))
+    write_gray(Path("gray"), [1.0, 0.5, 0.75, 1.25])
+    arguments = ["calibrate", "ball", "--circle", "60,48,40", "--overwrite"]
+    assert run(*arguments, "--gray-ball", "gray").code == 0
+    assert Path("calibration/light_intensities.txt").exists()
+    assert run(*arguments).code == 0
+    assert not Path("calibration/light_intensities.txt").exists()
+
+
+def test_a_display_encoded_target_is_reported(run):
+    write_balls(Path("ball"))
+    write_gray(Path("gray"), [1.0, 1.0, 1.0, 1.0])
+    for path in Path("gray").glob("[0-9].png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path.with_suffix(".jpg")), (picture // 257).astype(np.uint8))
+        path.unlink()
+    arguments = ["calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray", "--overwrite"]
+    assert "--transfer srgb reverses the curve" in run(*arguments).err
+    assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err

@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from splinecli.files import write_bytes
-from splinecli.surface.mesh import SurfaceMesh, write_mesh
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splinecli.surface.mesh import SurfaceMesh
 
 SURFACE_FILES = {"ply": "mesh.ply", "obj": "mesh.obj", "npy": "depth.npy", "tiff": "depth.tiff"}
 """The file name of each format."""
@@ -35,6 +38,10 @@ def write_surface(
     Raises:
         OutputError: a file cannot be written.
     """
+    import numpy as np
+
+    from splinecli.surface.mesh import write_mesh
+
     depth = depth.astype(np.float32)
     for name in formats:
         path = folder / SURFACE_FILES[name]

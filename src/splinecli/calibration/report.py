@@ -1,0 +1,145 @@
+"""The report of a calibration: calibration.json, its warnings, and its summary for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.calibration.balls import BallCalibration, CalibratedLights
+from splinecli.normals import angle_between_deg
+
+UNSURE_VISIBLE = 0.6
+"""Smallest visible share of an outline without a warning."""
+
+UNSURE_SPREAD = 0.01
+"""Largest spread of an outline without a warning, as a share of the radius."""
+
+DISAGREEMENT_DEG = 5.0
+"""Largest angle between a ball and the mean of all balls without a warning."""
+
+MISTAKEN_DEG = 3.0
+"""Smallest mean difference at which compared directions are checked for the mistake of mirror_ball.py."""
+
+
+def calibration_report(
+    lights: CalibratedLights,
+    intensities: NDArray[np.float64] | None,
+    known_directions: NDArray[np.float64] | None,
+    *,
+    picture: str,
+) -> dict[str, Any]:
+    """Return the report of a calibration as values for JSON, with its warnings.
+
+    Args:
+        lights: the calibrated directions.
+        intensities: (F, 3), or None where they were not measured.
+        known_directions: (F, 3) unit vectors to compare the result with, or None.
+        picture: the name of the picture to which warnings refer.
+    """
+    single = len(lights.balls) == 1
+    return {
+        "n_lights": len(lights.directions),
+        "balls": [_ball(ball) for ball in lights.balls],
+        "light_directions": _rows(lights.directions),
+        "light_intensities": None if intensities is None else _rows(intensities),
+        "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg, "mean", "largest"),
+        "compared": None
+        if known_directions is None
+        else _mean_and_largest(
+            angle_between_deg(known_directions, lights.directions), "mean_deg", "largest_deg"
+        ),
+        "warnings": [
+            *_outline_warnings(lights, picture),
+            *_disagreement_warnings(lights, picture),
+            *_comparison_warnings(lights, known_directions),
+        ],
+    }
+
+
+def summary_lines(report: dict[str, Any]) -> list[str]:
+    """Return the lines of a report for people: the outlines, and how well balls and compared lights agree."""
+    lines = []
+    for ball in report["balls"]:
+        circle = ball["circle"]
+        lines.append(
+            f"{ball['folder']}: circle {circle['x']:.1f}, {circle['y']:.1f}, radius {circle['radius']:.1f} pixels"
+            f" (from {circle['from']}, {100 * circle['seen']:.0f} % of the outline visible,"
+            f" spread {circle['spread']:.1f} pixels)"
+        )
+    if report["disagreement_deg"]:
+        angles = report["disagreement_deg"]
+        lines.append(
+            f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
+        )
+    if report["compared"]:
+        angles = report["compared"]
+        lines.append(
+            f"the compared file differs by {angles['mean_deg']:.1f} degrees on average,"
+            f" at most {angles['largest_deg']:.1f}"
+        )
+    return lines
+
+
+def _ball(ball: BallCalibration) -> dict[str, Any]:
+    circle = ball.circle
+    return {
+        "folder": str(ball.files.folder),
+        "circle": {
+            "x": _round(circle.x),
+            "y": _round(circle.y),
+            "radius": _round(circle.radius),
+            "from": ball.circle_from,
+            "seen": _round(circle.visible),
+            "spread": _round(circle.spread),
+        },
+        "highlights": [[_round(highlight.x), _round(highlight.y)] for highlight in ball.highlights],
+        "saturated": [_round(highlight.saturated) for highlight in ball.highlights],
+    }
+
+
+def _outline_warnings(lights: CalibratedLights, picture: str) -> list[str]:
+    return [
+        f"{ball.files.folder}: the outline of the ball is uncertain ({100 * ball.circle.visible:.0f} % of it visible,"
+        f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green circle is wrong, give --mask or"
+        " --circle."
+        for ball in lights.balls
+        if ball.circle.visible < UNSURE_VISIBLE or ball.circle.spread > UNSURE_SPREAD * ball.circle.radius
+    ]
+
+
+def _disagreement_warnings(lights: CalibratedLights, picture: str) -> list[str]:
+    worst = int(lights.disagreement_deg.argmax())
+    largest = lights.disagreement_deg[worst]
+    if largest <= DISAGREEMENT_DEG:
+        return []
+    return [
+        f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1} (counted from 1)."
+        f" Check {picture}."
+    ]
+
+
+def _comparison_warnings(lights: CalibratedLights, known: NDArray[np.float64] | None) -> list[str]:
+    if known is None:
+        return []
+    difference = angle_between_deg(known, lights.directions).mean()
+    from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
+    if difference <= MISTAKEN_DEG or from_normals >= difference / 3:
+        return []
+    return [
+        "The compared file contains the normals of the ball at the highlights instead of the light directions: each"
+        " lies half-way between the view and the light. Use the file written here."
+    ]
+
+
+def _mean_and_largest(angles: NDArray[np.float64], mean: str, largest: str) -> dict[str, float]:
+    return {mean: _round(angles.mean()), largest: _round(angles.max())}
+
+
+def _rows(values: NDArray[np.float64]) -> list[list[float]]:
+    return [[_round(value, 6) for value in row] for row in values]
+
+
+def _round(value: float, digits: int = 3) -> float:
+    return round(float(value), digits)

@@ -1,0 +1,162 @@
+"""What `calibrate` does: images of balls and of a gray target in, light files and a report out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splinecli.errors import UsageError
+from splinecli.pipeline.observer import SILENT, Observer
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splinecli.calibration.balls import BallCalibration, BallFiles, CalibratedLights
+    from splinecli.calibration.circle import Circle
+    from splinecli.calibration.gray import Target
+
+DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
+PICTURE, REPORT = "calibration.png", "calibration.json"
+OUTPUT_FILES = (DIRECTIONS, INTENSITIES, PICTURE, REPORT)
+
+DISPLAY_ENCODED = (
+    "The images of the gray target look display-encoded (JPEG, or PNG that says so), but they are read as linear"
+    " images. --transfer srgb reverses the curve of sRGB."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """Which images `calibrate` reads, and where it writes.
+
+    Args:
+        balls: a folder of images of a mirror ball each.
+        circles: the outline of each ball, or empty.
+        masks: a mask of each ball, or empty.
+        gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
+        transfer: the curve of the gray target's images: linear, srgb or gamma:G.
+        compare: a text file of light directions to compare the result with.
+        output: the folder of the results.
+        overwrite: replace earlier results.
+
+    Raises:
+        UsageError: two options contradict each other, or a value is unknown.
+    """
+
+    balls: tuple[Path, ...]
+    circles: tuple[Circle, ...] = ()
+    masks: tuple[Path, ...] = ()
+    gray_ball: Path | None = None
+    gray_card: Path | None = None
+    transfer: str = "linear"
+    compare: Path | None = None
+    output: Path = Path("calibration")
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.gamma != 1 and not (self.gray_ball or self.gray_card):
+            raise UsageError(
+                "--transfer needs --gray-ball or --gray-card",
+                hint="Leave it out: mirror balls give the same directions for any curve",
+            )
+        if self.gray_ball and self.gray_card:
+            raise UsageError("--gray-ball and --gray-card exclude each other")
+        for option, values in (("--circle", self.circles), ("--mask", self.masks)):
+            if values and len(values) != len(self.balls):
+                times = "once" if len(values) == 1 else f"{len(values)} times"
+                raise UsageError(
+                    f"{option} is given {times} for {len(self.balls)} balls",
+                    hint="Give it once for each ball, in the same order",
+                )
+
+    @property
+    def gamma(self) -> float | None:
+        """The transfer curve of the gray target's images, as in RadiometricCalibration."""
+        from splinecli.transfer import parse_transfer
+
+        return parse_transfer(self.transfer)
+
+
+def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
+    """Calibrate the lights, write OUTPUT_FILES and return the report.
+
+    Raises:
+        InputError: an image or file cannot be used, or the numbers of images and lights differ.
+        OutputError: the results exist and `overwrite` is not set, or they cannot be written.
+    """
+    from splinecli.calibration.balls import combine_balls, find_ball_files
+    from splinecli.calibration.report import calibration_report, summary_lines
+    from splinecli.capture.lights.light_files import read_light_directions
+    from splinecli.files import check_free
+
+    check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
+    target = options.gray_ball or options.gray_card
+    # A wrong path must not come to light after all images are read.
+    target_files = None if target is None else find_ball_files(target)
+    balls = [
+        find_ball_files(folder, mask=mask)
+        for folder, mask in zip(options.balls, options.masks or [None] * len(options.balls), strict=True)
+    ]
+    known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
+    circles = options.circles or [None] * len(balls)
+    lights = combine_balls(_calibrate_balls(balls, circles, observer))
+    intensities = None
+    if target_files is not None:
+        from splinecli.calibration.gray import measure_light_intensities
+
+        kind: Target = "ball" if options.gray_ball is not None else "card"
+        intensities = measure_light_intensities(target_files, lights.directions, kind, gamma=options.gamma)
+    report = calibration_report(lights, intensities, known, picture=PICTURE)
+    if options.gamma == 1 and target_files is not None and _looks_display_encoded(target_files):
+        report["warnings"].append(DISPLAY_ENCODED)
+    _write(options.output, lights, intensities, report)
+    for line in summary_lines(report):
+        observer.say(line)
+    for warning in report["warnings"]:
+        observer.warn(warning)
+    return report
+
+
+def _calibrate_balls(
+    balls: Sequence[BallFiles], circles: Sequence[Circle | None], observer: Observer
+) -> list[BallCalibration]:
+    from splinecli.calibration.balls import calibrate_ball
+
+    with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
+        return [
+            calibrate_ball(ball, circle=circle, progress=lambda: advance(1))
+            for ball, circle in zip(balls, circles, strict=True)
+        ]
+
+
+def _looks_display_encoded(files: BallFiles) -> bool:
+    from splinecli.capture.formats.header import is_display_encoded
+
+    return any(is_display_encoded(image) for image in files.images)
+
+
+def _write(
+    folder: Path,
+    lights: CalibratedLights,
+    intensities: NDArray[np.float64] | None,
+    report: dict[str, Any],
+) -> None:
+    from splinecli.files import write_bytes, write_text
+    from splinecli.pictures.calibration import calibration_picture
+    from splinecli.results.files import encode_png
+
+    write_text(folder / DIRECTIONS, _text(lights.directions))
+    if intensities is None:
+        (folder / INTENSITIES).unlink(missing_ok=True)  # it would belong to earlier lights
+    else:
+        write_text(folder / INTENSITIES, _text(intensities))
+    write_bytes(folder / PICTURE, encode_png(calibration_picture(lights.balls)))
+    write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
+
+
+def _text(values: NDArray[np.float64]) -> str:
+    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)

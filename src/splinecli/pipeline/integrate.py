@@ -1,0 +1,219 @@
+"""What `integrate` does: a normal map in, a depth map, meshes and a report out."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splinecli.errors import InputError, UsageError
+from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, write_surface
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splinecli.normals import Convention
+    from splinecli.surface.mesh import SurfaceMesh
+
+INPUT_FORMATS = ("npy", "tiff", "png", "png8")
+"""The formats in which `integrate` looks for a normal map in a folder, exact ones first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntegrateOptions:
+    """Which normal map `integrate` reads, how it integrates it, and what it writes.
+
+    Args:
+        normals: a normal map, or a folder that `infer` wrote.
+        output: the folder of the results. None for the folder of the normal map.
+        mask: a mask image. None takes all pixels that have a normal.
+        camera_matrix: a text file of 3 x 3 numbers, for a perspective camera. None for an orthographic camera.
+        stiffness: how easily the surface tears at edges. 0 never tears it.
+        largest_step: leaves out triangles that are higher, in pixels. None keeps all.
+        colours: an image that gives the colours of the vertices.
+        formats: keys of `splinecli.surface.surface_files.SURFACE_FILES`.
+        convention: direction of the green channel of normal maps that are images.
+        overwrite: replace earlier results.
+
+    Raises:
+        UsageError: a format is unknown.
+    """
+
+    normals: Path
+    output: Path | None = None
+    mask: Path | None = None
+    camera_matrix: Path | None = None
+    stiffness: float = 2.0
+    largest_step: float | None = None
+    colours: Path | None = None
+    formats: tuple[str, ...] = DEFAULT_FORMATS
+    convention: Convention = "opengl"
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.formats:
+            if name not in SURFACE_FILES:
+                raise UsageError(f"no format named {name!r}; expected one of {', '.join(SURFACE_FILES)}")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the results."""
+        return self.output or (self.normals if self.normals.is_dir() else self.normals.parent)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The names of the files that are written."""
+        return (*(SURFACE_FILES[name] for name in self.formats), SURFACE_REPORT)
+
+
+def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
+    """Integrate a normal map, write the surface and its report, and return the report.
+
+    Raises:
+        InputError: a file cannot be read, or the files do not fit together.
+        OutputError: the results exist and `overwrite` is not set, or they cannot be written.
+        UsageError: the stiffness or the largest step is negative.
+    """
+    import numpy as np
+
+    from splinecli.files import check_free, write_text
+    from splinecli.surface.integration import integrate_normals
+    from splinecli.surface.mesh import surface_mesh
+
+    check_free(options.folder, options.files, overwrite=options.overwrite)
+    normal_map = _read_normal_map(options)
+    mask = np.asarray(normal_map.any(axis=2))
+    camera_matrix = None if options.camera_matrix is None else _read_camera_matrix(options.camera_matrix)
+    colours = None if options.colours is None else _read_colours(options.colours, mask.shape)
+    started = time.perf_counter()
+    with observer.progress("integrating", 1.0) as advance:
+        depth = integrate_normals(
+            normal_map,
+            mask,
+            camera_matrix,
+            stiffness=options.stiffness,
+            progress=_share_of_iterations(advance),
+        )
+    mesh = surface_mesh(depth, mask, camera_matrix, colours, largest_step=options.largest_step)
+    report = _report(options, depth, mesh, perspective=camera_matrix is not None)
+    report["seconds"] = round(time.perf_counter() - started, 3)
+    report["files"] = list(options.files)
+    write_surface(options.folder, depth, mesh, options.formats)
+    write_text(options.folder / SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
+    return report
+
+
+def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
+    """Return the line that tells people what was written."""
+    unit = "pixels" if report["camera"] == "orthographic" else "times the mean depth"
+    low, high = report["range"]
+    return (
+        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit},"
+        f" {report['seconds']:.1f} s"
+    )
+
+
+def _report(
+    options: IntegrateOptions, depth: NDArray[np.float64], mesh: SurfaceMesh, *, perspective: bool
+) -> dict[str, Any]:
+    import numpy as np
+
+    return {
+        "normals": str(options.normals),
+        "camera": "perspective" if perspective else "orthographic",
+        "n_pixels": len(mesh.vertices),
+        "image_size": [depth.shape[1], depth.shape[0]],
+        "range": [round(float(np.nanmin(depth)), 4), round(float(np.nanmax(depth)), 4)],
+        "n_triangles": len(mesh.triangles),
+        "stiffness": options.stiffness,
+    }
+
+
+def _share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
+    """Return the progress function of integrate_normals that moves `advance` from 0 to 1.
+
+    Integration usually converges long before the largest number of iterations, so the share grows fast at first.
+    """
+    shown = 0.0
+
+    def progress(iteration: int, max_iterations: int) -> None:
+        nonlocal shown
+        share = 1 - 0.5 ** (8 * iteration / max_iterations)
+        advance(share - shown)
+        shown = share
+
+    return progress
+
+
+def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
+    """Return the normal map (H, W, 3), y up, zero outside the mask."""
+    from splinecli.capture import read_mask, read_normal_map
+
+    mask = None if options.mask is None else read_mask(options.mask)
+    is_folder = options.normals.is_dir()
+    path = _find_normal_map(options.normals) if is_folder else options.normals
+    normal_map = read_normal_map(path, mask)
+    if options.convention == "directx" or (is_folder and _was_written_as_directx(path)):
+        normal_map[..., 1] *= -1
+    return normal_map
+
+
+def _find_normal_map(folder: Path) -> Path:
+    from splinecli.results.files import NORMALS
+
+    names = [NORMALS[name] for name in INPUT_FORMATS]
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    raise InputError(
+        f"the folder has no normal map ({', '.join(names)})",
+        path=folder,
+        hint="Give a folder that 'splinecli infer' wrote",
+    )
+
+
+def _was_written_as_directx(path: Path) -> bool:
+    """Return whether the report beside an image of `infer` says that green points down."""
+    from splinecli.results.files import REPORT
+
+    try:
+        report = json.loads((path.parent / REPORT).read_text("utf-8"))
+        return path.suffix == ".png" and report["options"]["convention"] == "directx"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return the image at `path` as (H, W, 3) uint8 RGB."""
+    import numpy as np
+
+    from splinecli.capture import read_image
+
+    image = read_image(path)
+    if image.shape[:2] != shape:
+        raise InputError(
+            f"found an image of {image.shape[1]} x {image.shape[0]} pixels,"
+            f" expected {shape[1]} x {shape[0]} as the normal map",
+            path=path,
+        )
+    rgb = np.broadcast_to(image, (*shape, 3))
+    colours: NDArray[np.uint8] = np.rint(255 * rgb.clip(0, 1)).astype(np.uint8)
+    return colours
+
+
+def _read_camera_matrix(path: Path) -> NDArray[np.float64]:
+    from splinecli.capture.formats.text import read_number_rows
+
+    matrix = read_number_rows(path).as_array()
+    if matrix.shape != (3, 3):
+        raise InputError(
+            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
+            path=path,
+            hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
+        )
+    return matrix
