@@ -146,6 +146,15 @@ def test_exit_codes():
         assert word in codes[str(error.exit_code)]
 
 
+def test_fields_of_the_report():
+    """The table of report.json names each of its fields, and no other."""
+    golden = text_of("tests/golden/report_ls.json")
+    fields = set(re.findall(r'^  "(\w+)":', golden, re.MULTILINE))
+    _, _, section = text_of("docs/infer.md").partition("## The report")
+    cells = re.findall(r"^\| (`[^|]*`) \|", section.partition("\n## ")[0], re.MULTILINE)
+    assert {name for cell in cells for name in re.findall(r"`(\w+)`", cell)} == fields
+
+
 def test_rooms_of_the_contributing_page():
     """The table has the rooms of tests/test_imports.py in their order."""
     cells = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", text_of("CONTRIBUTING.md"), re.MULTILINE)
