@@ -23,13 +23,14 @@ from splinecli.capture.lights.draws import (
     read_draws,
 )
 from splinecli.capture.record import MIN_LIGHTS
+from splinecli.capture.stamp import stamp_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.quirks import describe_quirks
 from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.scored_pixels import keep_scored_pixels
 from splinecli.evaluation.statistics import AVERAGE
-from splinecli.evaluation.trials import Score, Trial, TrialStore, plan_trials, stamp_files
+from splinecli.evaluation.trials import Score, Trial, TrialStore, plan_trials
 from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 
@@ -149,12 +150,12 @@ class _CaptureJob:
         """None where no protocol can score the capture; its reasons are with the tasks."""
         try:
             source = open_capture(folder)
+            stamp = stamp_capture(source)
         except (InputError, UsageError) as error:
             for task in tasks:
                 task.fail(name, error)
             return None
         job = cls(name, source, [], [])
-        stamps = stamp_files(source.files)
         for task in tasks:
             try:
                 draws = _draws_for(source, name, task.protocol, task.draws_file)
@@ -162,7 +163,7 @@ class _CaptureJob:
                 task.fail(name, error)
                 continue
             job.tasks.append(task)
-            by_method = [plan_trials(name, stamps, e, draws, task.protocol) for e in estimators]
+            by_method = [plan_trials(name, stamp, e, draws, task.protocol) for e in estimators]
             for estimator, trials in zip(estimators, by_method, strict=True):
                 task.trials[name, estimator.name] = trials
             # Trial by trial, not method by method: the time left can then be told from the time gone.

@@ -10,10 +10,10 @@ from threading import Lock
 from typing import Any
 
 from splinecli import __version__
-from splinecli.capture import CaptureFiles
 from splinecli.capture.lights.draws import Draw
+from splinecli.capture.stamp import digest
 from splinecli.evaluation.records import Protocol
-from splinecli.files import file_sha256, refusals_as_output_errors
+from splinecli.files import refusals_as_output_errors
 from splinecli.methods import Estimator
 
 
@@ -101,25 +101,11 @@ class TrialStore:
             self._break_first = False
 
 
-def stamp_files(files: CaptureFiles) -> list[Any]:
-    """What changes when a file of the capture does; images by place, size and time alone, the others by content."""
-    named = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
-    contents = [file_sha256(path) for path in (*files.boundaries, *named) if path is not None]
-    return [contents, [place_size_and_time(path) for path in files.images]]
-
-
-def place_size_and_time(path: Path) -> tuple[str, int, int]:
-    """The stamp of a file that is too large to be read for it."""
-    found = path.stat()
-    return str(path.resolve()), found.st_size, found.st_mtime_ns
-
-
 def plan_trials(
-    capture: str, file_stamps: list[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
+    capture: str, stamp: list[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
 ) -> list[Trial]:
-    """The trials of one method on one capture, whose files stamp_files has stamped."""
-    values = [__version__, estimator.fingerprint, *file_stamps]
-    made_of = hashlib.sha256(json.dumps(values).encode()).hexdigest()
+    """The trials of one method on one capture, whose files stamp_capture has stamped."""
+    made_of = digest([__version__, estimator.fingerprint, *stamp])
     return [
         Trial(
             capture, estimator.name, number, draw, protocol.light_noise_deg, protocol.seed,

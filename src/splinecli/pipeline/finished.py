@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -61,13 +60,11 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
 
 def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
     """Return a digest that changes when any file that is read for the capture changes."""
-    from splinecli.evaluation.trials import place_size_and_time, stamp_files
+    from splinecli.capture.stamp import digest, stamp_capture
     from splinecli.files import file_sha256
 
-    flats = [place_size_and_time(path) for path in source.radiometry.flat_field]
     own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
-    stamps = [*stamp_files(source.files), flats, own_weights]
-    return hashlib.sha256(json.dumps(stamps).encode()).hexdigest()
+    return digest([*stamp_capture(source), own_weights])
 
 
 def _differences(earlier: InferOptions, options: InferOptions) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -13,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture import CaptureFiles, capture_name, open_capture
+from splinecli.capture import capture_name, open_capture
+from splinecli.capture.stamp import digest, stamp_capture
 from splinecli.errors import InputError
 from splinecli.files import file_sha256
 from splinecli.pixel_sets.store import Pixels, PixelSetWriter
@@ -51,14 +50,6 @@ def _number(name: str, is_taken: Callable[[str], bool]) -> str:
     return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
 
 
-def _fingerprint(files: CaptureFiles) -> str:
-    """Changes when a file of the capture does: its name, size or time."""
-    named = (files.light_directions, files.light_intensities, files.mask, files.ground_truth)
-    paths = [*files.images, *files.boundaries, *(path for path in named if path is not None)]
-    states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
-    return hashlib.sha256(json.dumps(states).encode()).hexdigest()
-
-
 def add_capture(writer: PixelSetWriter, name: str, folder: Path) -> None:
     """Read a capture and write its pixels with ground truth, unless they are there.
 
@@ -70,7 +61,7 @@ def add_capture(writer: PixelSetWriter, name: str, folder: Path) -> None:
         OutputError: the entry cannot be written, or is there from other files.
     """
     source = open_capture(folder)
-    recipe = {"source": str(folder.resolve()), "files": _fingerprint(source.files)}
+    recipe = {"source": str(folder.resolve()), "files": digest(stamp_capture(source))}
     if writer.holds(name, recipe):
         return
     if source.files.ground_truth is None:

@@ -1,0 +1,54 @@
+"""Stamps: values that change when a file of a capture changes, so that earlier results are known to be out of date."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from splinecli.capture.reader import CaptureSource
+from splinecli.errors import InputError
+from splinecli.files import file_sha256
+
+
+def stamp_capture(source: CaptureSource) -> list[Any]:
+    """Return JSON values that change when any file read for the capture does.
+
+    Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
+    files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    files = source.files
+    small = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
+    return [
+        [_sha256(path) for path in (*files.boundaries, *small) if path is not None],
+        [_path_size_and_time(path) for path in files.images],
+        [_path_size_and_time(path) for path in source.radiometry.flat_field],
+    ]
+
+
+def digest(stamp: list[Any]) -> str:
+    """Return the SHA-256 of a stamp, or of any JSON values, in hexadecimal digits."""
+    return hashlib.sha256(json.dumps(stamp).encode()).hexdigest()
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return file_sha256(path)
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
+def _path_size_and_time(path: Path) -> tuple[str, int, int]:
+    try:
+        status = path.stat()
+        return str(path.resolve()), status.st_size, status.st_mtime_ns
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> InputError:
+    return InputError(f"the file cannot be read ({error.strerror})", path=path)

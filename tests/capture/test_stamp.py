@@ -1,0 +1,89 @@
+"""Stamps change with every file of a capture, and only then."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import RadiometricCalibration, open_capture
+from splinecli.capture.stamp import digest, stamp_capture
+from splinecli.errors import InputError
+from splinecli.pixel_sets.preparation import add_capture
+from splinecli.pixel_sets.store import PixelSetWriter
+
+WriteImage = Callable[..., Path]
+
+OTHERS = ("light_directions.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, write_image: WriteImage) -> Path:
+    """A capture with every kind of file."""
+    for number in range(3):
+        write_image(f"vase/{number}.png", np.full((4, 5), 1000 * number + 500, np.uint16))
+    write_image("vase/mask.png", np.full((4, 5), 255, np.uint8))
+    write_image("vase/ambient.png", np.full((4, 5), 100, np.uint16))
+    write_image("flat.png", np.full((4, 5), 60_000, np.uint16))
+    np.savetxt(tmp_path / "vase/light_directions.txt", [[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+    np.savetxt(tmp_path / "vase/light_intensities.txt", np.ones((3, 3)))
+    normals: NDArray[np.float32] = np.zeros((4, 5, 3), np.float32)
+    normals[..., 2] = 1
+    np.save(tmp_path / "vase/normals_gt.npy", normals)
+    return tmp_path / "vase"
+
+
+def stamp(folder: Path) -> str:
+    flat = RadiometricCalibration(flat_field=(folder.parent / "flat.png",))
+    return digest(stamp_capture(open_capture(folder, radiometry=flat)))
+
+
+@pytest.mark.parametrize("name", ["1.png", "../flat.png"])
+def test_images_are_stamped_by_their_time(folder: Path, name: str) -> None:
+    before = stamp(folder)
+    assert stamp(folder) == before
+    os.utime(folder / name, ns=(1, 1))
+    assert stamp(folder) != before
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_files_are_stamped_by_their_content(folder: Path, name: str, write_image: WriteImage) -> None:
+    before = stamp(folder)
+    content = (folder / name).read_bytes()
+    os.utime(folder / name, ns=(1, 1))
+    assert stamp(folder) == before
+    if name.endswith(".png"):
+        write_image(f"vase/{name}", np.full((4, 5), 7, np.uint16))
+    elif name.endswith(".txt"):
+        (folder / name).write_bytes(content + b"# a comment\n")
+    else:
+        (folder / name).write_bytes(content + b" ")
+    assert stamp(folder) != before
+
+
+def test_a_new_ambient_image_replaces_the_pixels_that_prepare_kept(
+    folder: Path, tmp_path: Path, write_image: WriteImage
+) -> None:
+    """`prepare` compares the recipe of an entry with the capture's, and the recipe holds the stamp."""
+
+    def recipe() -> dict[str, object]:
+        writer = PixelSetWriter(tmp_path / f"set{len(list(tmp_path.glob('set*')))}")
+        add_capture(writer, "vase", folder)
+        return writer.recipe_of("vase")
+
+    before = recipe()
+    assert recipe() == before
+    write_image("vase/ambient.png", np.full((4, 5), 200, np.uint16))
+    assert recipe() != before
+
+
+@pytest.mark.parametrize("name", ["mask.png", "1.png"])
+def test_a_file_that_is_gone_is_named(folder: Path, name: str) -> None:
+    source = open_capture(folder)
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: the file cannot be read"):
+        stamp_capture(source)
