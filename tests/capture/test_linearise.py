@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.capture import RadiometricCalibration, open_capture, read_capture
-from splinecli.capture.linearise import is_display_encoded
+from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
+from splinecli.capture.formats.header import is_display_encoded
 from splinecli.errors import InputError
 from splinecli.results.albedo import albedo_map
 
@@ -44,6 +44,10 @@ def write(path: Path, image: NDArray[Any]) -> Path:
 def srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     """The published curve, IEC 61966-2-1."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def codes(warnings: Iterable[CaptureWarning]) -> list[str]:
+    return [warning.code for warning in warnings]
 
 
 def observed(folder: Path, **settings: Any) -> NDArray[np.float32]:
@@ -77,7 +81,7 @@ def test_ambient_light_is_taken_off(
     settings = {} if found else {"ambient": path}
     capture = open_capture(folder, radiometry=RadiometricCalibration(gamma, **settings)).read()
     np.testing.assert_allclose(capture.observations, expected(light), atol=6e-5)
-    assert ("The light of Ambient.png was taken off all images." in capture.warnings) == found
+    assert ("ambient_subtracted" in codes(capture.warnings)) == found
 
 
 def test_what_is_darker_than_the_ambient_light_is_black(tmp_path: Path, light: NDArray[np.float64]) -> None:
@@ -153,8 +157,8 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
         path.write_bytes(content)
         assert is_display_encoded(path) == encoded, name
     folder = store(tmp_path / "capture", light)
-    assert not any("display-encoded" in warning for warning in read_capture(folder).warnings)
+    assert "display_encoded" not in codes(read_capture(folder).warnings)
     (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))
-    assert any("display-encoded" in warning for warning in read_capture(folder).warnings)
-    told = open_capture(folder, radiometry=RadiometricCalibration(None)).warnings
-    assert not any("display-encoded" in warning for warning in told)
+    assert "display_encoded" in codes(read_capture(folder).warnings)
+    srgb_source = open_capture(folder, radiometry=RadiometricCalibration(None))
+    assert "display_encoded" not in codes(srgb_source.warnings)

@@ -36,7 +36,9 @@ def test_the_same_as_json(run, capture):
     assert report["exposure"]["saturated"] == 0
     # 60000 of 65535 under the light from the camera, at the top of the sphere.
     assert report["exposure"]["bright"][1] == pytest.approx(60_000 / 65_535, abs=0.01)
-    assert report["warnings"] == ["All lights stand within 30 degrees of the camera; lower ones tell more."]
+    assert report["warnings"] == [
+        "All lights are within 30 degrees of the camera's direction; lower lights give better normals."
+    ]
 
 
 def test_the_plot_of_the_lights(run, capture, tmp_path):
@@ -54,14 +56,14 @@ def test_warnings(run, capture):
     cv2.imwrite(str(photographs[2]), stored // 30)
     warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
     assert warnings[:3] == [
-        "There are images of 8 bits; 16-bit linear images give better normals.",
-        "Images saturated in more than 1 % of the pixels: 1, most image2.png (100.0 %);"
+        "The images have 8 bits; 16-bit linear images give better normals.",
+        "Images saturated in more than 1 % of the pixels: 1, most of all image2.png (100.0 %);"
         " a shorter exposure gives better normals.",
         "Images that use less than 5 % of the range: 1, such as image3.png; a longer exposure gives less noise.",
     ]
     cv2.imwrite(str(photographs[3]), stored[:20])
     warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
-    assert "The images have 2 different sizes; they have to be equal." in warnings
+    assert "The images have 2 different sizes; all images need the same size." in warnings
 
 
 def test_no_capture(run, tmp_path):

@@ -1,19 +1,24 @@
 """Captures: photographs of one object under known lights, read from folders of files."""
 
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.images import read_image, read_mask
 from splinecli.capture.formats.normal_files import read_normal_map, read_normals
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.layouts.registry import capture_name, find_capture_files, find_captures
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.linearise import RadiometricCalibration
-from splinecli.capture.reader import CaptureSource, open_capture, read_capture
+from splinecli.capture.reader import open_capture, read_capture
 from splinecli.capture.record import Capture
+from splinecli.capture.restore.white_level import WhiteLevel
+from splinecli.capture.source import CaptureSource
 
 __all__ = [
     "Capture",
     "CaptureFiles",
     "CaptureSource",
+    "CaptureWarning",
     "RadiometricCalibration",
+    "WhiteLevel",
     "capture_name",
     "find_capture_files",
     "find_captures",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.image_size import check_size
 from splinecli.capture.formats.images import to_linear
 from splinecli.errors import InputError
 from splinecli.transfer import decode_transfer
@@ -73,29 +74,5 @@ class Lineariser:
 
     def _linear(self, path: Path) -> NDArray[np.float32]:
         stored = decode_image(path)
-        if stored.shape[:2] != self.mask.shape:
-            raise InputError(
-                f"found an image of {stored.shape[1]} x {stored.shape[0]} pixels,"
-                f" expected {self.mask.shape[1]} x {self.mask.shape[0]} as the others",
-                path=path,
-            )
+        check_size(stored.shape, self.mask.shape, path, like="the others")
         return decode_transfer(to_linear(stored[self.mask], path), self.radiometry.gamma)
-
-
-def is_display_encoded(path: Path) -> bool:
-    """Whether the file itself says that its values are meant for a screen: JPEG, or PNG with a chunk sRGB or gAMA."""
-    with path.open("rb") as file:
-        start = file.read(8)
-        if start.startswith(b"\xff\xd8\xff"):
-            return True
-        if start != b"\x89PNG\r\n\x1a\n":
-            return False
-        while len(header := file.read(8)) == 8 and header[4:] not in (b"IDAT", b"IEND"):
-            length = int.from_bytes(header[:4], "big")
-            if header[4:] == b"sRGB":
-                return True
-            if header[4:] == b"gAMA":
-                # 100000 times the exponent of the encoding: 1 means linear.
-                return int.from_bytes(file.read(4), "big") != 100_000
-            file.seek(length + 4, 1)
-    return False

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
 
 MIN_LIGHTS = 3
@@ -35,9 +37,13 @@ class Capture:
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
         ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
-        warnings: sentences a user should read.
+        warnings: what a user should read.
         estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
             intensities and the images show that they differ; else None.
+        restored: (P, F) bool, true where an observation was saturated and an estimate stands in its place; None
+            where no observation was restored.
+        white_level: the stored value from which observations counted as saturated; None for floating-point images
+            and for captures that are not read from images.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
@@ -50,8 +56,10 @@ class Capture:
     light_indices: tuple[int, ...]
     mask: NDArray[np.bool_]
     ground_truth: NDArray[np.float32] | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[CaptureWarning, ...] = ()
     estimated_intensities: NDArray[np.float64] | None = None
+    restored: NDArray[np.bool_] | None = None
+    white_level: WhiteLevel | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -64,6 +72,8 @@ class Capture:
             object.__setattr__(
                 self, "estimated_intensities", np.asarray(self.estimated_intensities, np.float64)
             )
+        if self.restored is not None:
+            object.__setattr__(self, "restored", np.asarray(self.restored, np.bool_))
         self._check_lights()
         self._check_observations()
         if self.ground_truth is not None:
@@ -97,6 +107,23 @@ class Capture:
             estimated_intensities=None
             if self.estimated_intensities is None
             else self.estimated_intensities[chosen],
+            restored=None if self.restored is None else self.restored[:, chosen],
+        )
+
+    def choose_pixels(self, positions: NDArray[np.integer]) -> Capture:
+        """Return the same capture with some of its pixels, in rising order.
+
+        Args:
+            positions: rising zero-based positions among this record's pixels.
+        """
+        mask = np.zeros_like(self.mask)
+        # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
+        mask.flat[np.flatnonzero(self.mask)[positions]] = True
+        return replace(
+            self,
+            observations=self.observations[positions],
+            mask=mask,
+            restored=None if self.restored is None else self.restored[positions],
         )
 
     def _check_lights(self) -> None:
@@ -143,6 +170,10 @@ class Capture:
             raise InputError(
                 f"{self.name}: observations of shape {self.observations.shape},"
                 f" expected (pixels, lights) = {expected}"
+            )
+        if self.restored is not None and self.restored.shape != expected:
+            raise InputError(
+                f"{self.name}: restored flags of shape {self.restored.shape}, expected (pixels, lights) = {expected}"
             )
         if not all(np.isfinite(block).all() for block in _blocks(self.observations)):
             raise InputError(f"{self.name}: an observation is not finite")

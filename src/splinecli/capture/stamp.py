@@ -7,13 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from splinecli.capture.reader import CaptureSource
+from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 from splinecli.files import file_sha256
 
 
 def stamp_capture(source: CaptureSource) -> list[Any]:
-    """Return JSON values that change when any file read for the capture does.
+    """Return JSON values that change when any file read for the capture, or the given white level, does.
 
     Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
@@ -23,11 +23,13 @@ def stamp_capture(source: CaptureSource) -> list[Any]:
     """
     files = source.files
     small = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
-    return [
+    stamp: list[Any] = [
         [_sha256(path) for path in (*files.boundaries, *small) if path is not None],
         [_path_size_and_time(path) for path in files.images],
         [_path_size_and_time(path) for path in source.radiometry.flat_field],
     ]
+    # Left out where it is not given, so that earlier stamps stay valid.
+    return stamp if source.white_level is None else [*stamp, source.white_level]
 
 
 def digest(stamp: list[Any]) -> str:

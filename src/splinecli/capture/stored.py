@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import capture_warnings
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
@@ -23,12 +24,12 @@ class StoredCapture:
     Args:
         capture: the stored observations, linear, divided by the light intensities that the files give.
         saturated: (P, F) bool, or None where no observation is saturated.
-        knows_intensities: whether a file, an option or the image format gives the light intensities.
+        intensities_known: whether a file, an option or the image format gives the light intensities.
     """
 
     capture: Capture
     saturated: NDArray[np.bool_] | None
-    knows_intensities: bool
+    intensities_known: bool
 
     def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
         """Return the capture under some of its lights, with arrays of its own; see Capture.choose_lights."""
@@ -42,17 +43,12 @@ class StoredCapture:
         Args:
             rows: rows of the observations, in rising order.
         """
-        capture = self.capture
-        mask = np.zeros_like(capture.mask)
-        # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
-        mask.flat[np.flatnonzero(capture.mask)[rows]] = True
         saturated = None if self.saturated is None else self.saturated[rows]
-        chosen = replace(capture, observations=capture.observations[rows], mask=mask)
-        return replace(self, capture=chosen, saturated=saturated)
+        return replace(self, capture=self.capture.choose_pixels(rows), saturated=saturated)
 
     def estimate_intensities(self) -> NDArray[np.float64] | None:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
-        if self.knows_intensities:
+        if self.intensities_known:
             return None
         return estimate_light_intensities(
             self.capture.observations, self.saturated, self.capture.light_directions
@@ -66,20 +62,12 @@ class StoredCapture:
         Args:
             intensities: what estimate_intensities returns.
         """
-        observations, warnings = self.capture.observations, self.capture.warnings
+        observations, warnings, restored = self.capture.observations, self.capture.warnings, None
         if intensities is not None:
             observations /= intensities.astype(np.float32)
-            warnings = (*warnings, _intensities_in_words(intensities))
+            warnings = (*warnings, capture_warnings.estimated_intensities(intensities))
         if self.saturated is not None:
-            restore_saturated(observations, self.saturated, self.capture.light_directions)
-        if intensities is None:
+            restored = restore_saturated(observations, self.saturated, self.capture.light_directions)
+        if intensities is None and restored is None:
             return self.capture
-        return replace(self.capture, warnings=warnings, estimated_intensities=intensities)
-
-
-def _intensities_in_words(intensities: NDArray[np.float64]) -> str:
-    return (
-        f"The lights look unequally strong, from {intensities.min():.2f} to {intensities.max():.2f} times their mean,"
-        " and what the images tell of it was used; --intensities FILE gives the strengths, --intensities equal takes"
-        " them for equal."
-    )
+        return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)

@@ -1,33 +1,43 @@
-"""What a capture holds, without any normals: sizes, exposure, lights."""
+"""Summary of a capture without normals: sizes, exposure and lights."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import Lineariser
-from splinecli.capture.reader import SATURATED_SHARE, CaptureSource
 from splinecli.capture.restore.saturation import find_saturated
+from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.source import CaptureSource
 
 DARK = 0.05
-"""An image whose 99 % quantile lies below this share of full scale is called dark."""
+"""An image is called dark if its 99 % quantile is below this share of the white level."""
+
+FEW_LIGHTS = 8
+"""A capture with fewer lights carries a warning."""
+
+STEEP_DEG = 60.0
+"""A capture whose lights are all higher than this above the picture's plane carries a warning."""
 
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """One image of a capture, its object's pixels alone where there is a mask.
+    """One image of a capture; only the mask's pixels count.
 
     Args:
+        path: the file.
         shape: (H, W, C) as stored.
         dtype: as stored, such as "uint16".
-        bright: the 99 % quantile of its values, as a share of full scale (of floating-point images, as it is).
-        saturated: share of the pixels with a channel at full scale.
+        bright: the 99 % quantile of the values, as a share of the white level (of floating-point images, as it is).
+        saturated: share of the pixels with a channel at the white level or above.
     """
 
     path: Path
@@ -39,11 +49,19 @@ class ImageSummary:
 
 @dataclass(frozen=True, eq=False)
 class CaptureSummary:
-    """A capture's files, its images one by one, and the number of its pixels."""
+    """What reading a capture found.
+
+    Args:
+        source: the capture.
+        images: a summary of each image.
+        n_pixels: number of the mask's pixels.
+        white_level: as in Capture.
+    """
 
     source: CaptureSource
     images: tuple[ImageSummary, ...]
     n_pixels: int
+    white_level: WhiteLevel | None
 
     @property
     def elevations_deg(self) -> NDArray[np.float64]:
@@ -51,55 +69,73 @@ class CaptureSummary:
         degrees: NDArray[np.float64] = np.degrees(np.arcsin(self.source.light_directions[:, 2].clip(-1, 1)))
         return degrees
 
-    def warnings(self) -> list[str]:
-        """Sentences on what will cost accuracy."""
-        found = list(self.source.warnings)
-        sizes = {image.shape[:2] for image in self.images}
-        if len(sizes) > 1:
-            found.append(f"The images have {len(sizes)} different sizes; they have to be equal.")
-        if any(image.dtype == "uint8" for image in self.images):
-            found.append("There are images of 8 bits; 16-bit linear images give better normals.")
+    def warnings(self) -> list[CaptureWarning]:
+        """Return warnings of what costs accuracy."""
         saturated = [image for image in self.images if image.saturated > SATURATED_SHARE]
-        if saturated:
-            worst = max(saturated, key=lambda image: image.saturated)
-            found.append(
-                f"Images saturated in more than {100 * SATURATED_SHARE:.0f} % of the pixels: {len(saturated)},"
-                f" most {worst.path.name} ({100 * worst.saturated:.1f} %); a shorter exposure gives better normals."
-            )
+        worst = max(saturated, key=lambda image: image.saturated, default=None)
         dark = [image for image in self.images if image.dtype.startswith("uint") and image.bright < DARK]
-        if dark:
-            found.append(
-                f"Images that use less than {100 * DARK:.0f} % of the range: {len(dark)}, such as"
-                f" {dark[0].path.name}; a longer exposure gives less noise."
-            )
-        if len(self.images) < 8:
-            found.append(f"There are {len(self.images)} lights; ten well-spread ones are good.")
-        if self.elevations_deg.min() > 60:
-            found.append("All lights stand within 30 degrees of the camera; lower ones tell more.")
-        return found
+        n_sizes = len({image.shape[:2] for image in self.images})
+        found = [
+            capture_warnings.white_level(self.white_level),
+            capture_warnings.different_sizes(n_sizes) if n_sizes > 1 else None,
+            capture_warnings.eight_bit() if any(image.dtype == "uint8" for image in self.images) else None,
+            None
+            if worst is None
+            else capture_warnings.saturated_images(len(saturated), worst.path.name, worst.saturated),
+            capture_warnings.dark_images(len(dark), dark[0].path.name, DARK) if dark else None,
+            capture_warnings.few_lights(len(self.images)) if len(self.images) < FEW_LIGHTS else None,
+            capture_warnings.high_lights(90 - STEEP_DEG) if self.elevations_deg.min() > STEEP_DEG else None,
+        ]
+        return [*self.source.warnings, *(warning for warning in found if warning is not None)]
 
 
 def summarise_capture(source: CaptureSource, progress: Callable[[], object] | None = None) -> CaptureSummary:
-    """Look at every image once, one at a time. Raises InputError where one cannot be read or the mask does not fit."""
-    images = []
+    """Return the summary of a capture, reading its images one at a time.
+
+    Raises:
+        InputError: an image cannot be read, or the mask, the ambient image or a flat field does not fit.
+    """
+    images: list[ImageSummary] = []
     mask: NDArray[np.bool_] | None = None
-    for path in source.files.images:
+    for position, path in enumerate(source.files.images):
         stored = decode_image(path)
         if mask is None:
             mask = source.read_mask(stored.shape[:2])
             # It refuses ambient images and flat fields that do not fit.
             Lineariser(source.radiometry, mask, len(source.files.images))
-        pixels = stored[mask] if mask.shape == stored.shape[:2] else stored.reshape(-1, stored.shape[2])
+            finder = source.find_saturation(int(np.count_nonzero(mask)), range(len(source.files.images)))
+        fits = mask.shape == stored.shape[:2]
+        pixels = stored[mask] if fits else stored.reshape(-1, stored.shape[2])
+        if fits:
+            finder.add(position, pixels, path)
         images.append(
             ImageSummary(
                 path,
                 stored.shape,
                 str(stored.dtype),
                 float(np.quantile(to_linear(pixels, path), 0.99)),
+                # Of an image of another size, which the finder does not take.
                 float(find_saturated(pixels).mean()),
             )
         )
         if progress is not None:
             progress()
     assert mask is not None, "a capture has images"
-    return CaptureSummary(source, tuple(images), int(np.count_nonzero(mask)))
+    level, summaries = _by_white_level(finder, images, mask)
+    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level)
+
+
+def _by_white_level(
+    finder: SaturationFinder, images: list[ImageSummary], mask: NDArray[np.bool_]
+) -> tuple[WhiteLevel | None, tuple[ImageSummary, ...]]:
+    """Return the white level, and the images with brightness and saturation relative to it."""
+    level, saturated = finder.finish()
+    shares = np.zeros(len(images)) if saturated is None else saturated.mean(axis=0)
+    summaries = []
+    for image, share in zip(images, shares, strict=True):
+        bright = image.bright
+        if level is not None and image.dtype.startswith("uint"):
+            bright *= np.iinfo(image.dtype).max / level.value
+        fits = image.shape[:2] == mask.shape
+        summaries.append(replace(image, bright=bright, saturated=float(share) if fits else image.saturated))
+    return level, tuple(summaries)

@@ -118,7 +118,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
             "saturated": round(max(image.saturated for image in summary.images), 4),
         },
         "expect": {"memory_mib": round(mib), "seconds": round(3 + summary.n_pixels / PIXELS_PER_SECOND)},
-        "warnings": summary.warnings(),
+        "warnings": [str(warning) for warning in summary.warnings()],
     }
 
 

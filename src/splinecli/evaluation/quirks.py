@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from splinecli.capture import Capture
-from splinecli.capture.formats.normal_files import UPSIDE_DOWN
+from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
 from splinecli.evaluation.records import Protocol
 
 DAMAGED_IMAGES = {"bearPNG": 20}
@@ -23,7 +23,9 @@ def describe_quirks(capture: Capture, name: str, protocol: Protocol) -> tuple[st
             f"{name}: the first {damaged} images are known to be damaged and are used;"
             f" --skip-first {name}={damaged} leaves them out."
         )
-    notes += [f"{name}: {warning}" for warning in capture.warnings if warning == UPSIDE_DOWN]
+    notes += [
+        f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN
+    ]
     if capture.ground_truth is not None:
         without = capture.n_pixels - int(np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1)))
         if without:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from splinecli.capture import Capture
@@ -29,7 +27,4 @@ def keep_scored_pixels(capture: Capture, *, max_pixels: int | None = None, seed:
         chosen = np.sort(generator.permutation(chosen)[:max_pixels])
     if len(chosen) == capture.n_pixels:
         return capture
-    mask = np.zeros_like(capture.mask)
-    # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
-    mask.flat[np.flatnonzero(capture.mask)[chosen]] = True
-    return replace(capture, observations=capture.observations[chosen], mask=mask)
+    return capture.choose_pixels(chosen)

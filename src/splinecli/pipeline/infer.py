@@ -56,7 +56,7 @@ def infer_capture(
         estimator = make_method(options)
     with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
         estimate = estimate_normals(capture, estimator, progress=advance)
-    warnings = [*capture.warnings, *_method_warnings(estimator, capture)]
+    warnings = [*map(str, capture.warnings), *_method_warnings(estimator, capture)]
     for warning in warnings:
         observer.warn(f"{capture.name}: {warning}")
     report = {
@@ -157,7 +157,7 @@ def _further_files(
         writers.append(partial(files.write_confidence, estimate.confidence_map))
     if "preview" in options.maps:
         writers.append(partial(files.write_preview, estimate))
-    if source.found_mask is not None:
+    if source.automatic_mask is not None:
         writers.append(partial(files.write_mask, capture.mask))
     if options.surface:
         writers.append(_surface(estimate, colours, observer))

@@ -50,9 +50,10 @@ def albedo_map(
         colours = read(index)
         if capture.estimated_intensities is not None:
             colours /= np.float32(capture.estimated_intensities[position])
-        # Restored observations are brighter than their colours, which are saturated: the others tell better.
-        restored = colours.mean(axis=1) < 0.99 * capture.observations[:, position]
-        weight = cosine * np.where(restored, np.float32(1e-3), np.float32(1))
+        weight = cosine
+        if capture.restored is not None:
+            # The colours of restored observations are saturated, so the other observations decide.
+            weight = cosine * np.where(capture.restored[:, position], np.float32(1e-3), np.float32(1))
         total += weight[:, None] * colours
         squares += weight * cosine
         if progress is not None:

@@ -18,9 +18,6 @@ from splinecli.normals import SHORTEST_IN_PICTURE, decode_picture
 
 StrPath = str | os.PathLike[str]
 
-UPSIDE_DOWN = "The rows of the ground truth are in the wrong order; it was turned over."
-"""The warning of a capture whose ground truth was."""
-
 _CLEARLY_BETTER = 0.02  # of the mask's pixels
 _LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or JPEG
 _FEWEST_UNIT = 0.6  # of a picture of normals; of photographs a third are of such length by chance

@@ -29,7 +29,7 @@ def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
 
 def restore_saturated(
     observations: NDArray[np.float32], saturated: NDArray[np.bool_], light_directions: NDArray[np.float64]
-) -> None:
+) -> NDArray[np.bool_] | None:
     """Put estimates in the place of saturated observations (P, F), in the array itself.
 
     What a saturated observation was is not known, but that it was at least so bright is: each becomes the prediction
@@ -43,10 +43,12 @@ def restore_saturated(
         light_directions: (F, 3), unit.
     """
     lights = light_directions.astype(np.float32)
-    rows = np.flatnonzero(saturated.any(axis=1) & ~saturated.all(axis=1))
+    everywhere = np.asarray(saturated.all(axis=1))
+    rows = np.flatnonzero(saturated.any(axis=1) & ~everywhere)
     for start in range(0, len(rows), _TILE_PIXELS):
         tile = rows[start : start + _TILE_PIXELS]
         observations[tile] = _restored(observations[tile], saturated[tile], lights)
+    return saturated & ~everywhere[:, None] if len(rows) else None
 
 
 def _restored(

@@ -1,0 +1,157 @@
+"""Warnings about a capture: a stable code for programs, a sentence for people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.restore.white_level import WhiteLevel
+
+
+@dataclass(frozen=True)
+class CaptureWarning:
+    """Something about a capture that costs accuracy, or that was decided for the user.
+
+    Args:
+        code: a name that stays the same when the sentence changes; one of the constants below.
+        text: one or two sentences.
+    """
+
+    code: str
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+AMBIENT_SUBTRACTED = "ambient_subtracted"
+BLACK_PIXELS = "black_pixels"
+DARK_IMAGES = "dark_images"
+DIFFERENT_SIZES = "different_sizes"
+DISPLAY_ENCODED = "display_encoded"
+EIGHT_BIT = "eight_bit"
+ESTIMATED_INTENSITIES = "estimated_intensities"
+FEW_LIGHTS = "few_lights"
+GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
+HIGH_LIGHTS = "high_lights"
+IMAGES_LEFT_OUT = "images_left_out"
+LIGHTS_MATCHED = "lights_matched"
+SATURATED = "saturated"
+WHITE_LEVEL = "white_level"
+
+SATURATED_SHARE = 0.01
+"""The share of saturated observations above which the capture carries a warning."""
+
+BLACK_SHARE = 0.01
+"""The share of pixels without light above which the capture carries a warning."""
+
+
+def white_level(level: WhiteLevel | None) -> CaptureWarning | None:
+    """Warn of a white level that no file states, seen in the images."""
+    if level is None or level.origin != "images":
+        return None
+    return CaptureWarning(
+        WHITE_LEVEL,
+        f"The images look clipped at {level.value:g}, so this value counts as saturated; --white-level N sets another.",
+    )
+
+
+def saturated(share: float) -> CaptureWarning | None:
+    """Warn of too many saturated observations."""
+    if share <= SATURATED_SHARE:
+        return None
+    return CaptureWarning(
+        SATURATED,
+        f"{100 * share:.1f} % of the observations are saturated; a shorter exposure gives better normals.",
+    )
+
+
+def black_pixels(share: float) -> CaptureWarning | None:
+    """Warn of too many pixels that no light reaches."""
+    if share <= BLACK_SHARE:
+        return None
+    return CaptureWarning(
+        BLACK_PIXELS,
+        f"{100 * share:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1).",
+    )
+
+
+def eight_bit() -> CaptureWarning:
+    return CaptureWarning(EIGHT_BIT, "The images have 8 bits; 16-bit linear images give better normals.")
+
+
+def ground_truth_upside_down() -> CaptureWarning:
+    return CaptureWarning(
+        GROUND_TRUTH_UPSIDE_DOWN,
+        "The rows of the ground truth are in the wrong order; the map was turned upside down.",
+    )
+
+
+def estimated_intensities(intensities: NDArray[np.float64]) -> CaptureWarning:
+    """Warn that light intensities (F,) with a mean of 1 were estimated."""
+    return CaptureWarning(
+        ESTIMATED_INTENSITIES,
+        "The light intensities were estimated from the images: they are unequal, from"
+        f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. --intensities FILE gives measured ones,"
+        " --intensities equal takes them for equal.",
+    )
+
+
+def images_left_out(light_file: str, n_named: int, n_images: int) -> CaptureWarning:
+    return CaptureWarning(
+        IMAGES_LEFT_OUT, f"{light_file} names {n_named} of the {n_images} images; the others are left out."
+    )
+
+
+def lights_matched(light_file: str, how: str) -> CaptureWarning:
+    return CaptureWarning(LIGHTS_MATCHED, f"The lights of {light_file} were matched to the images by {how}.")
+
+
+def ambient_subtracted(ambient: str) -> CaptureWarning:
+    return CaptureWarning(AMBIENT_SUBTRACTED, f"{ambient} was subtracted from all images as ambient light.")
+
+
+def display_encoded() -> CaptureWarning:
+    return CaptureWarning(
+        DISPLAY_ENCODED,
+        "The images look display-encoded (JPEG, or PNG that says so) but are taken to be linear;"
+        " --transfer srgb undoes sRGB's curve.",
+    )
+
+
+def different_sizes(n_sizes: int) -> CaptureWarning:
+    return CaptureWarning(
+        DIFFERENT_SIZES, f"The images have {n_sizes} different sizes; all images need the same size."
+    )
+
+
+def saturated_images(n_images: int, worst: str, worst_share: float) -> CaptureWarning:
+    """Warn of images with too many saturated pixels; the worst is named."""
+    return CaptureWarning(
+        SATURATED,
+        f"Images saturated in more than {100 * SATURATED_SHARE:.0f} % of the pixels: {n_images}, most of all {worst}"
+        f" ({100 * worst_share:.1f} %); a shorter exposure gives better normals.",
+    )
+
+
+def dark_images(n_images: int, example: str, share: float) -> CaptureWarning:
+    """Warn of images that use less than a share of the range."""
+    return CaptureWarning(
+        DARK_IMAGES,
+        f"Images that use less than {100 * share:.0f} % of the range: {n_images}, such as {example};"
+        " a longer exposure gives less noise.",
+    )
+
+
+def few_lights(n_lights: int) -> CaptureWarning:
+    return CaptureWarning(FEW_LIGHTS, f"There are {n_lights} lights; use ten or more, well spread.")
+
+
+def high_lights(limit_deg: float) -> CaptureWarning:
+    """Warn of lights that are all close to the camera's direction."""
+    return CaptureWarning(
+        HIGH_LIGHTS,
+        f"All lights are within {limit_deg:.0f} degrees of the camera's direction; lower lights give better normals.",
+    )

@@ -1,0 +1,115 @@
+"""What the headers of image files state about their values: display encoding, and the white level."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from splinecli.errors import InputError
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_MAX_SAMPLE_VALUE, _WHITE_LEVEL = 281, 50717  # tags of TIFF and DNG
+
+
+def is_display_encoded(path: Path) -> bool:
+    """Whether the file itself says that its values are meant for a screen: JPEG, or PNG with a chunk sRGB or gAMA.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_PNG))
+            if start.startswith(_JPEG):
+                return True
+            for kind, content in _png_chunks(file) if start == _PNG else ():
+                if kind == b"sRGB":
+                    return True
+                if kind == b"gAMA":
+                    # 100000 times the exponent of the encoding: 1 means linear.
+                    return int.from_bytes(content[:4], "big") != 100_000
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    return False
+
+
+def stated_white_level(images: Sequence[Path]) -> int | None:
+    """Return the white level that all 16-bit images state, 2^bits - 1 where they state bits; None without one.
+
+    It comes from a PNG's chunk sBIT, or from a TIFF's BitsPerSample, WhiteLevel (DNG) or MaxSampleValue. The last one
+    may also be the largest value of an image, so it counts only if it is 2^bits - 1.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    levels = set()
+    for path in images:
+        levels.add(_stated(path))
+        if len(levels) > 1 or None in levels:
+            return None
+    return levels.pop() if levels else None
+
+
+def _stated(path: Path) -> int | None:
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_PNG))
+            if start == _PNG:
+                return _stated_by_png(file)
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    return _stated_by_tiff(path) if start.startswith(_TIFF) else None
+
+
+def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
+    """Yield name and content of the chunks before a PNG's pixels, from a file that stands behind the signature."""
+    while len(header := file.read(8)) == 8 and header[4:] not in (b"IDAT", b"IEND"):
+        length = int.from_bytes(header[:4], "big")
+        # Those of interest are short; others, such as profiles, may be long.
+        content = file.read(min(length, 16))
+        file.seek(length - len(content) + 4, 1)
+        yield header[4:], content
+
+
+def _stated_by_png(file: BinaryIO) -> int | None:
+    for kind, content in _png_chunks(file):
+        if kind == b"IHDR" and (len(content) < 10 or content[8] != 16):
+            return None
+        if kind == b"sBIT" and content:
+            # One number for each channel. Alpha, if there is one, comes last.
+            bits = set(content[: 3 if len(content) > 2 else 1])
+            return _level(bits.pop()) if len(bits) == 1 else None
+    return None
+
+
+def _stated_by_tiff(path: Path) -> int | None:
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            page: Any = file.pages.first
+            bits = int(page.bitspersample)
+            tags = {code: page.tags.valueof(code) for code in (_MAX_SAMPLE_VALUE, _WHITE_LEVEL)}
+    except Exception:  # a damaged header causes struct, key, value or memory errors; decoding names it
+        return None
+    if bits < 16:
+        return _level(bits)
+    if bits > 16:
+        return None
+    white, largest = (_one_value(tags[code]) for code in (_WHITE_LEVEL, _MAX_SAMPLE_VALUE))
+    if white is not None and 0 < white < 65_535:
+        return white
+    return largest if largest is not None and largest == _level(largest.bit_length()) else None
+
+
+def _one_value(tag: object) -> int | None:
+    """Return the tag's value where it is one whole number, or the same one for each channel."""
+    values = set(tag) if isinstance(tag, tuple) else {tag}
+    value = values.pop() if len(values) == 1 else None
+    return value if isinstance(value, int) else None
+
+
+def _level(bits: int) -> int | None:
+    return (1 << bits) - 1 if 8 <= bits < 16 else None

@@ -1,0 +1,41 @@
+"""The mask of a capture: which pixels belong to the object."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.images import read_boundary, read_mask
+from splinecli.capture.layouts.capture_files import CaptureFiles
+from splinecli.errors import InputError
+
+
+def read_capture_mask(files: CaptureFiles, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the mask (H, W) of a capture whose images have this shape; all true where the capture has no mask.
+
+    Raises:
+        InputError: a mask cannot be read, is empty, or differs in size from the images.
+    """
+    if files.boundaries:
+        return _read_boundaries(files, shape)
+    if files.mask is None:
+        return np.ones(shape, np.bool_)
+    mask = read_mask(files.mask)
+    check_size(mask.shape, shape, files.mask, like=files.images[0].name, what="a mask")
+    return mask
+
+
+def _read_boundaries(files: CaptureFiles, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the union of the masks of CyclesPS."""
+    union = np.zeros(shape, np.bool_)
+    for path in files.boundaries:
+        boundary = read_boundary(path)
+        check_size(boundary.shape, shape, path, like=files.images[0].name, what="a mask")
+        union |= boundary
+    if not union.any():
+        names = " and ".join(path.name for path in files.boundaries)
+        raise InputError(
+            f"the mask is empty: every pixel of {names} is zero", path=files.boundaries[0].parent
+        )
+    return union

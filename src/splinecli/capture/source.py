@@ -1,0 +1,239 @@
+"""A capture whose lights are read and whose images are not: from it, a Capture is read one image at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.header import stated_white_level
+from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.normal_files import read_ground_truth
+from splinecli.capture.layouts.capture_files import CaptureFiles
+from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration
+from splinecli.capture.masks import read_capture_mask
+from splinecli.capture.record import Capture, check_light_indices
+from splinecli.capture.restore.auto_mask import find_object
+from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.stored import StoredCapture
+from splinecli.errors import InputError
+
+Progress = Callable[[], object]
+"""Called once after each image."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureSource:
+    """A capture whose lights are read and whose images are not.
+
+    Args:
+        files: the files of the capture.
+        light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
+        light_intensities: (F, 3) float64, RGB; ones where no file gives them.
+        intensities_known: whether a file or the user gives the intensities.
+        warnings: what a user should read.
+        radiometry: how stored values become linear light.
+        white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
+        automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
+    """
+
+    files: CaptureFiles
+    light_directions: NDArray[np.float64]
+    light_intensities: NDArray[np.float64]
+    warnings: tuple[CaptureWarning, ...] = ()
+    radiometry: RadiometricCalibration = AS_STORED
+    white_level: float | None = None
+    automatic_mask: NDArray[np.bool_] | None = None
+    intensities_known: bool = True
+
+    @property
+    def n_lights(self) -> int:
+        return len(self.light_directions)
+
+    def read(
+        self,
+        light_indices: Sequence[int] | None = None,
+        progress: Progress | None = None,
+        *,
+        as_stored: bool = False,
+    ) -> Capture:
+        """Return the capture under the chosen lights (None for all), in the order given.
+
+        Only the images of these lights are read. Memory holds at most one full image beside the result. Values outside
+        the mask are ignored.
+
+        Args:
+            light_indices: zero-based.
+            progress: called once after each image.
+            as_stored: use the stored values alone. By default, saturated observations are restored (see
+                restore_saturated) and light intensities that no file gives are estimated (see
+                estimate_light_intensities).
+
+        Raises:
+            UsageError: an index is out of range, comes twice, or there are fewer than three.
+            InputError: an image, the mask or the ground truth cannot be read or does not fit the others, or
+                the lights cannot give normals (see Capture).
+        """
+        stored = self.read_stored(light_indices, progress)
+        return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
+
+    def read_stored(
+        self, light_indices: Sequence[int] | None = None, progress: Progress | None = None
+    ) -> StoredCapture:
+        """Return the stored values under the chosen lights, and what restores them; see read."""
+        indices = (
+            tuple(range(self.n_lights))
+            if light_indices is None
+            else check_light_indices(light_indices, self.n_lights)
+        )
+        first = decode_image(self.files.images[indices[0]])
+        mask = self.read_mask(first.shape[:2])
+        ground_truth, upside_down = None, False
+        if self.files.ground_truth is not None:
+            ground_truth, upside_down = read_ground_truth(
+                self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
+            )
+        found = self._read_observations(indices, mask, first, progress)
+        warnings = [*self.warnings, *found.warnings()]
+        if upside_down:
+            warnings.append(capture_warnings.ground_truth_upside_down())
+        capture = Capture(
+            name=self.files.name,
+            observations=found.observations,
+            light_directions=self.light_directions[list(indices)],
+            light_indices=indices,
+            mask=mask,
+            ground_truth=ground_truth,
+            warnings=tuple(warnings),
+            white_level=found.white_level,
+        )
+        return StoredCapture(capture, found.saturated, self.intensities_known)
+
+    def find_saturation(self, n_pixels: int, indices: Sequence[int]) -> SaturationFinder:
+        """Return what finds the saturated observations of these images. Raises InputError."""
+        return SaturationFinder(
+            n_pixels,
+            len(indices),
+            given=self.white_level,
+            stated=stated_white_level([self.files.images[index] for index in indices]),
+        )
+
+    def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
+        """Return a function that reads the mask's (H, W) pixels (P, 3) RGB of an image by its index.
+
+        The values are linear, each channel divided by its light's intensity. The function raises InputError where the
+        image cannot be read or does not have the size of the mask.
+        """
+        linearise = Lineariser(self.radiometry, mask, len(self.files.images))
+
+        def read(index: int) -> NDArray[np.float32]:
+            path = self.files.images[index]
+            stored = decode_image(path)
+            check_size(stored.shape, mask.shape, path, like=self.files.images[0].name)
+            return self._colours(linearise, stored[mask], index)
+
+        return read
+
+    def find_mask(self, progress: Progress | None = None) -> CaptureSource:
+        """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
+
+        Raises:
+            InputError: no object stands out, or an image cannot be read.
+        """
+        if self.files.mask is not None or self.files.boundaries:
+            return self
+        linearise = None
+        for index, path in enumerate(self.files.images):
+            stored = decode_image(path)
+            if linearise is None:
+                shape = stored.shape[:2]
+                linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
+                total = np.zeros(shape[0] * shape[1], np.float32)
+            check_size(stored.shape, shape, path, like=self.files.images[0].name)
+            total += self._colours(linearise, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
+            if progress is not None:
+                progress()
+        try:
+            return replace(self, automatic_mask=find_object(total.reshape(shape)))
+        except InputError as error:
+            raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
+
+    def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """Return the mask (H, W) for images of this shape. Raises InputError."""
+        return read_capture_mask(self.files, shape) if self.automatic_mask is None else self.automatic_mask
+
+    def _read_observations(
+        self,
+        indices: tuple[int, ...],
+        mask: NDArray[np.bool_],
+        first: NDArray[Any],
+        progress: Progress | None,
+    ) -> _Observations:
+        """Return the mask's pixels under these lights; `first` is the first image, decoded."""
+        n_pixels = int(np.count_nonzero(mask))
+        linearise = Lineariser(self.radiometry, mask, len(self.files.images))
+        saturation = self.find_saturation(n_pixels, indices)
+        observations = np.empty((n_pixels, len(indices)), np.float32)
+        any_8_bit = False
+        stored: NDArray[Any] | None = first
+        del first
+        for position, index in enumerate(indices):
+            path = self.files.images[index]
+            if stored is None:
+                stored = decode_image(path)
+            check_size(stored.shape, mask.shape, path, like=self.files.images[indices[0]].name)
+            any_8_bit |= stored.dtype == np.uint8
+            pixels = stored[mask]
+            stored = None  # let go before the next is decoded: one full image at a time
+            saturation.add(position, pixels, path)
+            observations[:, position] = _observe(
+                linearise(pixels, path, index), self.light_intensities[index]
+            )
+            if progress is not None:
+                progress()
+        return _Observations(observations, *saturation.finish(), any_8_bit)
+
+    def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
+        linear = linearise(pixels, self.files.images[index], index)
+        # In float32 and in place: 24 megapixels take noticeably longer in any other way.
+        colours = np.array(np.broadcast_to(linear, (len(linear), 3)), np.float32)
+        colours /= self.light_intensities[index].astype(np.float32)
+        return colours
+
+
+@dataclass(frozen=True, eq=False)
+class _Observations:
+    """Observations (P, F) as read, which of them are saturated (None for none), and from which stored value."""
+
+    observations: NDArray[np.float32]
+    white_level: WhiteLevel | None
+    saturated: NDArray[np.bool_] | None
+    any_8_bit: bool
+
+    def warnings(self) -> list[CaptureWarning]:
+        n_saturated = 0 if self.saturated is None else np.count_nonzero(self.saturated)
+        n_black = len(self.observations) - np.count_nonzero(self.observations.any(axis=1))
+        warnings = [
+            capture_warnings.white_level(self.white_level),
+            capture_warnings.saturated(n_saturated / max(self.observations.size, 1)),
+            capture_warnings.black_pixels(n_black / max(len(self.observations), 1)),
+            capture_warnings.eight_bit() if self.any_8_bit else None,
+        ]
+        return [warning for warning in warnings if warning is not None]
+
+
+def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return observations (P,) from linear pixels (P, C) under a light of RGB intensity (3,).
+
+    Each channel is divided by its intensity, then the mean is taken. A gray image is equal in all channels.
+    """
+    weights = 1 / (3 * intensity)
+    if linear.shape[1] == 1:
+        weights = weights.sum(keepdims=True)
+    return linear @ weights.astype(np.float32)
