@@ -260,7 +260,7 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     cv2.imwrite(str(capture / "ambient.png"), dark)
     assert mean_deg("--transfer", "gamma:2.2") < 0.1
     assert read_report(Path("out/sphere"))["warnings"] == [
-        "The light of ambient.png was taken off all images."
+        "ambient.png was subtracted from all images as ambient light."
     ]
     result = run("infer", capture, "--transfer", "rec709")
     assert (result.code, result.out) == (2, "")
