@@ -1,1 +1,1 @@
-"""Pictures and plots."""
+"""Every picture and plot: maps, curves, lights, calibrations, contact sheets."""

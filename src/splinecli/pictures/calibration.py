@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallCalibration
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.images import to_linear
-
-Picture = NDArray[np.uint8]
+from splinecli.pictures.png import Picture
 
 TILE = 200
 _MARGIN = 1.15  # of the radius

@@ -1,4 +1,4 @@
-"""A picture of what a pixel set holds: each scene's normals, and each of its entries under two lights."""
+"""A picture of the scenes in a pixel set: the normals of each scene, and each of its entries under two lights."""
 
 from __future__ import annotations
 
@@ -6,20 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.normals import encode_picture
+from splinecli.pictures.png import Picture
 from splinecli.pixel_sets.store import Entry, Pixels, PixelSet
 
-TILE = 96  # pixels: shapes and materials can be told, and sixty scenes fit on a screen or two
+TILE = 96  # pixels: large enough to recognise shapes and materials; sixty scenes fit on a screen or two
 LARGE_TILE, FEW_SCENES = 160, 12
 MOST_SCENES = 120
 _WIDTH = 1900
 _GAMMA = 2.2
 _LIGHTS = ((0.4, 0.4, 0.82), (-0.75, 0.2, 0.63))
 
-Picture = NDArray[np.uint8]
-
 
 def contact_sheet(pixel_set: PixelSet) -> Picture:
-    """An RGB picture (H, W, 3): a strip for each scene, evenly chosen where there are more than MOST_SCENES."""
+    """Return an RGB picture (H, W, 3) with a strip for each scene, or for an even choice of at most MOST_SCENES."""
     scenes: dict[str, list[Entry]] = {}
     for entry in pixel_set.entries:
         scenes.setdefault(entry.scene, []).append(entry)
@@ -44,7 +43,7 @@ def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
 
 
 def _shown(pixels: Pixels, light: tuple[float, float, float]) -> Picture:
-    """The image under the entry's light closest to `light`, exposed for its 98th percentile."""
+    """Return the image under the light closest to `light`, scaled so that its 98th percentile is white."""
     closest = int(np.argmax(pixels.light_directions @ np.array(light)))
     values = np.asarray(pixels.observations[:, closest], np.float32)
     exposed = (values / max(float(np.percentile(values, 98)), 1e-6)).clip(0, 1) ** (1 / _GAMMA)

@@ -1,4 +1,4 @@
-"""Pictures of angular errors."""
+"""Pictures of angular error maps."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
+from splinecli.pictures.png import Picture
 
 TOP_DEG = 30.0
-"""Errors from here on share the last colour: large ones are failures alike, small ones need the colours."""
+"""Top of the colour scale. Larger errors have the last colour: the scale serves the small errors."""
 
 TITLE = "angular error (deg)"
 
-_SMALLEST_HEIGHT = 256  # pixels: a bar with its text fits, and a small map can be seen
-_LARGEST_ENLARGED = 1024  # pixels: no width grows beyond it
-_TEXT_SIZE = 0.45  # OpenCV's font scale in a picture of _USUAL_HEIGHT: capitals of 10 pixels
+_SMALLEST_HEIGHT = 256  # pixels: room for the colour bar and its text
+_LARGEST_ENLARGED = 1024  # pixels: a small map is not enlarged beyond this width
+_TEXT_SIZE = 0.45  # OpenCV's font scale in a picture of _USUAL_HEIGHT; capitals are 10 pixels high
 _USUAL_HEIGHT = 400
 _BACKGROUND, _INK = 255, 0
 _TICK_STEPS_DEG = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 45)
 _MOST_STEPS = 4
 
-Picture = NDArray[np.uint8]
-
 
 def error_map_picture(error_map_deg: NDArray[np.floating], *, top_deg: float = TOP_DEG) -> Picture:
-    """An error map as an RGB picture (H', W', 3) with a colour bar in degrees at its right.
+    """Return an error map as an RGB picture (H', W', 3) with a colour bar in degrees at its right.
 
-    Colours go from 0 (viridis' violet) to top_deg and beyond (its yellow); white where there is no error. A
-    map of fewer than 256 rows is enlarged by a whole factor, pixel by pixel, as far as its width stays within
-    1024, and then padded to 256 rows.
+    The colours are viridis, from violet for 0 to yellow for top_deg and more. Pixels without an error are white. A map
+    of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to 256
+    rows.
 
     Args:
-        error_map_deg: (H, W) degrees, NaN where there is none.
+        error_map_deg: (H, W) degrees, NaN where there is no error.
+        top_deg: the top of the colour scale in degrees.
 
     Raises:
         UsageError: top_deg is not a finite angle over 0.
     """
     if not 0 < top_deg < math.inf:
-        raise UsageError(f"the error map's scale ends at {top_deg:g} degrees, expected more than 0")
+        raise UsageError(f"the top of the error scale is {top_deg:g} degrees; expected more than 0")
     picture = colour_errors(error_map_deg, top_deg)
     height, width = picture.shape[:2]
     factor = max(1, min(-(-_SMALLEST_HEIGHT // height), _LARGEST_ENLARGED // width))
@@ -52,7 +52,7 @@ def error_map_picture(error_map_deg: NDArray[np.floating], *, top_deg: float = T
 
 
 def colour_errors(error_map_deg: NDArray[np.floating], top_deg: float) -> Picture:
-    """The colours (H, W, 3) of errors (H, W), white for NaN."""
+    """Return the colours (H, W, 3) of errors (H, W) in degrees, white for NaN."""
     import cv2
 
     known = np.isfinite(error_map_deg)
@@ -64,14 +64,14 @@ def colour_errors(error_map_deg: NDArray[np.floating], top_deg: float) -> Pictur
 
 
 def _colour_bar(height: int, top_deg: float) -> Picture:
-    """The bar with ticks, labels and the title set upwards: (height, as wide as it needs, 3)."""
+    """Return the colour bar with ticks, labels and a vertical title: (height, W, 3), W as large as needed."""
     scale = max(1.0, height / _USUAL_HEIGHT)
     labels = [(value, f"{value:g}") for value in _ticks_deg(top_deg)]
     labels[-1] = (top_deg, f"{top_deg:g}+")
     texts = [_text(label, scale) for _, label in labels]
     title = np.rot90(_text(TITLE, scale))
     gap, bar_width, line = round(8 * scale), round(18 * scale), max(1, round(scale))
-    margin = texts[0].shape[0]  # so that the outermost labels are not cut
+    margin = texts[0].shape[0]  # keeps the outermost labels whole
     bar_height = height - 2 * margin
 
     label_x = 3 * gap + bar_width
@@ -89,22 +89,22 @@ def _colour_bar(height: int, top_deg: float) -> Picture:
 
 
 def _ticks_deg(top_deg: float) -> list[float]:
-    """Round angles from 0, and the top itself."""
+    """Return round angles from 0 up, and the top itself."""
     step = next((step for step in _TICK_STEPS_DEG if top_deg / step <= _MOST_STEPS), top_deg)
     ticks = [float(tick) for tick in np.arange(0, top_deg, step)]
-    # A label too near to the top's would run into it.
+    # A label close to the top one would overlap it.
     return [tick for tick in ticks if top_deg - tick >= step / 2] + [top_deg]
 
 
 def _text(text: str, scale: float) -> Picture:
-    """A line of text, black on white, cropped to its ink: (h, w)."""
+    """Return a line of text (h, w), black on white, without margins."""
     import cv2
 
     font, size, thickness = cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE * scale, max(1, round(scale))
     (width, height), below = cv2.getTextSize(text, font, size, thickness)
     canvas = np.full((height + below + 2 * thickness, width + 2 * thickness), _BACKGROUND, np.uint8)
     cv2.putText(canvas, text, (thickness, height + thickness), font, size, _INK, thickness, cv2.LINE_AA)
-    # OpenCV 4 and 5 draw with different fonts and report different heights; the ink is what it is.
+    # OpenCV 4 and 5 have different fonts and report different heights, so crop to the drawn pixels.
     ink = canvas < _BACKGROUND
     rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
     return canvas[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

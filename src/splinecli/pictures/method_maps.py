@@ -1,4 +1,4 @@
-"""Normal maps and error maps of several methods side by side, as the papers show them."""
+"""Normal maps and error maps of several methods side by side, as in the papers."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.normals import encode_picture
-from splinecli.pictures.error_map import TITLE, TOP_DEG, Picture, colour_errors
+from splinecli.pictures.error_map import TITLE, TOP_DEG, colour_errors
 from splinecli.pictures.plotting import png_bytes
+from splinecli.pictures.png import Picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST_WIDE = 3600  # pixels: all columns; with the gaps between them the picture stays below 4000
+_MOST_WIDE = 3600  # pixels, all columns without gaps: the picture stays below 4000
 _MOST_HIGH = 1200  # pixels: one map
-_ENLARGED = 240  # pixels: small maps are enlarged as far as their longer side stays within it
-_SMALLEST_CELL = 150  # pixels: the colour bar fits, and a name can be read
+_ENLARGED = 240  # pixels: small maps are enlarged while their longer side stays within it
+_SMALLEST_CELL = 150  # pixels: room for the colour bar and a name
 _LARGEST_TEXT, _SMALLEST_TEXT = 36, 10  # pixels
-_TEXT_WIDTH = 0.62  # of its height: a character on average
+_TEXT_WIDTH = 0.62  # of its height: the average width of a character
 _DPI = 100
 _POINT = _DPI / 72  # pixels
 _WHITE = 255
@@ -34,17 +35,18 @@ def method_maps(
     *,
     title: str,
 ) -> bytes:
-    """A column for the ground truth and one for each method, its normal map above its error map; PNG.
+    """Return a PNG file with a column for the ground truth and one for each method: normal map above error map.
 
-    Normals are shown as RGB = (n + 1) / 2, errors from 0 to TOP_DEG and beyond, white where there is nothing. The
-    maps are cut to the mask's bounding box; small ones are enlarged pixel by pixel, large ones averaged down, so that
-    the picture stays below 4000 pixels wide. Under each method stands its MAE, over the pixels that have errors.
+    Normals have the colours (n + 1) / 2, errors those of colour_errors from 0 to TOP_DEG; other pixels are white. The
+    maps are cropped to the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
+    that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that have errors.
 
     Args:
-        ground_truth: (H, W, 3) unit normals, zero where there is none.
+        ground_truth: (H, W, 3) unit normals, zero where there is no ground truth.
         mask: (H, W), not empty.
         normal_maps: (H, W, 3) by method, in the order of the columns.
-        error_maps_deg: (H, W) by method, NaN where there is none.
+        error_maps_deg: (H, W) by method, NaN where there is no error.
+        title: the title of the picture.
     """
     from matplotlib.figure import Figure
 
@@ -60,7 +62,7 @@ def method_maps(
     cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
     text = _text_height(cell_width, ["ground truth", *captions, *captions.values()])
     gap, line = text // 2, 2 * text
-    errors_at = gap + line  # upwards, as matplotlib counts
+    errors_at = gap + line  # from the bottom, as in matplotlib
     normals_at = errors_at + cell_height + gap
     names_at = normals_at + cell_height
     width, height = gap + (cell_width + gap) * (1 + len(normal_maps)), names_at + 2 * line
@@ -84,8 +86,8 @@ def method_maps(
 
 
 def _draw_bar(figure: Figure, right: int, bottom: int, height: int, text: int) -> None:
-    """The colours of errors upwards from 0, ending at `right`, with labels and a title at the left."""
-    inset = text // 2  # half a label stands out at either end
+    """Draw a vertical colour bar of errors with its right edge at `right`, and its labels and title on the left."""
+    inset = text // 2  # room for half a label at either end
     length = height - 2 * inset
     column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
     figure.figimage(colour_errors(column, TOP_DEG), right - text, bottom + inset, origin="lower")
@@ -111,7 +113,7 @@ def _write(
     align: Literal["center", "right"] = "center",
     rotation: float = 0,
 ) -> None:
-    """Text with its middle at (x, y) in pixels from the bottom left."""
+    """Write text centred at (x, y) in pixels from the bottom left."""
     from matplotlib.transforms import IdentityTransform
 
     figure.text(
@@ -128,7 +130,7 @@ def _write(
 
 
 def _text_height(width: int, lines: Sequence[str], *, most: int = _LARGEST_TEXT) -> int:
-    """Pixels, so that each of the lines fits into the width, and a short one does not fill it."""
+    """Return a text height in pixels at which each line fits into the width; short lines do not fill it."""
     longest = max(18, *(len(line) for line in lines))
     return min(most, max(_SMALLEST_TEXT, int(width / (_TEXT_WIDTH * longest))))
 
@@ -139,7 +141,7 @@ def _bounding_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _scale(height: int, width: int, columns: int) -> float:
-    """A whole number from 1, or less than 1."""
+    """Return the factor of enlargement: a whole number, or less than 1."""
     most = min(_MOST_WIDE / columns / width, _MOST_HIGH / height)
     return most if most < 1 else max(1, min(int(most), _ENLARGED // max(height, width)))
 
@@ -154,7 +156,7 @@ def _resize(picture: Picture, scale: float) -> Picture:
 
 
 def _colour_normals(normals: NDArray[np.floating], known: NDArray[np.bool_]) -> Picture:
-    """RGB = (n + 1) / 2, white where not known; what stands there may be NaN."""
+    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if NaN is there."""
     colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
     colours[~known] = _WHITE
     return colours

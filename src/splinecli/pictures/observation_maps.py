@@ -1,4 +1,4 @@
-"""What the networks see and guess of chosen pixels, after figure 3 of SPLINE-Net (Zheng et al., ICCV 2019)."""
+"""Observation maps of single pixels, as in figure 3 of SPLINE-Net (Zheng et al., ICCV 2019)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _MAP_INCHES = 1.7
 _DPI = 150
-_EMPTY = "0.85"  # light gray, in no place of the colours
+_EMPTY = "0.85"  # light gray, which the colour scale does not contain
 _SMALL, _LARGE = 8, 9  # points
 
 
@@ -31,10 +31,10 @@ def observation_map_figure(
     title: str = "",
     grid: Grid = "even",
 ) -> bytes:
-    """A row for each of N pixels: its sparse map, LI-Net's dense map and the map of all lights; PNG.
+    """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all lights.
 
-    Row 0 of a map is y = +1; a pixel's three maps are in one frame, be it the camera's or the pixel's own. Values
-    are shares of the largest observation, from 0 to 1. Empty cells are gray, the circle is the horizon.
+    Row 0 of a map is y = +1. The maps of a pixel share one frame, that of the camera or that of the pixel. Values are
+    relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the horizon.
 
     Args:
         sparse: (N, w, w), NaN in empty cells.
@@ -44,7 +44,7 @@ def observation_map_figure(
         pixels: (N, 2) row and column in the image; None to leave them out.
         truth_label: label of the true maps.
         title: title of the figure; empty for none.
-        grid: how lights fell on the cells.
+        grid: how light directions are assigned to cells.
     """
     from matplotlib.figure import Figure
 
@@ -64,7 +64,7 @@ def observation_map_figure(
     for axis, place_in_image, error in zip(axes[:, 0], places, error_deg, strict=True):
         axis.set_title(f"{place_in_image}{error:.1f} deg off", fontsize=_SMALL, loc="left")
     bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
-    bar.set_label("share of the largest observation", fontsize=_SMALL)
+    bar.set_label("relative to the largest observation", fontsize=_SMALL)
     bar.ax.tick_params(labelsize=_SMALL)
     return png_bytes(figure, _DPI)
 
@@ -75,7 +75,8 @@ def _finish(axes: Axes, size: int, grid: Grid) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
     axes.set_facecolor(_EMPTY)
-    # matplotlib has cell k from k - 1/2 to k + 1/2; the authors' last column and top row are a single line.
+    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column and the top row
+    # stand for a single line each.
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
     if grid == "cnn-ps":
         centre, radius = (size / 2 - 1, size / 2), (size - 1) / 2

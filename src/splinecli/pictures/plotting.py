@@ -1,4 +1,4 @@
-"""What the plots share: a fixed look for each method, and PNG by matplotlib without its global state."""
+"""Parts that all plots share: a fixed style for each method, and PNG files without matplotlib's global state."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 class Look(NamedTuple):
-    """matplotlib's names of a colour and a marker."""
+    """The style of a line: matplotlib's names of a colour and a marker."""
 
     colour: str
     marker: str
 
 
-# The colours of Okabe and Ito ("Color Universal Design", 2008), told apart by the colour-blind; gray in place of
-# their yellow, too light for a line on white. The markers help where a print has no colours.
+# The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can distinguish. Gray
+# replaces their yellow, which is too light for a line on white. The markers help in prints without colour.
 _LOOKS = tuple(
     Look(colour, marker)
     for colour, marker in zip(
@@ -33,17 +33,20 @@ _LOOKS = tuple(
 
 
 def method_looks(methods: Sequence[str]) -> dict[str, Look]:
-    """Each method's look: by its place in the registry, so the same in every plot; other names follow in order."""
+    """Return the style of each method. It depends on the registry's order, so it is the same in every plot.
+
+    Names that are not in the registry follow in their order.
+    """
     known = method_names()
     places = known + [name for name in methods if name not in known]
     return {name: _LOOKS[places.index(name) % len(_LOOKS)] for name in methods}
 
 
 def png_bytes(figure: Figure, dpi: int) -> bytes:
-    """The figure as PNG, on white whatever the user's matplotlibrc says."""
+    """Return a figure as a PNG file, on white whatever the user's matplotlibrc says."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # A capture's name in a script that the font lacks is drawn as boxes; no reason to disturb the terminal.
+        # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
     return buffer.getvalue()

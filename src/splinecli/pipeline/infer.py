@@ -21,12 +21,6 @@ if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
 
-SCHEMA = 1
-"""Of report.json. It rises when a field changes its meaning."""
-
-RESTORED, AS_STORED = "restored", "as stored"
-"""How a capture was read: see CaptureSource.read."""
-
 
 def infer_capture(
     folder: Path, options: InferOptions, observer: Observer = SILENT, *, estimator: Estimator | None = None
@@ -49,7 +43,8 @@ def infer_capture(
         OutputError: the results cannot be written.
     """
     from splinecli.inference import estimate_normals
-    from splinecli.results.files import report_of, write_estimate
+    from splinecli.results.files import write_estimate
+    from splinecli.results.report import report_of
 
     source, capture, read_seconds = _read(folder, options, observer)
     if estimator is None:
@@ -59,18 +54,15 @@ def infer_capture(
     warnings = [*map(str, capture.warnings), *_method_warnings(estimator, capture)]
     for warning in warnings:
         observer.warn(f"{capture.name}: {warning}")
-    report = {
-        "schema": SCHEMA,
-        **report_of(
-            estimate,
-            estimator,
-            options.as_dict(),
-            inputs_sha256(source, options.weights),
-            read_seconds=read_seconds,
-            warnings=warnings,
-        ),
-        "reading": AS_STORED if options.as_stored else RESTORED,
-    }
+    report = report_of(
+        estimate,
+        estimator,
+        options.as_dict(),
+        inputs_sha256(source, options.weights),
+        as_stored=options.as_stored,
+        read_seconds=read_seconds,
+        warnings=warnings,
+    )
     return write_estimate(
         estimate,
         report,
@@ -146,11 +138,12 @@ def _further_files(
     writers: list[Callable[[Path], None]] = []
     albedo = colours = None
     if "albedo" in options.maps or options.html:
+        from splinecli.pictures.maps import albedo_picture
         from splinecli.results.albedo import albedo_map
 
         with observer.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
             albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
-        colours = files.albedo_picture(albedo, capture.mask)
+        colours = albedo_picture(albedo, capture.mask)
         if "albedo" in options.maps:
             writers.append(partial(files.write_albedo, albedo, capture.mask))
     if "confidence" in options.maps and estimate.confidence_map is not None:

@@ -1,1 +1,1 @@
-"""What `infer` leaves behind for a capture: files, albedo, pages."""
+"""The results of `infer` for a capture: files, report, albedo, pages."""

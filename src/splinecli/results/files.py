@@ -13,14 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli import __version__
 from splinecli.files import current_umask, refusals_as_output_errors
 from splinecli.inference import NormalEstimate
 from splinecli.normals import Convention, encode_picture
-from splinecli.pictures.maps import albedo_picture as albedo_picture
-from splinecli.pictures.maps import confidence_picture, preview_picture
-from splinecli.pictures.png import encode_png as encode_png
-from splinecli.results.report import report_of as report_of
+from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
+from splinecli.pictures.png import encode_png
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT
 
 NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
@@ -48,21 +45,6 @@ OWN_FILES = (
     REPORT,
 )
 """All files that `infer` and `integrate` may write into a capture's folder of results."""
-
-
-def finished_report(
-    folder: Path, options: dict[str, Any], inputs: Callable[[], str]
-) -> dict[str, Any] | None:
-    """The report in the folder; None unless this version made it, of these inputs, as asked for, and all is there."""
-    try:
-        report = json.loads((folder / REPORT).read_text("utf-8"))
-        whole = all((folder / name).is_file() for name in report["files"])
-        same = (report["options"], report["version"]) == (json.loads(json.dumps(options)), __version__)
-        # Last, for it reads the capture's small files.
-        same = same and whole and report["inputs_sha256"] == inputs()
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return report if same else None
 
 
 def write_estimate(

@@ -11,6 +11,9 @@ from splinecli import __version__
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 
+SCHEMA = 1
+"""The version of the report's fields. It rises when a field changes its meaning."""
+
 
 def report_of(
     estimate: NormalEstimate,
@@ -18,6 +21,7 @@ def report_of(
     options: Mapping[str, Any],
     inputs: str,
     *,
+    as_stored: bool,
     read_seconds: float,
     warnings: Sequence[str],
 ) -> dict[str, Any]:
@@ -28,6 +32,7 @@ def report_of(
         estimator: the method that made it.
         options: the options of the run, ready for JSON.
         inputs: a digest that changes when an input file changes.
+        as_stored: whether the capture was read without any restoration.
         read_seconds: seconds that reading the capture took.
         warnings: what the user should know about the result.
     """
@@ -35,6 +40,7 @@ def report_of(
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
     height, width = capture.mask.shape
     return {
+        "schema": SCHEMA,
         "capture": capture.name,
         "method": estimator.name,
         "weights": estimator.weights,
@@ -55,6 +61,7 @@ def report_of(
         "options": options,
         "inputs_sha256": inputs,
         "version": __version__,
+        "reading": "as stored" if as_stored else "restored",
     }
 
 
