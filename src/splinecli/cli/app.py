@@ -8,6 +8,7 @@ import typer
 
 from splinecli import __version__
 from splinecli.cli.calibrate import calibrate
+from splinecli.cli.commands import Command, Group
 from splinecli.cli.evaluate import evaluate
 from splinecli.cli.import_weights import import_weights
 from splinecli.cli.infer import infer
@@ -18,6 +19,7 @@ from splinecli.cli.train import train
 
 app = typer.Typer(
     name="splinecli",
+    cls=Group,
     help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
     epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
     # Plain help reads the same on a terminal, in a pipe and in the README.
@@ -43,11 +45,11 @@ def _splinecli(
     pass
 
 
-app.command()(infer)
-app.command()(info)
-app.command()(calibrate)
-app.command()(integrate)
-app.command()(evaluate)
-app.command()(prepare)
-app.command()(train)
-app.command()(import_weights)
+app.command(cls=Command)(infer)
+app.command(cls=Command)(info)
+app.command(cls=Command)(calibrate)
+app.command(cls=Command)(integrate)
+app.command(cls=Command)(evaluate)
+app.command(cls=Command)(prepare)
+app.command(cls=Command)(train)
+app.command(cls=Command)(import_weights)

@@ -1,4 +1,4 @@
-"""Entry point: runs the app and turns what goes wrong into one message and an exit code."""
+"""Entry point: run the app, and turn every error into one message and an exit code."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from splinecli.errors import OutputError, SplinecliError
 
 INTERRUPTED = 130
 DEFECT = 1
-# Typer carries its own copy of click, elsewhere in each version; this is click's base of all usage errors.
+# Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
 _ClickUsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
-    _mend_streams()
+    _repair_streams()
+    _let_threads_sleep()
     command = typer.main.get_command(app)
     try:
         result = command.main(
@@ -38,9 +39,12 @@ def main(args: Sequence[str] | None = None) -> int:
         where = context.command_path if context else "splinecli"
         return fail(f"{message}. See '{where} --help'.", 2)
     except BrokenPipeError:
-        # The reader of stdout went away, as `| head` does. Python would complain again at its exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _end_at_closed_pipe()
+    except SystemExit as error:
+        # Click turns a closed pipe into exit code 1.
+        if isinstance(error.__context__, BrokenPipeError):
+            return _end_at_closed_pipe()
+        raise
     except (KeyboardInterrupt, typer.Abort):
         return fail("interrupted.", INTERRUPTED)
     except OSError as error:
@@ -55,12 +59,19 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def fail(message: str, exit_code: int) -> int:
-    """Say what went wrong, in one line on stderr, and hand back the exit code."""
+    """Print the message on stderr, in one line, and return the exit code."""
     print(f"splinecli: {message}", file=sys.stderr)
     return exit_code
 
 
-def _mend_streams() -> None:
+def _end_at_closed_pipe() -> int:
+    """Return 0: the reader of stdout has read enough, as `| head -1` does."""
+    # Otherwise Python complains when it flushes stdout at its exit.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _repair_streams() -> None:
     """Make streams usable that are closed (`>&-`) or cannot hold every character (an ASCII locale)."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -70,13 +81,23 @@ def _mend_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def _let_threads_sleep() -> None:
+    """Let PyTorch's threads sleep while they wait for each other, unless the user has chosen otherwise.
+
+    By default they spin. On a machine that is busy with other work this takes cores from the thread that computes.
+    PyTorch reads the variable when it is first imported.
+    """
+    if "GOMP_SPINCOUNT" not in os.environ:
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
 def run() -> None:
-    """The console script. SIGTERM, which job schedulers send, ends as cleanly as Ctrl-C."""
+    """Run the console script. SIGTERM, which job schedulers send, is treated like Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     code = main()
     if "TORCHELASTIC_RUN_ID" in os.environ:
-        # PyTorch's communication threads now and then abort a process of torchrun that ends by itself, after all
-        # is done; torchrun would take that for a failure.
+        # PyTorch's communication threads sometimes abort a process of torchrun after its work is done, and torchrun
+        # counts that as a failure. os._exit does not wait for these threads.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

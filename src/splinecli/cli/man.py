@@ -15,6 +15,7 @@ import typer
 
 from splinecli import __version__
 from splinecli.cli.app import app
+from splinecli.cli.commands import help_panels
 
 EXIT_STATUS = (
     ("0", "Done."),
@@ -125,7 +126,7 @@ def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
     lines = [
         *_beginning("splinecli", "surface normals from a few photographs under known lights", group, context),
         ".SH OPTIONS",
-        *_options(group, context),
+        *_options(help_panels(group, context)),
         ".SH COMMANDS",
     ]
     for name, command in commands.items():
@@ -143,9 +144,9 @@ def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any
         # In NAME stands no sentence: no capital, no full stop.
         *_beginning(_page_name(name), summary[0].lower() + summary[1:], command, context),
         ".SH OPTIONS",
-        *_options(command, context),
+        *_options(help_panels(command, context)),
         ".SH EXIT STATUS",
-        "0 when all is done; what else it may be is in",
+        "0 if everything is done. The other codes are listed in",
         ".BR splinecli (1).",
         *_examples(name),
     ]
@@ -167,23 +168,22 @@ def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str
         f"{_escape(title)} \\- {_escape(meaning)}",
         ".SH SYNOPSIS",
         f".B {_escape(context.command_path)}",
-        _escape(_without_braces(usage)),
+        _escape(usage),
         ".SH DESCRIPTION",
         *"\n.PP\n".join(map(_escape, _paragraphs(command.help))).split("\n"),
     ]
 
 
-def _options(command: Any, context: Any) -> list[str]:
-    """Arguments, then options."""
+def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
+    """Write the rows of a command's help, with a heading for each panel if there are several."""
     lines = []
-    for parameter in sorted(command.get_params(context), key=lambda one: one.param_type_name != "argument"):
-        term, meaning = parameter.get_help_record(context)
-        if parameter.param_type_name == "argument":
-            # The record has the Python type here.
-            term = _without_braces(" ".join(parameter.get_usage_pieces(context)))
-        # Bold what is typed as it stands, italic what stands for something.
-        words = [rf"\f{'B' if word[0] == '-' else 'I'}{_escape(word)}\fR" for word in term.split()]
-        lines += [".TP", " ".join(words), _escape(" ".join(meaning.split()))]
+    for title, rows in panels.items():
+        if len(panels) > 1:
+            lines.append(f".SS {_escape(title)}")
+        for term, meaning in rows:
+            # Bold for what is typed as it stands, italic for what stands for something.
+            words = [rf"\f{'B' if word[0] == '-' else 'I'}{_escape(word)}\fR" for word in term.split()]
+            lines += [".TP", " ".join(words), _escape(meaning)]
     return lines
 
 
@@ -222,11 +222,6 @@ def _reference(command: str) -> str:
 
 def _paragraphs(text: str) -> list[str]:
     return [" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n")]
-
-
-def _without_braces(usage: str) -> str:
-    """Typer sets braces about arguments that are required."""
-    return usage.translate({ord(brace): None for brace in "{}"})
 
 
 # Bare, these would be typeset: hyphens, curly quotes, accents.

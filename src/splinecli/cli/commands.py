@@ -1,0 +1,92 @@
+"""What all commands share: help in panels, and `~` in every path."""
+
+from __future__ import annotations
+
+import os
+import re
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from typer.core import TyperCommand, TyperGroup
+
+from splinecli.cli.panels import sort_into_panels
+
+TERM_WIDTH = 30
+"""Columns of the names of options in the help; a longer name has a line of its own."""
+
+ARGUMENTS = "Arguments"
+
+_RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"
+
+
+class Command(TyperCommand):
+    """A command whose help has panels, as plain text, and which expands `~` in what it is given."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command. A shell expands `~` in `-o ~/x`, but not in `--output=~/x`."""
+        ctx.params = {name: _expand(value) for name, value in ctx.params.items()}
+        return super().invoke(ctx)
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the parts of the usage line, without the braces that Typer sets about arguments."""
+        return [
+            piece.translate({ord(brace): None for brace in "{}"})
+            for piece in super().collect_usage_pieces(ctx)
+        ]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of the arguments, then of the options, panel by panel."""
+        panels = help_panels(self, ctx)
+        longest = min(max(len(term) for rows in panels.values() for term, _ in rows), TERM_WIDTH)
+        for title, rows in panels.items():
+            with formatter.section(title):
+                # All panels have their texts in one column.
+                formatter.write_dl([(term.ljust(longest), meaning) for term, meaning in rows], TERM_WIDTH)
+
+
+class Group(TyperGroup):
+    """The commands, each with the whole first sentence of its help."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of the commands."""
+        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in commands if command]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
+    """Return the title of each panel of a command's help and its rows: names, and what they mean."""
+    arguments, options = [], {}
+    for parameter in command.get_params(context):
+        record = parameter.get_help_record(context)
+        if record is None:
+            continue
+        term, meaning = record
+        if parameter.param_type_name == "argument":
+            # The record has the Python type beside the name.
+            arguments.append(
+                (str(parameter.metavar or parameter.name), _tidy(meaning.removesuffix("[required]")))
+            )
+        else:
+            long_name = max(parameter.opts, key=len)
+            options[long_name] = (term, _tidy(meaning))
+    panels = sort_into_panels(context.info_name, list(options))
+    rows = {title: [options[name] for name in names] for title, names in panels.items()}
+    return {ARGUMENTS: arguments, **rows} if arguments else rows
+
+
+def _tidy(meaning: str) -> str:
+    """Return a help text without the ranges of numbers that click adds, such as "[x>=1]"."""
+    meaning = re.sub(rf"\s*\[{_RANGE}\]$", "", meaning)
+    return " ".join(re.sub(rf"; {_RANGE}\]$", "]", meaning).split())
+
+
+def _expand(value: Any) -> Any:
+    """Return a value with `~` and `~user` at the beginning of a text or path replaced by the home folder."""
+    if isinstance(value, str | Path) and not isinstance(value, Enum):
+        return type(value)(os.path.expanduser(value))  # noqa: PTH111 - Path.expanduser raises for an unknown user
+    if isinstance(value, list | tuple):
+        return type(value)(_expand(item) for item in value)
+    return value

@@ -1,0 +1,91 @@
+"""Which options stand together in the help of each command."""
+
+from __future__ import annotations
+
+SPEED = ("--device", "--precision", "--batch-size")
+REPEAT = ("--overwrite", "--json", "--quiet")
+
+PANELS: dict[str, dict[str, tuple[str, ...]]] = {
+    "infer": {
+        "Input": (
+            "--mask",
+            "--auto-mask",
+            "--ground-truth",
+            "--transfer",
+            "--ambient",
+            "--flat-field",
+            "--white-level",
+            "--as-stored",
+        ),
+        "Lights": ("--lights", "--intensities", "--n-lights", "--seed", "--light-indices"),
+        "Method": ("--method", "--weights", "--rotations"),
+        "Output": (
+            "--output",
+            "--format",
+            "--maps",
+            "--html",
+            "--surface",
+            "--convention",
+            "--update",
+            *REPEAT,
+        ),
+        "Speed": SPEED,
+    },
+    "info": {
+        "Input": (
+            "--mask",
+            "--ground-truth",
+            "--transfer",
+            "--ambient",
+            "--flat-field",
+            "--white-level",
+            "--as-stored",
+        ),
+        "Lights": ("--lights", "--intensities"),
+        "Output": ("--plot", *REPEAT),
+    },
+    "calibrate": {
+        "Input": ("--circle", "--mask"),
+        "Light intensities": ("--gray-ball", "--gray-card", "--transfer"),
+        "Output": ("--output", "--compare", *REPEAT),
+    },
+    "integrate": {
+        "Input": ("--mask", "--camera-matrix", "--convention", "--colours"),
+        "Method": ("--stiffness", "--largest-step"),
+        "Output": ("--output", "--format", *REPEAT),
+    },
+    "evaluate": {
+        "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level"),
+        "Lights": ("--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg"),
+        "Method": ("--method", "--weights", "--rotations"),
+        "Output": ("--output", "--figures", "--pixel", *REPEAT),
+        "Speed": ("--jobs", *SPEED),
+    },
+    "prepare": {
+        "Input": ("--as-stored", "--white-level"),
+        "Scenes": ("--scenes", "--mesh", "--size", "--lights", "--measured", "--measured-share", "--seed"),
+        "Output": ("--output", *REPEAT),
+    },
+    "train": {
+        "Settings": ("--preset", "--config", "--param", "--start-from", "--seed"),
+        "Pixels": ("--generator-weight", "--n-lights"),
+        "Length": ("--steps", "--minutes", "--resume"),
+        "Output": ("--output", "--tensorboard", "--quiet"),
+        "Speed": ("--device",),
+    },
+    "import-weights": {"Output": ("--output", *REPEAT)},
+}
+"""Command -> title of a panel -> its options, in the order of the help."""
+
+OTHERS = "Options"
+"""Title of the options that no panel names, such as --help."""
+
+
+def sort_into_panels(command: str, options: list[str]) -> dict[str, list[str]]:
+    """Return the title of each panel and those of the options (their long names) that stand in it."""
+    panels = {
+        title: [name for name in names if name in options] for title, names in PANELS.get(command, {}).items()
+    }
+    named = {name for names in panels.values() for name in names}
+    panels[OTHERS] = [name for name in options if name not in named]
+    return {title: names for title, names in panels.items() if names}
