@@ -1,4 +1,4 @@
-"""Where a capture's lights stand, seen from the camera: the disc that observation maps are drawn on."""
+"""A plot of the light directions of a capture as the camera sees them, on the disc of observation maps."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from numpy.typing import NDArray
 
 from splinecli.pictures.plotting import png_bytes
 
-_RINGS_DEG = (15, 30, 45, 60, 75)  # from the view axis
+_RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
 
 
 def sky_plot(light_directions: NDArray[np.float64], title: str) -> bytes:
-    """PNG of the lights (F, 3) at their (x, y), numbered from 1; rings are angles from the view axis."""
+    """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
+
+    The rings are angles from the viewing direction, in degrees.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 6), layout="constrained")
@@ -20,7 +23,7 @@ def sky_plot(light_directions: NDArray[np.float64], title: str) -> bytes:
     for ring_deg in (*_RINGS_DEG, 90):
         radius = np.sin(np.radians(ring_deg))
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1)
-        if ring_deg < 90:  # beside 75 degrees there is no room for it
+        if ring_deg < 90:  # the label of 90 degrees would overlap that of 75 degrees
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
     axes.scatter(x, y, s=30, color="#D55E00", zorder=3)

@@ -134,7 +134,7 @@ def _calibrate_balls(
 
 
 def _looks_display_encoded(files: BallFiles) -> bool:
-    from splinecli.capture.formats.header import is_display_encoded
+    from splinecli.capture.linearise import is_display_encoded
 
     return any(is_display_encoded(image) for image in files.images)
 
@@ -147,7 +147,7 @@ def _write(
 ) -> None:
     from splinecli.files import write_bytes, write_text
     from splinecli.pictures.calibration import calibration_picture
-    from splinecli.results.files import encode_png
+    from splinecli.pictures.png import encode_png
 
     write_text(folder / DIRECTIONS, _text(lights.directions))
     if intensities is None:
