@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import typer
 
+from splinecli.capture import capture_warnings
 from splinecli.capture.formats import exposure
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore import light_intensities
@@ -118,8 +119,9 @@ def test_commands_have_options_that_exist(page, command):
         ("docs/train.md", f"eta = {TrainingConfig().eta:g} and lambda_c = {TrainingConfig().lambda_c:g}"),
         ("docs/train.md", f"lambda_s = {PRESETS['paper'].symmetric_weight:g}"),
         ("docs/infer.md", f"at least {light_intensities.FEWEST_LIGHTS} lights"),
-        ("docs/infer.md", f"to {100 * light_intensities.PLAIN:.0f} % or less"),
-        ("docs/infer.md", f"to {100 * light_intensities.WORST_FIT:.1f} % or less"),
+        ("docs/infer.md", f"at most {100 * light_intensities.PLAIN:.0f} % of that"),
+        ("docs/infer.md", f"is at most {100 * light_intensities.WORST_FIT:.1f} %"),
+        ("docs/infer.md", f"is above {100 * light_intensities.MISFIT:.0f} %"),
         ("docs/files-and-frames.md", f"more than {100 * exposure.SAME:.0f} % apart"),
         ("docs/files-and-frames.md", f"cells along one side of an observation map: {MAP_SIZE}"),
         ("docs/method.md", f"a wall beside {100 * PixelGeneratorConfig().wall_share:.0f} % of the pixels"),
@@ -153,6 +155,14 @@ def test_fields_of_the_report():
     _, _, section = text_of("docs/infer.md").partition("## The report")
     cells = re.findall(r"^\| (`[^|]*`) \|", section.partition("\n## ")[0], re.MULTILINE)
     assert {name for cell in cells for name in re.findall(r"`(\w+)`", cell)} == fields
+
+
+def test_every_warning_is_explained():
+    codes = {
+        value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)
+    }
+    explained = re.findall(r"^\| `(\w+)` \|", text_of("docs/troubleshooting.md"), re.MULTILINE)
+    assert sorted(codes) == explained
 
 
 def test_rooms_of_the_contributing_page():
