@@ -81,7 +81,7 @@ def train(
     loses at most that; --resume goes on. Settings come from the preset, then the file, then the options. Under
     torchrun all processes train together.
     """
-    from splinecli.devices import choose_device
+    from splinecli.devices import choose_device, use_available_cores
     from splinecli.files import check_writable, held_folder
     from splinecli.training.config_files import parse_parameter
     from splinecli.training.defaults import CHECKPOINT, WEIGHTS
@@ -108,6 +108,7 @@ def train(
     if minutes is not None:
         settings = replace(settings, minutes=minutes)
     check_writable(output)
+    use_available_cores()
     workers, own_device = join_workers(choose_device(device.value))
     talk = Messages(quiet=quiet or not workers.leads)
     with ExitStack() as stack:

@@ -1,4 +1,7 @@
-"""The methods by name. A new method is one new file and one entry here, imported when it is made."""
+"""The methods by name. To add a method, write one file and add one entry here.
+
+The file is imported when the method is used.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,15 @@ DEFAULT_METHOD = "spline-net"
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """What a user may choose about a method; each method takes what means something to it.
+    """Settings of a method. Each method ignores those that do not apply to it.
 
-    weights: a shipped name or a file; None there, as for rotations and batch_size, for the method's own.
+    weights: a shipped name or a file.
+    rotations: number of rotations of the lights whose normals a network averages.
+    batch_size: pixels per batch.
+    device: where to compute; "auto" is a CUDA GPU if there is one.
+    precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
+
+    None stands for the method's default.
     """
 
     weights: str | None = None
@@ -30,19 +39,27 @@ class MethodOptions:
 
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
-    """An estimator ready to run. Raises UsageError (unknown name or device), ModelError (weights)."""
+    """Return the estimator of this name.
+
+    Methods that run in PyTorch (all but "ls") limit its threads to the cores that the process may use; see
+    splinecli.devices.use_available_cores.
+
+    Raises:
+        UsageError: the name, the device or a number is not valid.
+        ModelError: the weights cannot be used.
+    """
     check_method(name)
     return _METHODS[name](name, options)
 
 
 def check_method(name: str) -> None:
-    """Raise UsageError for an unknown name, before anything heavy is loaded."""
+    """Raise UsageError if no method has this name. Loads nothing heavy."""
     if name not in _METHODS:
         raise UsageError(f"no method named {name!r}; expected one of {', '.join(_METHODS)}")
 
 
 def method_names() -> list[str]:
-    """Names of all methods."""
+    """Return the names of all methods."""
     return list(_METHODS)
 
 
@@ -54,15 +71,16 @@ def _least_squares(*_: object) -> Estimator:
 
 @dataclass(frozen=True)
 class _Solver:
-    """In which file of `fits` a BatchedEstimator's `solve` lies, and how many pixels it takes at a time."""
+    """A method whose `solve` is in a module of `splinecli.fits`, and its default batch size."""
 
     module: str
     batch_size: int
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
-        from splinecli.devices import choose_device
+        from splinecli.devices import choose_device, use_available_cores
         from splinecli.methods.batched import BatchedEstimator
 
+        use_available_cores()
         solve = import_module(f"splinecli.fits.{self.module}").solve
         size = self.batch_size if options.batch_size is None else options.batch_size
         return BatchedEstimator(name, solve, str(choose_device(options.device)), size)
@@ -70,16 +88,17 @@ class _Solver:
 
 @dataclass(frozen=True)
 class _Network:
-    """The views that a network averages and the pixels it takes at a time, unless the user says otherwise."""
+    """A network, with its default number of averaged rotations and its default batch size."""
 
     rotations: int
     batch_size: int
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
-        from splinecli.devices import choose_device, choose_precision
+        from splinecli.devices import choose_device, choose_precision, use_available_cores
         from splinecli.methods.networks import NetworkEstimator
         from splinecli.networks.weights import resolve_weights
 
+        use_available_cores()
         device = choose_device(options.device)
         return NetworkEstimator(
             name,
