@@ -1,18 +1,21 @@
-"""Pixels a second of the shipped network and of the paper's, on the CPU, same run; and the whole `infer` command.
+"""Measure the pixels per second of the shipped network and of the paper's, and the whole `infer` command.
 
 python benchmarks/inference_speed.py [CAPTURE]
 
-The networks get ten lights of one random rig. Medians over the repeats, after one warm-up. With a CAPTURE (such as
-DiLiGenT's catPNG) the whole command is timed on it too, from ten lights, in processes of its own.
+The networks run on the CPU, on --pixels generated pixels under ten random lights; the paper's network, which is much
+slower, gets a thirty-second of them. Each figure is the median over --repeats runs, after one warm-up. With a CAPTURE
+(such as DiLiGenT's catPNG), the whole command is measured too, with ten lights, in processes of its own.
 """
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 
 import torch
 
@@ -25,7 +28,7 @@ from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 
 def pixels_per_second(loaded: LoadedNetwork, precision: Precision, pixels: int, repeats: int) -> float:
-    """Median over the repeats of `pixels` over the seconds that they take."""
+    """Return the median speed over the repeats."""
     config = PixelGeneratorConfig(min_lights=10, max_lights=10)
     batch = PixelGenerator(config, torch.Generator().manual_seed(0)).draw(pixels)
     observations, lights = batch.observations.numpy(), batch.light_directions[0].double().numpy()
@@ -38,35 +41,37 @@ def pixels_per_second(loaded: LoadedNetwork, precision: Precision, pixels: int, 
     return pixels / statistics.median(seconds[1:])
 
 
-def main() -> None:
+def command_seconds(capture: str, repeats: int) -> float:
+    """Return the median time of `splinecli infer CAPTURE --n-lights 10`."""
+    seconds = []
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as out:
+            command = [sys.executable, "-m", "splinecli", "infer", capture, "--n-lights", "10", "-o", out]
+            started = time.perf_counter()
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("capture", nargs="?")
+    parser.add_argument("--pixels", type=int, default=16_384)
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args(arguments)
     print(f"{torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}")
     paper_network = SplineNet(NetworkConfig(size="paper")).eval().to(memory_format=torch.channels_last)
-    paper = pixels_per_second(LoadedNetwork(paper_network, "paper", ""), "float32", 512, 3)
+    loaded = LoadedNetwork(paper_network, "paper", "")
+    paper = pixels_per_second(loaded, "float32", options.pixels // 32, options.repeats)
     print(f"paper      float32   {paper:8.0f} pixels/s")
     shipped = resolve_weights("spline-net")
-    for precision in ("float32", "bfloat16"):
-        speed = pixels_per_second(shipped, precision, 16_384, 5)
+    precisions: tuple[Precision, ...] = ("float32", "bfloat16")
+    for precision in precisions:
+        speed = pixels_per_second(shipped, precision, options.pixels, options.repeats)
         auto = " (auto)" if choose_precision("auto", torch.device("cpu")) == precision else ""
         print(f"spline-net {precision:9} {speed:8.0f} pixels/s, {speed / paper:.0f} times the paper's{auto}")
-    if len(sys.argv) > 1:
-        seconds = []
-        for _ in range(3):
-            with tempfile.TemporaryDirectory() as out:
-                command = [
-                    sys.executable,
-                    "-m",
-                    "splinecli",
-                    "infer",
-                    sys.argv[1],
-                    "--n-lights",
-                    "10",
-                    "-o",
-                    out,
-                ]
-                started = time.perf_counter()
-                subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-                seconds.append(time.perf_counter() - started)
-        print(f"infer {sys.argv[1]}: {statistics.median(seconds):.1f} s")
+    if options.capture:
+        print(f"infer {options.capture}: {command_seconds(options.capture, options.repeats):.1f} s")
 
 
 if __name__ == "__main__":

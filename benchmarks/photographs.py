@@ -1,15 +1,18 @@
-"""What splinecli does for photographs of one's own, measured on captures with ground truth.
+"""Measure how splinecli handles overexposure, unknown light intensities, and its own confidence.
 
     python benchmarks/photographs.py CAPTURE... [--draws 2] [--pixels 1500]
 
-For each capture, under draws of ten lights (seed 0) and a seeded subset of its pixels: how far normals are off where a
-fifth of the observations is overexposed; what comes of the lights' strengths when they are withheld; and whether the
-confidence is what it says. The last table puts all captures together.
+The captures need ground truth. Each is measured under draws of ten lights (seed 0) on a random subset of its pixels:
+
+1. the errors of overexposed pixels, if a fifth of the observations is cut off;
+2. the estimated light intensities, if the measured ones are withheld;
+3. the errors that the confidence predicts, and the actual ones. The last row is for all captures together.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,15 +32,15 @@ from splinecli.normals import angle_between_deg
 
 N_LIGHTS = 10
 OVEREXPOSED = 0.2
-"""Share of a draw's observations that are cut off."""
+"""Share of the observations of a draw that is cut off."""
 
 
 class Draw(NamedTuple):
-    """Observations (P, F), lights (F, 3), their strengths (F,), and true normals (P, 3)."""
+    """Observations (P, F), light directions (F, 3) and intensities (F,), and true normals (P, 3)."""
 
     observations: NDArray[np.float32]
     lights: NDArray[np.float64]
-    strengths: NDArray[np.float64]
+    intensities: NDArray[np.float64]
     normals: NDArray[np.float32]
 
 
@@ -48,12 +51,12 @@ def read_draws(folder: Path, n_draws: int, n_pixels: int) -> list[Draw]:
     normals = capture.ground_truth[capture.mask]
     known = np.flatnonzero(normals.any(axis=1))
     rows = np.sort(np.random.default_rng(5).choice(known, min(n_pixels, len(known)), replace=False))
-    strengths = source.light_intensities.mean(axis=1)
+    intensities = source.light_intensities.mean(axis=1)
     return [
         Draw(
             capture.observations[rows][:, d],
             capture.light_directions[list(d)],
-            strengths[list(d)],
+            intensities[list(d)],
             normals[rows],
         )
         for d in draw_lights(capture.light_directions, N_LIGHTS, trials=n_draws, seed=0)
@@ -64,7 +67,7 @@ def read_draws(folder: Path, n_draws: int, n_pixels: int) -> list[Draw]:
 def estimate(
     network: SplineNet, observations: NDArray[np.float32], draw: Draw, valid: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Errors (P,) in degrees and confidences (P,)."""
+    """Return errors (P,) in degrees and confidences (P,)."""
     normals, error = network(
         torch.from_numpy(observations),
         torch.from_numpy(draw.lights).float(),
@@ -75,14 +78,14 @@ def estimate(
 
 
 def overexposed(network: SplineNet, draw: Draw) -> list[float]:
-    """Mean errors of the pixels concerned: properly exposed, as stored, saturated ones left out, restored."""
+    """Return mean errors of the pixels cut off: well exposed, as stored, without the saturated values, restored."""
     limit = np.quantile(draw.observations, 1 - OVEREXPOSED)
     stored, saturated = np.minimum(draw.observations, limit), draw.observations >= limit
     restored = stored.copy()
     restore_saturated(restored, saturated, draw.lights)
-    concerned = saturated.any(axis=1)
+    affected = saturated.any(axis=1)
     return [
-        float(errors[concerned].mean())
+        float(errors[affected].mean())
         for errors, _ in (
             estimate(network, draw.observations, draw),
             estimate(network, stored, draw),
@@ -92,49 +95,55 @@ def overexposed(network: SplineNet, draw: Draw) -> list[float]:
     ]
 
 
-def withheld(network: SplineNet, draw: Draw) -> tuple[bool, list[float]]:
-    """Whether unequal strengths were found; spread of the log strengths' error in %, if equal and as found; errors."""
-    raw = (draw.observations * draw.strengths).astype(np.float32)
-    found = estimate_light_intensities(raw, None, draw.lights)
-    used = np.ones(N_LIGHTS) if found is None else found
-    spreads = [100 * float(np.std(np.log(s / draw.strengths))) for s in (np.ones(N_LIGHTS), used)]
+def without_intensities(network: SplineNet, draw: Draw) -> tuple[bool, list[float]]:
+    """Return whether intensities were estimated, the errors of the intensities, and those of the normals.
+
+    The errors of the intensities are standard deviations of the logarithm in %: of equal ones and of the estimated
+    ones. Those of the normals are for the measured, equal and estimated intensities.
+    """
+    raw = (draw.observations * draw.intensities).astype(np.float32)
+    estimated = estimate_light_intensities(raw, None, draw.lights)
+    used = np.ones(N_LIGHTS) if estimated is None else estimated
+    spreads = [100 * float(np.std(np.log(s / draw.intensities))) for s in (np.ones(N_LIGHTS), used)]
     errors = [
         estimate(network, o, draw)[0].mean()
         for o in (draw.observations, raw, (raw / used).astype(np.float32))
     ]
-    return found is not None, [*spreads, *(float(error) for error in errors)]
+    return estimated is not None, [*spreads, *(float(error) for error in errors)]
 
 
-def share_found(confidence: NDArray[np.float32], errors_deg: NDArray[np.float64]) -> float:
-    """Of the largest tenth of the errors, the share in the tenth of the pixels with the least confidence."""
+def share_detected(confidence: NDArray[np.float32], errors_deg: NDArray[np.float64]) -> float:
+    """Return the share of the largest tenth of the errors that is in the least confident tenth of the pixels."""
     large = errors_deg > np.quantile(errors_deg, 0.9)
     return float(large[confidence <= np.quantile(confidence, 0.1)].sum() / large.sum())
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--draws", type=int, default=2)
     parser.add_argument("--pixels", type=int, default=1500)
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     network = resolve_weights("spline-net").network
     captures = {folder.name: read_draws(folder, args.draws, args.pixels) for folder in args.captures}
 
-    print("overexposed: MAE of the pixels concerned      exposed well   as stored     left out     restored")
+    print("overexposed: MAE of the pixels cut off       well exposed    as stored     left out     restored")
     for name, draws in captures.items():
         means = np.mean([overexposed(network, draw) for draw in draws], axis=0)
         print(f"{name:44} " + " ".join(f"{mean:12.2f}" for mean in means))
 
-    print("\nstrengths withheld: found   % off: if equal, as found    MAE: given, if equal, as found")
+    print("\nintensities unknown: estimated   % off: equal, estimated   MAE: measured, equal, estimated")
     for name, draws in captures.items():
-        results = [withheld(network, draw) for draw in draws]
+        results = [without_intensities(network, draw) for draw in draws]
         means = np.mean([numbers for _, numbers in results], axis=0)
-        told = sum(found for found, _ in results)
-        print(f"{name:18} {told:3} of {len(draws):3}" + " ".join(f"{mean:10.2f}" for mean in means))
+        estimated = sum(is_estimated for is_estimated, _ in results)
+        print(f"{name:18} {estimated:3} of {len(draws):3}" + " ".join(f"{mean:10.2f}" for mean in means))
 
-    print("\nconfidence: share under 5 degrees expected, found; share of the large errors in the worst tenth")
+    print(
+        "\nconfidence: share under 5 degrees expected, actual; share of the large errors in the least confident tenth"
+    )
     everything: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
     for name, draws in captures.items():
         errors, confidence = map(
@@ -146,8 +155,8 @@ def main() -> None:
 
 
 def print_confidence(name: str, errors: NDArray[np.float64], confidence: NDArray[np.float32]) -> None:
-    found = (errors <= CONFIDENT_DEG).mean()
-    print(f"{name:18} {confidence.mean():6.2f} {found:6.2f} {share_found(confidence, errors):6.2f}")
+    actual = (errors <= CONFIDENT_DEG).mean()
+    print(f"{name:18} {confidence.mean():6.2f} {actual:6.2f} {share_detected(confidence, errors):6.2f}")
 
 
 if __name__ == "__main__":

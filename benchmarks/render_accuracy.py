@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -139,7 +140,7 @@ def render_with_mitsuba(
     return image[..., -3:] if light is None else image[..., :3].mean(axis=-1)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     import mitsuba as mi
 
     mi.set_variant("scalar_rgb")
@@ -148,7 +149,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     for name in ("directions", "subsamples"):
         parser.add_argument(f"--{name}", type=int)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     config = SceneConfig(size=options.size, bounces=options.bounces)
     if options.directions:
         config = dataclasses.replace(config, directions=options.directions)

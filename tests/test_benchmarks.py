@@ -1,0 +1,95 @@
+"""Each benchmark runs to its end on small inputs and prints every row."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from splinecli.methods import method_names
+
+ROOT = Path(__file__).resolve().parents[1]
+MEDALLION = str(ROOT / "examples/medallion")
+
+Run = Callable[..., str]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the benchmark of this name and return what it prints."""
+
+    def run_benchmark(name: str, *arguments: str) -> str:
+        spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        main: Callable[[Sequence[str]], None] = module.main
+        main(arguments)
+        return capsys.readouterr().out
+
+    return run_benchmark
+
+
+def numbers(line: str) -> list[float]:
+    return [
+        float(number) for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))
+    ]
+
+
+def test_every_benchmark_has_a_test() -> None:
+    text = Path(__file__).read_text("utf-8")
+    for path in (ROOT / "benchmarks").glob("*.py"):
+        assert f'run("{path.stem}"' in text.replace("(\n        ", "("), path.name
+
+
+def test_training_speed(run: Run) -> None:
+    """It crashed: CNN-PS has no LI-Net, so its updates cannot alternate."""
+    printed = run(
+        "training_speed", "--batch-size", "8", "--steps", "1", "--warm-up", "1", "--device", "cpu"
+    ).splitlines()
+    rows = [line.split("  ")[0] for line in printed[1:]]
+    assert rows == ["compact", "compact, Ls and La", "compact, alternating", "paper", "cnn-ps"]
+    assert all(min(numbers(line[25:])) > 0 for line in printed[1:])
+
+
+def test_method_speed(run: Run) -> None:
+    printed = run("method_speed", MEDALLION, "--pixels", "40", "--repeats", "1").splitlines()
+    assert printed[0] == "medallion, 10 lights"
+    assert [line.split()[0] for line in printed[1:]] == method_names()
+
+
+def test_inference_speed(run: Run) -> None:
+    printed = run("inference_speed", "--pixels", "64", "--repeats", "1").splitlines()
+    assert [line.split()[0] for line in printed[1:]] == ["paper", "spline-net", "spline-net"]
+    assert sum("(auto)" in line for line in printed) == 1
+
+
+def test_photographs(run: Run) -> None:
+    printed = run("photographs", MEDALLION, "--draws", "1", "--pixels", "60")
+    overexposed, intensities, confidence = printed.split("\n\n")
+    assert len(numbers(overexposed.splitlines()[1])) == 4
+    assert len(numbers(intensities.splitlines()[1])) == 7
+    assert [line.split()[0] for line in confidence.splitlines()[1:]] == ["medallion", "all"]
+
+
+def test_render_accuracy(run: Run) -> None:
+    pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    printed = run(
+        "render_accuracy", "--size", "12", "--samples", "4", "--scenes", "1", "--directions", "4"
+    ).splitlines()
+    assert [line.split()[0] for line in printed[2:5]] == ["diffuse", "specular", "metallic"]
+    assert printed[-1].count("%") == 3
+
+
+def test_busy_machine(run: Run) -> None:
+    """The quiet machine alone: each figure takes a process that loads PyTorch."""
+    header, row = run("busy_machine", "--busy", "0", "--pixels", "100", "--repeats", "1").splitlines()
+    assert header.split("  ")[-1].strip() == "default / passive"
+    assert row.startswith("quiet")
+    default, passive, single, ratio = numbers(row)
+    assert min(default, passive, single) > 0
+    assert ratio == pytest.approx(default / passive, abs=0.02 * ratio + 0.02)
