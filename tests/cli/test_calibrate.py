@@ -190,3 +190,13 @@ def test_a_display_encoded_target_is_reported(run):
     arguments = ["calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray", "--overwrite"]
     assert "--transfer srgb reverses the curve" in run(*arguments).err
     assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err
+
+
+def test_home_folder_in_paths(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    write_balls(tmp_path / "home" / "ball")
+    cv2.imwrite(str(tmp_path / "home" / "ball.png"), normals()[1].astype(np.uint8) * 255)
+    result = run("calibrate", "~/ball", "--mask=~/ball.png", "--output=~/out")
+    assert (result.code, result.out) == (0, f"{tmp_path}/home/out/light_directions.txt\n")
+    assert not Path("~").exists()

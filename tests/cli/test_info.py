@@ -1,4 +1,4 @@
-"""`splinecli info`: what it says of a capture whose content is known, and that it writes nothing."""
+"""`splinecli info`: its report of a capture whose content is known, and that it writes nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def files_below(folder: Path) -> list[str]:
     return sorted(str(path) for path in folder.rglob("*"))
 
 
-def test_what_is_said_of_a_capture(run, capture):
+def test_the_report_of_a_capture(run, capture):
     before = files_below(capture.parent)
     result = run("info", str(capture))
     assert files_below(capture.parent) == before
@@ -23,9 +23,10 @@ def test_what_is_said_of_a_capture(run, capture):
     assert rows["capture"] == f"{capture.name} (plain folder)"
     assert rows["images"] == "8: 24 x 24, gray, 16 bits"
     # (+-0.4, +-0.4, 1) are the lowest lights, 29.5 degrees from the view axis.
-    assert rows["lights"].endswith("light_directions.txt, 60 to 90 degrees above the picture's plane")
+    assert rows["lights"].endswith("light_directions.txt, 60 to 90 degrees above the image plane")
     assert rows["mask"].endswith("mask.png (448 pixels)")
     assert rows["intensities"].startswith("none")
+    assert rows["white level"] == "65535, the full scale of the files"
 
 
 def test_the_same_as_json(run, capture):
@@ -76,9 +77,67 @@ def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
     before = (capture / "image1.png").read_bytes()
     for name in ("image1.png", "sky.png"):
         result = run("info", capture, "--plot", capture / name)
-        assert (result.code, "would lie among the photographs" in result.err) == (2, True)
+        assert (result.code, "would be in the folder of the images" in result.err) == (2, True)
     assert (capture / "image1.png").read_bytes() == before
     (tmp_path / "mine.png").write_bytes(b"mine")
     assert run("info", capture, "--plot", tmp_path / "mine.png").code == 5
     assert (tmp_path / "mine.png").read_bytes() == b"mine"
     assert run("info", capture, "--plot", tmp_path / "mine.png", "--overwrite").code == 0
+
+
+def test_quiet_prints_nothing_but_errors(run, capture):
+    result = run("info", capture, "-q")
+    assert (result.code, result.out, result.err) == (0, "", "")
+    # --json asks for its document, quiet or not.
+    assert json.loads(run("info", capture, "-q", "--json").out)["images"] == 8
+    result = run("info", "nowhere", "-q")
+    assert (result.code, result.out) == (3, "")
+    assert result.err.startswith("splinecli: nowhere: ")
+
+
+def clip_at_12_bits(capture: Path, times: float = 2) -> None:
+    """Turn the images into 12-bit data in 16-bit files, `times` overexposed."""
+    for path in capture.glob("image*.png"):
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
+        cv2.imwrite(str(path), np.minimum(stored * times / 16, 4095).astype(np.uint16))
+
+
+def test_the_white_level_of_12_bit_data(run, capture):
+    """Clipped at 4095, no value reaches the full scale of the files, and yet many are saturated."""
+    clip_at_12_bits(capture)
+    result = run("info", capture)
+    assert "white level  4095, found in the images\n" in result.out
+    report = json.loads(run("info", capture, "--json").out)
+    assert report["white_level"] == {"value": 4095, "origin": "images"}
+    mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
+    shares = [
+        (cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean()
+        for path in capture.glob("image*.png")
+    ]
+    assert report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
+    assert report["exposure"]["saturated"] > 0.1
+    assert report["exposure"]["bright"][1] == pytest.approx(1)
+
+
+def test_a_white_level_given_by_the_user(run, capture):
+    clip_at_12_bits(capture, times=0.5)
+    result = run("info", capture, "--white-level", 2000)
+    assert "white level  2000, given by --white-level\n" in result.out
+    given = json.loads(run("info", capture, "--white-level", 1000, "--json").out)
+    assert (
+        given["exposure"]["saturated"]
+        > json.loads(run("info", capture, "--json").out)["exposure"]["saturated"]
+    )
+    assert run("info", capture, "--white-level", -1).code == 2
+
+
+@pytest.mark.parametrize("option", ["--plot", "--lights", "--mask"])
+def test_home_folder_in_paths(run, capture, tmp_path, monkeypatch, option):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    for name in ("light_directions.txt", "mask.png"):
+        (tmp_path / "home" / name).write_bytes((capture / name).read_bytes())
+    name = {"--plot": "sky.png", "--lights": "light_directions.txt", "--mask": "mask.png"}[option]
+    assert run("info", capture, f"{option}=~/{name}").code == 0
+    assert (tmp_path / "home" / name).exists()
+    assert not Path("~").exists()

@@ -1,4 +1,4 @@
-"""`splinecli integrate`: a normal map in its forms, the files, and the refusals."""
+"""`splinecli integrate`: normal maps in all formats, the files, and the errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHAPE = (40, 50)
 
 
 def sphere():
-    """Normals and heights of a cap of radius 30 about (24.5, 19.5), and where it is."""
+    """Return normals, heights and mask of a spherical cap of radius 30 about (24.5, 19.5)."""
     y, x = np.indices(SHAPE).astype(float)
     nx, ny = (x - 24.5) / 30, (19.5 - y) / 30
     inside = np.hypot(nx, ny) < 0.6
@@ -52,14 +52,14 @@ def test_heights_and_mesh_of_a_sphere(run):
 
 
 @pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"], ["."]])
-def test_forms_of_normal_maps(run, arguments):
+def test_formats_of_normal_maps(run, arguments):
     assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
     _, heights, inside = sphere()
     assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
 
 
 @pytest.mark.parametrize("form", ["png", "png8"])
-def test_a_folder_tells_how_it_was_written(run, capture, form):
+def test_the_convention_of_a_folder_is_recognised(run, capture, form):
     for convention in ("opengl", "directx"):
         arguments = ["--method", "ls", "--format", form, "--convention", convention, "-o", convention]
         assert run("infer", capture, *arguments).code == 0
@@ -154,3 +154,15 @@ def test_refusals(run, golden):
         messages.append(result.err.replace(f"{Path.cwd()}/", ""))
     golden("integrate_refusals.txt", "".join(messages))
     assert not Path("out").exists()
+
+
+def test_quiet_prints_nothing(run):
+    result = run("integrate", "normals.npy", "-o", "out", "-q")
+    assert (result.code, result.out, result.err) == (0, "", "")
+
+
+def test_home_folder_in_paths(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    result = run("integrate", "~/normals.npy", "--output=~/out", "--format", "npy")
+    assert (result.code, result.out.split(":")[0]) == (0, f"{tmp_path}/out")
+    assert not Path("~").exists()

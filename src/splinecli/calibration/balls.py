@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
 from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.image_size import check_size
 from splinecli.capture.formats.images import read_mask, to_linear
 from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
@@ -126,12 +127,7 @@ def calibrate_ball(
     for path in files.images:
         stored = decode_image(path)
         first = first or stored.shape[:2]
-        if stored.shape[:2] != first:
-            raise InputError(
-                f"found an image of {stored.shape[1]} x {stored.shape[0]} pixels, expected {first[1]} x {first[0]}"
-                f" as in {files.images[0].name}",
-                path=path,
-            )
+        check_size(stored.shape, first, path, like=files.images[0].name)
         if not circle.inside(first).any():
             raise InputError(
                 "the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels"
@@ -197,12 +193,8 @@ def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
     total: NDArray[np.float32] | None = None
     for path in images:
         gray = to_linear(decode_image(path), path).mean(axis=2)
-        if total is not None and total.shape != gray.shape:
-            raise InputError(
-                f"found an image of {gray.shape[1]} x {gray.shape[0]} pixels,"
-                f" expected {total.shape[1]} x {total.shape[0]} as in {images[0].name}",
-                path=path,
-            )
+        if total is not None:
+            check_size(gray.shape, total.shape, path, like=images[0].name)
         total = gray if total is None else total + gray
     assert total is not None
     return total / np.float32(len(images))

@@ -12,6 +12,7 @@ from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.exposure import check_exposures
+from splinecli.capture.formats.image_size import check_size
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import AMBIENT, find_named
 from splinecli.capture.linearise import Lineariser, RadiometricCalibration
@@ -56,7 +57,7 @@ def measure_light_intensities(
     radiometry = RadiometricCalibration(gamma, find_named(files.folder, AMBIENT))
     linearise = Lineariser(radiometry, mask, len(files.images))
     intensities = [
-        _intensity(path, linearise, index, normals @ light)
+        _intensity(path, linearise, index, normals @ light, files.images[0])
         for index, (path, light) in enumerate(zip(files.images, light_directions, strict=True))
     ]
     relative: NDArray[np.float64] = np.array(intensities) / np.mean(intensities)
@@ -68,8 +69,8 @@ def _target_normals(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
     mask = np.ones(shape, np.bool_) if files.mask is None else read_mask(files.mask)
-    if mask.shape != shape:
-        raise InputError("the mask's size is not the images'", path=files.mask)
+    if files.mask is not None:
+        check_size(mask.shape, shape, files.mask, like=files.images[0].name, what="a mask")
     if target == "card":
         return mask, np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     if files.mask is None:
@@ -83,12 +84,11 @@ def _target_normals(
 
 
 def _intensity(
-    path: Path, linearise: Lineariser, index: int, cosine: NDArray[np.float64]
+    path: Path, linearise: Lineariser, index: int, cosine: NDArray[np.float64], first: Path
 ) -> NDArray[np.float64]:
     """Return the intensity (3,) of the light of one image; cosine (P,) is n.l at the pixels of the mask."""
     stored = decode_image(path)
-    if stored.shape[:2] != linearise.mask.shape:
-        raise InputError("the image is not of the others' size", path=path)
+    check_size(stored.shape, linearise.mask.shape, path, like=first.name)
     pixels = stored[linearise.mask]
     usable = (cosine > SMALLEST_COSINE) & ~find_saturated(pixels)
     values = linearise(pixels, path, index)[usable]

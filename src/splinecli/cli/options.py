@@ -86,6 +86,15 @@ FlatFieldOption = Annotated[
         "--flat-field", metavar="DIR", help="Images of something evenly white, one for each light or for all."
     ),
 ]
+WhiteLevelOption = Annotated[
+    float | None,
+    typer.Option(
+        "--white-level",
+        metavar="N",
+        min=0,
+        help="Stored value from which a pixel counts as saturated. [default: found in the images]",
+    ),
+]
 AsStoredOption = Annotated[
     bool,
     typer.Option(

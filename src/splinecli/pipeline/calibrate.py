@@ -134,7 +134,7 @@ def _calibrate_balls(
 
 
 def _looks_display_encoded(files: BallFiles) -> bool:
-    from splinecli.capture.linearise import is_display_encoded
+    from splinecli.capture.formats.header import is_display_encoded
 
     return any(is_display_encoded(image) for image in files.images)
 

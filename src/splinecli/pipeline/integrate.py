@@ -193,14 +193,10 @@ def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     import numpy as np
 
     from splinecli.capture import read_image
+    from splinecli.capture.formats.image_size import check_size
 
     image = read_image(path)
-    if image.shape[:2] != shape:
-        raise InputError(
-            f"found an image of {image.shape[1]} x {image.shape[0]} pixels,"
-            f" expected {shape[1]} x {shape[0]} as the normal map",
-            path=path,
-        )
+    check_size(image.shape, shape, path, like="the normal map")
     rgb = np.broadcast_to(image, (*shape, 3))
     colours: NDArray[np.uint8] = np.rint(255 * rgb.clip(0, 1)).astype(np.uint8)
     return colours

@@ -1,0 +1,180 @@
+"""What `info` does: a capture in, a report out of what `infer` would read and need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splinecli.errors import UsageError
+from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.pipeline.options import radiometric_calibration
+
+if TYPE_CHECKING:
+    from splinecli.capture import CaptureSource
+    from splinecli.capture.summary import CaptureSummary
+
+PIXELS_PER_SECOND = 2000
+"""Speed of spline-net on a laptop's processor. benchmarks/inference_speed.py measures that of your machine."""
+
+STARTING_SECONDS = 3
+"""Time that infer takes besides the pixels."""
+
+BASE_MIB = 700
+"""Memory of Python, PyTorch and a batch of pixels. The memory of a capture is added to it."""
+
+ORIGINS = {
+    "given": "given by --white-level",
+    "file": "stated by the image files",
+    "images": "found in the images",
+    "full scale": "the full scale of the files",
+}
+"""The sources of a white level, for people."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InfoOptions:
+    """Which capture `info` reads, and how.
+
+    Args:
+        capture: the folder of the capture.
+        lights, intensities, mask, ground_truth: files that replace those of the capture. `intensities` may also be
+            "equal".
+        transfer: the curve of the images: linear, srgb or gamma:G.
+        ambient: an image without any of the lights.
+        flat_field: a folder of images of an evenly white surface.
+        white_level: the stored value from which a pixel counts as saturated. None finds it.
+        plot: a PNG file that a plot of the lights is written to.
+        overwrite: replace an earlier plot.
+    """
+
+    capture: Path
+    lights: Path | None = None
+    intensities: Path | None = None
+    mask: Path | None = None
+    ground_truth: Path | None = None
+    transfer: str = "linear"
+    ambient: Path | None = None
+    flat_field: Path | None = None
+    white_level: float | None = None
+    plot: Path | None = None
+    overwrite: bool = False
+
+    def open(self) -> CaptureSource:
+        """Open the capture under these options. Raises InputError, UsageError."""
+        from splinecli.capture import open_capture
+
+        return open_capture(
+            self.capture,
+            lights=self.lights,
+            intensities=self.intensities,
+            mask=self.mask,
+            ground_truth=self.ground_truth,
+            radiometry=radiometric_calibration(self.transfer, self.ambient, self.flat_field),
+            white_level=self.white_level,
+        )
+
+
+def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[str, Any]:
+    """Read a capture without estimating normals, write the plot if there is one, and return the report.
+
+    Raises:
+        InputError: the folder has no capture, or a file cannot be read.
+        OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
+        UsageError: the plot would be in the folder of the images, or an option is out of range.
+    """
+    from splinecli.capture.summary import summarise_capture
+    from splinecli.files import write_bytes
+
+    source = options.open()
+    if options.plot is not None:
+        _check_plot(options.plot, source, overwrite=options.overwrite)
+    with observer.progress("reading", len(source.files.images)) as advance:
+        summary = summarise_capture(source, progress=lambda: advance(1))
+    if options.plot is not None:
+        from splinecli.pictures.light_sky import sky_plot
+
+        write_bytes(options.plot, sky_plot(source.light_directions, source.files.name))
+    report = _report(summary)
+    for warning in report["warnings"]:
+        observer.warn(warning)
+    return report
+
+
+def summary_lines(report: dict[str, Any]) -> list[str]:
+    """Return the lines of a report for people."""
+    types = {"uint8": "8 bits", "uint16": "16 bits"}
+    kinds = ", ".join(
+        f"{kind['size'][0]} x {kind['size'][1]}, {'gray' if kind['channels'] == 1 else 'RGB'},"
+        f" {types.get(kind['type'], kind['type'])}"
+        for kind in report["image_kinds"]
+    )
+    low, high = report["elevation_deg"]
+    exposure, level = report["exposure"], report["white_level"]
+    dark, bright = exposure["bright"]
+    rows = [
+        ("capture", f"{report['capture']} ({report['layout']})"),
+        ("images", f"{report['images']}: {kinds}"),
+        ("lights", f"{report['light_directions']}, {low:.0f} to {high:.0f} degrees above the image plane"),
+        ("intensities", report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"),
+        ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
+        ("ground truth", report["ground_truth"] or "none"),
+        ("white level", f"{level['value']:g}, {ORIGINS[level['origin']]}" if level else "none: floating-point"),
+        ("exposure", f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of the white level, at most"
+                     f" {100 * exposure['saturated']:.1f} % of an image saturated"),
+        ("expect", f"{report['expect']['memory_mib']} MiB, about {report['expect']['seconds']} s on a laptop"),
+    ]  # fmt: skip
+    return [f"{name:13}{text}" for name, text in rows]
+
+
+def _check_plot(plot: Path, source: CaptureSource, *, overwrite: bool) -> None:
+    from splinecli.files import check_free
+
+    if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
+        raise UsageError(
+            f"the plot {plot} would be in the folder of the images and count as an image of the capture",
+            hint="Choose another folder for it",
+        )
+    check_free(plot.parent, [plot.name], overwrite=overwrite)
+
+
+def _report(summary: CaptureSummary) -> dict[str, Any]:
+    source, files, level = summary.source, summary.source.files, summary.white_level
+    kinds = sorted(
+        {(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images}
+    )
+    elevations, bright = summary.elevations_deg, [image.bright for image in summary.images]
+    intensities = files.light_intensities
+    if intensities is None and (source.light_intensities != 1).any():
+        intensities = files.light_directions  # the light files of AliceVision have both
+    return {
+        "capture": files.name,
+        "layout": files.layout,
+        "images": len(summary.images),
+        "image_kinds": [
+            {"size": [width, height], "channels": channels, "type": dtype}
+            for width, height, channels, dtype in kinds
+        ],
+        "n_pixels": summary.n_pixels,
+        "light_directions": str(files.light_directions),
+        "light_intensities": None if intensities is None else str(intensities),
+        "mask": None if files.mask is None else str(files.mask),
+        "ground_truth": None if files.ground_truth is None else str(files.ground_truth),
+        "elevation_deg": [round(float(elevations.min()), 1), round(float(elevations.max()), 1)],
+        "white_level": None if level is None else {"value": level.value, "origin": level.origin},
+        "exposure": {
+            "bright": [round(min(bright), 4), round(max(bright), 4)],
+            "saturated": round(max(image.saturated for image in summary.images), 4),
+        },
+        "expect": {
+            "memory_mib": round(_memory_mib(summary)),
+            "seconds": round(STARTING_SECONDS + summary.n_pixels / PIXELS_PER_SECOND),
+        },
+        "warnings": [str(warning) for warning in summary.warnings()],
+    }
+
+
+def _memory_mib(summary: CaptureSummary) -> float:
+    """Return the memory of observations and estimate in float32, and of one image in float64."""
+    height, width, _ = summary.images[0].shape
+    return BASE_MIB + (summary.n_pixels * (4 * summary.source.n_lights + 40) + 8 * height * width * 3) / 2**20
