@@ -57,7 +57,7 @@ def test_the_stored_balls_are_what_the_script_renders(script):
 
 @needs_weights
 def test_the_tutorial(tmp_path):
-    """Its commands, in its order, lead from photographs to a mesh; what it says they print is what they print."""
+    """Run its commands in order: they lead from photographs to a mesh and print what the tutorial shows."""
     text = TUTORIAL.read_text("utf-8")
     (tmp_path / "examples").symlink_to(EXAMPLES)
     commands = [
@@ -72,17 +72,14 @@ def test_the_tutorial(tmp_path):
         )  # fmt: skip
         assert done.returncode == 0, (command, done.stderr)
         said += " ".join((done.stdout + done.stderr).split()) + " "
-    for quoted in (
-        "38 to 72 degrees above the picture's plane",
-        "brightest 1 % from 30 to 57 % of full scale",
-        "unequally strong, from 0.68 to 1.37 times their mean",
-        "out/photographs: 11836 pixels, 10 lights, spline-net",
-    ):
-        assert quoted in said
-        assert quoted in text
+    # The expected memory and time differ from machine to machine.
+    shown = [block.partition("    expect ")[0] for block in re.findall(r"(?:^ {4}.+\n)+", text, re.MULTILINE)]
+    assert len(shown) == 3
+    for block in shown:
+        assert " ".join(block.split()) in said
     out = tmp_path / "out/photographs"
     assert (out / "mesh.ply").stat().st_size > 100_000
-    # "1.8 degrees off on average, as they are with the true lights, strengths and mask"
+    # "The mean error of these normals is 1.8 degrees."
     truth = read_png(MEDALLION / "normals_gt.png") / 65_535 * 2 - 1
     mask = read_png(MEDALLION / "mask.png") > 0
     error_deg = angle_between_deg(np.load(out / "normals.npy")[mask], unit(truth[mask]))
