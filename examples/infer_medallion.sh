@@ -1,9 +1,9 @@
 #!/bin/sh
-# Normals of the medallion with the shipped weights; prints the mean angular error from the report.
+# Estimate the normals of the medallion with the shipped weights and print the mean angular error from the report.
 #
 #   examples/infer_medallion.sh [OUT]             # default: out, in the repository
 #
-# SPLINECLI and PYTHON name other programs than `splinecli` and `python3` on the PATH.
+# The variables SPLINECLI and PYTHON name the programs to run, by default `splinecli` and `python3`.
 set -eu
 
 out=${1:-}

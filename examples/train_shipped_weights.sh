@@ -1,17 +1,17 @@
 #!/bin/sh
-# Makes the weights that come with splinecli from nothing, in about six hours on two cores:
+# Train the weights that come with splinecli from scratch, in about six hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
-# Needs the extra 'render' (pip install -c constraints.txt '.[render]'). Cut off, the same command goes on. Seeds and
-# numbers of steps are fixed. See MODEL_CARD.md.
+# Needs the extra 'render' (pip install -c constraints.txt '.[render]'). If it is
+# interrupted, the same command continues. Seeds and numbers of steps are fixed. See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}
 
 splinecli=${SPLINECLI:-splinecli}
 "$splinecli" prepare --scenes 48 --seed 11 -o "$folder/scenes"
 
-# A run that was begun is resumed; one that is at its end is left alone.
+# Resume a run that was interrupted; skip a run that is finished.
 run() {
   name=$1
   shift
