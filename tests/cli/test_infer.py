@@ -186,7 +186,7 @@ def test_overexposed_photographs(capture, run):
     (after,) = json.loads(run("infer", capture, "--method", "ls", "--json", "--overwrite").out)
     assert json.loads(before)[0]["angular_error_deg"]["mean"] < 0.01
     assert after["angular_error_deg"]["mean"] < 0.1
-    assert any("saturated" in warning for warning in after["warnings"])
+    assert any(warning["code"] == "saturated" for warning in after["warnings"])
 
 
 def test_an_index_of_several_captures(capture, make_capture, run):
@@ -260,7 +260,10 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     cv2.imwrite(str(capture / "ambient.png"), dark)
     assert mean_deg("--transfer", "gamma:2.2") < 0.1
     assert read_report(Path("out/sphere"))["warnings"] == [
-        "ambient.png was subtracted from all images as ambient light."
+        {
+            "code": "ambient_subtracted",
+            "text": "ambient.png was subtracted from all images as ambient light.",
+        }
     ]
     result = run("infer", capture, "--transfer", "rec709")
     assert (result.code, result.out) == (2, "")
@@ -315,7 +318,9 @@ def test_three_lights_are_warned_about(capture, run):
     result = run("infer", capture, "--light-indices", "1,2,3")
     assert result.code == 0
     assert "trained with 4 to 96 lights, not 3" in result.err
-    assert any("trained with 4" in text for text in read_report(Path("out/sphere"))["warnings"])
+    (warning,) = read_report(Path("out/sphere"))["warnings"]
+    assert warning["code"] == "untrained_lights"
+    assert "trained with 4" in warning["text"]
 
 
 def test_rotations_change_little_and_batches_nothing(capture, run):

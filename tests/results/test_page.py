@@ -94,7 +94,7 @@ def test_figures_and_pictures() -> None:
     errors = np.where(mask, 90 * normals[..., 2], np.nan).astype(np.float32)
     page = Page(
         result_page(
-            {**REPORT, "warnings": ["The images are 8-bit."]},
+            {**REPORT, "warnings": [{"code": "eight_bit", "text": "The images are 8-bit."}]},
             normals,
             mask,
             albedo=np.full_like(normals, 0.3) * mask[..., None],
@@ -142,9 +142,14 @@ def test_what_is_not_given_is_absent() -> None:
 def test_names_are_text() -> None:
     normals, mask = sphere(40)
     hostile = {"capture": HOSTILE, "method": HOSTILE, "device": HOSTILE, "version": HOSTILE}
-    report = {**REPORT, **hostile, "weights": {"name": HOSTILE, "sha256": ""}, "warnings": [HOSTILE]}
+    report = {
+        **REPORT,
+        **hostile,
+        "weights": {"name": HOSTILE, "sha256": ""},
+        "warnings": [{"code": "", "text": HOSTILE}],
+    }
     page = Page(result_page(report, normals, mask))
-    plain = Page(result_page({**REPORT, "warnings": ["w"]}, normals, mask))
+    plain = Page(result_page({**REPORT, "warnings": [{"code": "", "text": "w"}]}, normals, mask))
     assert [tag for tag, _ in page.tags] == [tag for tag, _ in plain.tags]
     assert page.text["script"] == plain.text["script"]
     assert page.text["title"] == [f"Photometric stereo: {HOSTILE}"]
@@ -294,7 +299,7 @@ async () => {
 @pytest.mark.parametrize("webgl", [True, False])
 def test_pointer_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = sphere()
-    report = {**REPORT, "capture": "x" * 300, "warnings": ["y" * 300]}
+    report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
     errors = np.where(mask, np.float32(3), np.nan)
     html = result_page(report, normals, mask, albedo=normals + 1, error_map_deg=errors)
     page = open_page(html, width=400, height=800, webgl=webgl)

@@ -39,6 +39,7 @@ HIGH_LIGHTS = "high_lights"
 IMAGES_LEFT_OUT = "images_left_out"
 LIGHTS_MATCHED = "lights_matched"
 SATURATED = "saturated"
+UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
 SATURATED_SHARE = 0.01

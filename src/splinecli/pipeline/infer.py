@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splinecli.capture import Capture, CaptureSource
+    from splinecli.capture.capture_warnings import CaptureWarning
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
 
@@ -51,7 +52,7 @@ def infer_capture(
         estimator = make_method(options)
     with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
         estimate = estimate_normals(capture, estimator, progress=advance)
-    warnings = [*map(str, capture.warnings), *_method_warnings(estimator, capture)]
+    warnings = [*capture.warnings, *_method_warnings(estimator, capture)]
     for warning in warnings:
         observer.warn(f"{capture.name}: {warning}")
     report = report_of(
@@ -116,12 +117,14 @@ def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int
     return draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
 
 
-def _method_warnings(estimator: Estimator, capture: Capture) -> Sequence[str]:
+def _method_warnings(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:
     if estimator.weights is None:
-        return ()
+        return []
+    from splinecli.capture.capture_warnings import UNTRAINED_LIGHTS, CaptureWarning
     from splinecli.networks.weights import untrained_warning
 
-    return untrained_warning(estimator.weights["sha256"], capture.n_lights)
+    texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
+    return [CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts]
 
 
 def _further_files(

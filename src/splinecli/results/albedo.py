@@ -1,4 +1,4 @@
-"""The albedo map: how much of the light each pixel throws back, in colour, once its normal is known."""
+"""The albedo map: the share of the light that each pixel reflects, in colour, computed from the normal map."""
 
 from __future__ import annotations
 
@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture, CaptureSource
 
 LIT = 0.15
-"""Lights count where n.l is above this."""
+"""A light counts for a pixel if n.l is above this."""
 
 AGREEING = 0.3
-"""Observations count whose albedo is within this share of the pixel's median: no highlights, no cast shadows."""
+"""An observation counts if its albedo differs from the pixel's median by at most this share of the median.
+
+This leaves out highlights and cast shadows.
+"""
+
+RESTORED_WEIGHT = 1e-3
+"""Weight of a restored observation: its colour is saturated, so that the other observations decide."""
 
 _TILE_PIXELS = 65_536
 
@@ -24,13 +30,15 @@ def albedo_map(
     normal_map: NDArray[np.float32],
     progress: Callable[[], object] | None = None,
 ) -> NDArray[np.float32]:
-    """Diffuse albedo (H, W, 3) RGB, linear, zero outside the mask and where no light reaches.
+    """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
 
-    By Lambert's law, I / (n.l), least squares over the lights that agree with the pixel's median. Its scale is that of
-    the images over the light intensities: known up to one factor for the whole capture, unless those are absolute.
+    A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the lights that agree with
+    the pixel's median of I / (n.l). Its scale is that of the images divided by the light intensities, so it is known
+    up to one factor for the whole capture unless the intensities are absolute.
 
     Args:
-        source: of the capture; its images are read once more, one at a time, for their colours.
+        source: the source of the capture. Its images are read again, one at a time, for their colours.
+        capture: what the source read.
         normal_map: (H, W, 3), unit in the capture's mask.
         progress: called once after each image.
 
@@ -52,8 +60,9 @@ def albedo_map(
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine
         if capture.restored is not None:
-            # The colours of restored observations are saturated, so the other observations decide.
-            weight = cosine * np.where(capture.restored[:, position], np.float32(1e-3), np.float32(1))
+            weight = cosine * np.where(
+                capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1)
+            )
         total += weight[:, None] * colours
         squares += weight * cosine
         if progress is not None:
@@ -66,10 +75,10 @@ def albedo_map(
 
 
 def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which observations (P, F) are lit and neither highlight nor cast shadow; cosine (P, F) of normal and light."""
+    """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine` (P, F) is n.l."""
     lit = cosine > LIT
     albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
-    # The median over the lit ones, which sorting brings to the front.
+    # The median of the lit observations, which sorting moves to the front.
     ordered, number = np.sort(albedo, axis=1), lit.sum(axis=1)
     middle = np.take_along_axis(ordered, np.maximum((number - 1) // 2, 0)[:, None], axis=1)
     with np.errstate(invalid="ignore"):

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from splinecli import __version__
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 
@@ -23,7 +24,7 @@ def report_of(
     *,
     as_stored: bool,
     read_seconds: float,
-    warnings: Sequence[str],
+    warnings: Sequence[CaptureWarning],
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), all but `seconds.write` and `files`, which write_estimate adds.
 
@@ -53,7 +54,7 @@ def report_of(
         "precision": estimator.precision,
         "seconds": {"read": round(read_seconds, 3), "estimate": round(estimate.seconds, 3)},
         "peak_memory_mib": peak_memory_mib(),
-        "warnings": list(warnings),
+        "warnings": [asdict(warning) for warning in warnings],
         "angular_error_deg": None
         if errors is None
         else {name: round(value, 4) for name, value in asdict(errors).items()},

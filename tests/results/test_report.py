@@ -1,0 +1,36 @@
+"""A report names its schema, how the capture was read, and each warning with a code."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from splinecli.capture import Capture
+from splinecli.capture.capture_warnings import EIGHT_BIT, CaptureWarning
+from splinecli.inference import estimate_normals
+from splinecli.methods import make_estimator
+from splinecli.results.report import SCHEMA, peak_memory_mib, report_of
+
+
+@pytest.mark.parametrize(("as_stored", "reading"), [(True, "as stored"), (False, "restored")])
+def test_a_report(matte_pixels, as_stored, reading):
+    normals, lights, observations = matte_pixels
+    capture = Capture("matte", observations, lights, tuple(range(12)), mask=(normals[:, 2] > -2)[:, None])
+    estimator = make_estimator("ls")
+    warning = CaptureWarning(EIGHT_BIT, "The images have 8 bits.")
+    report = report_of(
+        estimate_normals(capture, estimator), estimator, {"method": "ls"}, "0" * 64,
+        as_stored=as_stored, read_seconds=0.12345, warnings=[warning],
+    )  # fmt: skip
+    assert report == json.loads(json.dumps(report))
+    assert (report["schema"], report["reading"]) == (SCHEMA, reading)
+    assert report["warnings"] == [{"code": "eight_bit", "text": "The images have 8 bits."}]
+    assert (report["n_lights"], report["n_pixels"], report["image_size"]) == (12, 200, [1, 200])
+    assert report["seconds"]["read"] == 0.123
+    assert report["angular_error_deg"] is None
+
+
+def test_the_memory_is_measured_in_mib():
+    peak = peak_memory_mib()
+    assert peak is None or 20 < peak < 200_000
