@@ -9,6 +9,9 @@ from pathlib import Path
 
 from splinecli.errors import InputError
 
+StrPath = str | os.PathLike[str]
+"""A path in any form that the standard library takes."""
+
 
 def find_mode(path: Path) -> int | None:
     """The mode (see stat) of what lies at the path, links followed; None for nothing.

@@ -13,10 +13,11 @@ from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.header import is_display_encoded
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
-from splinecli.capture.layouts.registry import StrPath, find_capture_files
+from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights import named_lights
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
+from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.errors import UsageError

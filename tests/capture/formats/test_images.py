@@ -177,7 +177,7 @@ def test_the_c_library_is_silent_and_gamma_is_not_applied(
         (
             [[1, -0.5]],
             "found the negative value -0.5, expected a photograph."
-            " Set values below zero, such as noise after a dark frame was taken off, to zero.",
+            " Set values below zero, such as noise after a dark frame was subtracted, to zero.",
         ),
     ],
 )

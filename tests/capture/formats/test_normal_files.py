@@ -116,7 +116,7 @@ def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.tif"])
 def test_wrong_size(tmp_path: Path, normals: NDArray[np.float64], name: str) -> None:
     with pytest.raises(
-        InputError, match="found ground truth of 3 x 5 x 3, expected 4 x 5 x 3 like the images"
+        InputError, match="found a ground truth of 5 x 3 pixels, expected 5 x 4 as in the images"
     ):
         read_normals(write(tmp_path / name, normals[1:]), SHAPE, MASK)
 

@@ -140,8 +140,8 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     assert str(caught.value) == (
         f"{tmp_path / 'dark'}: the folder holds 2 images but no light file"
         " (light_directions.txt, lights.txt, *.lp or lights.json)."
-        " Pass --lights FILE, with one line x y z for each image;"
-        " photographs of a mirror ball tell it to 'splinecli calibrate'."
+        " Pass --lights FILE, with one line x y z for each image."
+        " 'splinecli calibrate' makes the file from images of a mirror ball."
     )
     assert (
         find_capture_files(tmp_path / "dark", lights=tmp_path / "file").light_directions == tmp_path / "file"

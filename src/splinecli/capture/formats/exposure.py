@@ -1,4 +1,4 @@
-"""How long a camera exposed a photograph, from its EXIF tags."""
+"""Exposures of images, from their EXIF tags."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SAME = 0.1
 
 @dataclass(frozen=True)
 class Exposure:
-    """Seconds, f-number and ISO sensitivity."""
+    """Exposure time in seconds, f-number and ISO sensitivity."""
 
     seconds: float
     f_number: float
@@ -29,7 +29,7 @@ class Exposure:
 
     @property
     def relative(self) -> float:
-        """What brightness is proportional to."""
+        """A number that the brightness of the image is proportional to."""
         return self.seconds * self.iso / self.f_number**2
 
     def __str__(self) -> str:
@@ -38,12 +38,19 @@ class Exposure:
 
 
 def read_exposure(path: Path) -> Exposure | None:
-    """Of an image file; None where it does not say, or not all."""
-    try:
-        seconds, f_number, iso = _read_raw(path) if path.suffix.lower() in RAW_SUFFIXES else _read_tags(path)
-        exposure = Exposure(float(seconds), float(f_number), float(iso[0] if isinstance(iso, tuple) else iso))
-    except Exception:  # damaged tags surface as any of a dozen types, and are no reason to refuse the picture
-        return None
+    """Return the exposure of an image file; None where a part of it is missing or the file is damaged."""
+    # Pillow warns of tags that it does not expect. Decoding the image names a damaged file.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            seconds, f_number, iso = (
+                _read_raw(path) if path.suffix.lower() in RAW_SUFFIXES else _read_tags(path)
+            )
+            exposure = Exposure(
+                float(seconds), float(f_number), float(iso[0] if isinstance(iso, tuple) else iso)
+            )
+        except Exception:  # damaged tags cause a dozen types of errors
+            return None
     usable = all(0 < value < math.inf for value in (exposure.seconds, exposure.f_number, exposure.iso))
     return exposure if usable else None
 
@@ -60,9 +67,8 @@ def _read_raw(path: Path) -> tuple[Any, Any, Any]:
     from PIL import Image
 
     tags = Image.Exif()
-    # Pillow knows no sensors' pixels, but can be given the header alone where it is TIFF's: most cameras'.
-    with path.open("rb") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of tags that are not as Pillow expects them
+    # Pillow cannot decode RAW files, but it reads their header where it is TIFF's, as with most cameras.
+    with path.open("rb") as file:
         try:
             tags.load_from_fp(file)
         except SyntaxError:
@@ -73,7 +79,7 @@ def _read_raw(path: Path) -> tuple[Any, Any, Any]:
 
 
 def check_exposures(images: Sequence[Path]) -> None:
-    """Raise InputError where the images tell that they were not all exposed alike."""
+    """Raise InputError where two images state different exposures."""
     first: tuple[Path, Exposure] | None = None
     for path in images:
         exposure = read_exposure(path)
@@ -85,6 +91,6 @@ def check_exposures(images: Sequence[Path]) -> None:
             raise InputError(
                 f"found an exposure of {exposure}, expected {first[1]} as in {first[0].name}",
                 path=path,
-                hint="Set the camera to manual for all images; or give each its exposure as its light's intensity"
-                " (--intensities)",
+                hint="Expose all images alike, or give each image's exposure as the intensity of its light"
+                " (--intensities FILE)",
             )

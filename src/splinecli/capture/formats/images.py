@@ -1,8 +1,7 @@
-"""Photographs as linear values, and masks."""
+"""Images as linear values, and masks."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image, decode_with_alpha
+from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-
-StrPath = str | os.PathLike[str]
 
 
 def read_image(path: StrPath) -> NDArray[np.float32]:
-    """A photograph as (H, W, C) float32, C 1 (gray) or 3 (RGB), taken to be linear.
+    """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be linear.
 
-    PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full range is 0 to 1, floating-point ones
-    are kept; alpha is dropped and an EXIF orientation ignored.
+    The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1. Floating-point values
+    are kept. Alpha is dropped, and an EXIF orientation is ignored.
 
     Raises:
         InputError: the file is missing, of another format, truncated or damaged, or holds floating-point
@@ -29,13 +27,17 @@ def read_image(path: StrPath) -> NDArray[np.float32]:
 
 
 def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
-    """Stored values of any shape as float32 on the scale of read_image, which see."""
+    """Return stored values of any shape as float32 on the scale of read_image.
+
+    Raises:
+        InputError: a floating-point value is negative or not finite.
+    """
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
         values = stored.astype(np.float32)
     if stored.dtype.kind == "u":
         values /= np.float32(np.iinfo(stored.dtype).max)
         return values
-    # One of these is NaN or infinite where any value is; np.isfinite of all would be an array more.
+    # One of these is NaN or infinite where any value is. np.isfinite of all values would need another array.
     lowest, highest = (values.min(), values.max()) if values.size else (0.0, 0.0)
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise InputError(
@@ -45,13 +47,13 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
         raise InputError(
             f"found the negative value {lowest:g}, expected a photograph",
             path=path,
-            hint="Set values below zero, such as noise after a dark frame was taken off, to zero",
+            hint="Set values below zero, such as noise after a dark frame was subtracted, to zero",
         )
     return values
 
 
 def read_boundary(path: StrPath) -> NDArray[np.bool_]:
-    """A mask of CyclesPS (H, W) bool: true where any channel is above zero; it may be empty.
+    """Return a mask (H, W) of CyclesPS: true where any channel is above zero; it may be empty.
 
     Raises:
         InputError: the image cannot be read.
@@ -61,20 +63,19 @@ def read_boundary(path: StrPath) -> NDArray[np.bool_]:
 
 
 def read_mask(path: StrPath) -> NDArray[np.bool_]:
-    """A mask (H, W) bool: true where any channel is above half of the image's largest value.
+    """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
-    So 0 and 1 serve as well as 0 and 255. Where an alpha channel cuts something out (is above half of its
-    largest value at some pixels and not at others), it alone is the mask: colours then mean nothing.
+    So 0 and 1 serve as well as 0 and 255. If an alpha channel cuts something out, it alone is the mask, because colours
+    mean nothing in such an image.
 
     Raises:
         InputError: the image cannot be read, or no pixel is above zero.
     """
     path = Path(path)
     stored, alpha = decode_with_alpha(path)
-    if alpha is not None:
-        opaque: NDArray[np.bool_] = alpha > alpha.max() / 2
-        if opaque.any() and not opaque.all():
-            return opaque
+    opaque = None if alpha is None else cut_out(alpha)
+    if opaque is not None:
+        return opaque
     largest = to_linear(stored.max(keepdims=True), path).item()
     if largest <= 0:
         raise InputError(
@@ -84,3 +85,12 @@ def read_mask(path: StrPath) -> NDArray[np.bool_]:
         )
     mask: NDArray[np.bool_] = (stored > stored.max() / 2).any(axis=2)
     return mask
+
+
+def cut_out(alpha: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one that does not.
+
+    Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
+    """
+    opaque: NDArray[np.bool_] = alpha > alpha.max() / 2
+    return opaque if opaque.any() and not opaque.all() else None

@@ -1,4 +1,4 @@
-"""The simplest layout: a folder of photographs, with a light file in it or named by the user."""
+"""The simplest layout: a folder of images with a light file, in it or named by the user. DiLiGenT is one, too."""
 
 from __future__ import annotations
 
@@ -20,14 +20,21 @@ from splinecli.capture.layouts.capture_files import (
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
 
+_DILIGENT_LIGHTS = "light_directions.txt"
+# normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
+_DILIGENT_GROUND_TRUTH = (*GROUND_TRUTH, "normal.txt")
+
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles:
-    """The capture's files: the images in natural order, or in that of filenames.txt where there is one.
+    """Return the capture's files, with the images in natural order or in the order of filenames.txt.
+
+    A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
 
     Raises:
-        InputError: the folder holds no images, or no light file and none is named.
+        InputError: the folder holds no images, filenames.txt is wrong, or there is no light file and none is named.
     """
     filenames = find_named(folder, [FILENAMES])
+    is_diligent = filenames is not None and find_named(folder, [_DILIGENT_LIGHTS]) is not None
     if filenames is not None:
         images = read_image_list(filenames)
     else:
@@ -38,16 +45,17 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
         raise InputError(
             f"the folder holds {len(images)} images but no light file ({LIGHT_FILES})",
             path=folder,
-            hint="Pass --lights FILE, with one line x y z for each image; photographs of a mirror ball tell it to"
-            " 'splinecli calibrate'",
+            hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
+            " images of a mirror ball",
         )
+    names = _DILIGENT_GROUND_TRUTH if is_diligent else GROUND_TRUTH
     return CaptureFiles(
-        layout="plain folder",
+        layout="DiLiGenT" if is_diligent else "plain folder",
         name=folder_name(folder),
         folder=folder,
         images=images,
         light_directions=lights,
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
         mask=overrides.mask or find_named(folder, MASK),
-        ground_truth=overrides.ground_truth or find_named(folder, GROUND_TRUTH),
+        ground_truth=overrides.ground_truth or find_named(folder, names),
     )

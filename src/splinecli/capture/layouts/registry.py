@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from splinecli.capture.layouts import cyclesps, diligent, plain_folder, psbox
+from splinecli.capture.layouts import cyclesps, plain_folder, psbox
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     LIGHT_FILES,
@@ -17,13 +16,11 @@ from splinecli.capture.layouts.capture_files import (
     folder_name,
 )
 from splinecli.capture.layouts.image_lists import list_folder, list_images
-from splinecli.capture.paths import is_folder
+from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
 
-StrPath = str | os.PathLike[str]
-
 # Special before general: a plain folder takes whatever holds images.
-_LAYOUTS = (diligent.find, psbox.find, cyclesps.find, plain_folder.find)
+_LAYOUTS = (psbox.find, cyclesps.find, plain_folder.find)
 
 
 def find_capture_files(

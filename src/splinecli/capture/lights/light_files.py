@@ -5,7 +5,6 @@ Frame: x right, y up, z to the camera; a direction points from the object to the
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import NumberRows, columns, read_number_rows
+from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-
-StrPath = str | os.PathLike[str]
 
 
 def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray[np.float64]:

@@ -1,0 +1,117 @@
+"""Bad files cause one message that names the file, and nothing else on stderr."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from splinecli.capture import find_capture_files, open_capture, read_capture
+from splinecli.capture.formats.header import is_display_encoded, stated_white_level
+from splinecli.errors import InputError
+
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for number in range(4):
+        pixels = np.random.default_rng(number).integers(0, 60_000, (20, 25, 3)).astype(np.uint16)
+        tifffile.imwrite(tmp_path / f"{number}.tif", pixels, photometric="rgb")
+    np.savetxt(tmp_path / "lights.txt", LIGHTS)
+    return tmp_path
+
+
+@pytest.fixture
+def no_warnings(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
+    """Fail the test where a library warns, or writes to stderr."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    assert [str(warning.message) for warning in caught] == []
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("no_warnings")
+@pytest.mark.parametrize("size", [0, 8, 9, 60, 100, 200, 1000, -10])
+def test_a_truncated_tiff(folder: Path, size: int) -> None:
+    data = (folder / "2.tif").read_bytes()
+    (folder / "2.tif").write_bytes(data[:size])
+    with pytest.raises(InputError, match=r"2\.tif: (the TIFF is (truncated|damaged)|the file is empty)"):
+        read_capture(folder)
+
+
+@pytest.mark.usefixtures("no_warnings")
+@pytest.mark.parametrize("light", [(0, 0, 1), (0.6, 0, 0.8)])
+@pytest.mark.parametrize("as_stored", [True, False])
+def test_identical_lights(tmp_path: Path, light: tuple[float, ...], as_stored: bool) -> None:
+    """On a scene whose intensities would be estimated, were the lights not identical."""
+    rng = np.random.default_rng(0)
+    for number in range(8):
+        shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.rint(shading * 40_000).astype(np.uint16))
+    np.savetxt(tmp_path / "lights.txt", [light] * 8)
+    with pytest.raises(InputError, match="the 8 lights lie in one plane"):
+        read_capture(tmp_path, as_stored=as_stored)
+
+
+@pytest.fixture
+def forbid(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Make a file unreadable, also to root."""
+
+    def forbid_file(path: Path) -> None:
+        path.chmod(0)
+        if os.access(path, os.R_OK):
+            original = Path.open
+
+            def refuse(self: Path, *args: object, **kwargs: object) -> object:
+                if self == path:
+                    raise PermissionError(13, "Permission denied", str(self))
+                return original(self, *args, **kwargs)  # type: ignore[call-overload]
+
+            monkeypatch.setattr(Path, "open", refuse)
+
+    return forbid_file
+
+
+@pytest.mark.parametrize(
+    "name", ["1.tif", "lights.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png"]
+)
+def test_a_file_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None], name: str) -> None:
+    if name.endswith(".png"):
+        cv2.imwrite(str(folder / name), np.full((20, 25), 255, np.uint8))
+    elif name.endswith(".npy"):
+        np.save(folder / name, np.broadcast_to([0.0, 0.0, 1.0], (20, 25, 3)))
+    elif name == "light_intensities.txt":
+        np.savetxt(folder / name, np.ones((4, 3)))
+    forbid(folder / name)
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert str(caught.value) == f"{folder / name}: the file cannot be read (Permission denied)."
+
+
+def test_headers_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None]) -> None:
+    forbid(folder / "1.tif")
+    with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
+        is_display_encoded(folder / "1.tif")
+    with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
+        stated_white_level([folder / "1.tif"])
+
+
+def test_an_image_that_vanishes(folder: Path) -> None:
+    source = open_capture(folder)
+    (folder / "3.tif").unlink()
+    with pytest.raises(InputError, match=r"3\.tif: the file (does not exist|cannot be read)"):
+        source.read()
+
+
+def test_a_folder_in_place_of_a_named_file(folder: Path) -> None:
+    (folder / "sub").mkdir()
+    with pytest.raises(InputError, match="sub: found a folder, expected a file"):
+        find_capture_files(folder, mask=folder / "sub")
