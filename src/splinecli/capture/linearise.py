@@ -74,5 +74,5 @@ class Lineariser:
 
     def _linear(self, path: Path) -> NDArray[np.float32]:
         stored = decode_image(path)
-        check_size(stored.shape, self.mask.shape, path, like="the others")
+        check_size(stored.shape, self.mask.shape, path, like="the other images")
         return decode_transfer(to_linear(stored[self.mask], path), self.radiometry.gamma)

@@ -207,7 +207,9 @@ def test_images_and_normals_of_another_size(tmp_path: Path) -> None:
     folder = tmp_path / "Bunny"
     write_object(folder, "specular")
     tifffile.imwrite(folder / "gt_normal.tif", np.ones((WIDTH, HEIGHT, 3), np.uint16), photometric="rgb")
-    assert "found ground truth of 11 x 7 x 3, expected 7 x 11 x 3" in message(lambda: read_capture(folder))
+    assert "found a ground truth of 7 x 11 pixels, expected 11 x 7 as in the images" in message(
+        lambda: read_capture(folder)
+    )
     (folder / "gt_normal.tif").unlink()
     odd = folder / "images_specular/00002.tif"
     tifffile.imwrite(odd, np.ones((WIDTH, HEIGHT, 3), np.uint16), photometric="rgb")
