@@ -56,7 +56,11 @@ def test_imports_point_downwards():
     upwards = []
     for path in SOURCE.rglob("*.py"):
         room = path.relative_to(SOURCE).parts[0].removesuffix(".py")
-        for target in imported_rooms(ast.parse(path.read_text("utf-8"))):
+        tree = ast.parse(path.read_text("utf-8"))
+        if path == SOURCE / "__init__.py":
+            # Its functions are for notebooks: they import from the rooms above, but only when called.
+            tree.body = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+        for target in imported_rooms(tree):
             if target != room and HEIGHT[target] >= HEIGHT[room]:
                 upwards.append(f"{path.relative_to(SOURCE)} -> {target}")
     assert not upwards

@@ -1,3 +1,127 @@
-"""splinecli: surface normals from a few photographs under known lights (photometric stereo, SPLINE-Net)."""
+"""splinecli: surface normals from a few photographs under known lights (photometric stereo, SPLINE-Net).
+
+Use `estimate_normals` and `integrate_normals` on arrays, for example in a notebook. To work with folders of files, use
+the command line or the functions in docs/python.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
+
+    from splinecli.inference import NormalEstimate
 
 __version__ = "0.2.0"
+
+__all__ = ["__version__", "estimate_normals", "integrate_normals"]
+
+# Everything else is imported inside the functions. PyTorch takes a second or more to load.
+
+
+def estimate_normals(
+    images: ArrayLike | Sequence[NDArray[Any]],
+    light_directions: ArrayLike,
+    mask: ArrayLike | None = None,
+    *,
+    light_intensities: ArrayLike | None = None,
+    method: str = "spline-net",
+    as_stored: bool = False,
+    white_level: float | None = None,
+    weights: str | None = None,
+    rotations: int | None = None,
+    batch_size: int | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    precision: Literal["auto", "float32", "bfloat16"] = "auto",
+    progress: Callable[[int], object] | None = None,
+) -> NormalEstimate:
+    """Estimate surface normals from images of one object under different lights.
+
+    The images are prepared and the normals estimated exactly as `splinecli infer` does.
+
+    The first call limits PyTorch's threads to the cores that the process may use. If other processes keep the machine
+    busy, also set the environment variable OMP_WAIT_POLICY to passive before PyTorch is imported.
+
+    Args:
+        images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the top. uint8 and
+            uint16 values are scaled by their full range; floating-point values are taken as they are.
+        light_directions: (F, 3), from the object towards the lights, of any length; x right, y up, z to the camera.
+        mask: (H, W), not zero at the pixels of the object. None takes all pixels.
+        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown: they are estimated if the images show
+            that they differ.
+        method: "spline-net", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
+        as_stored: use the values of the images alone. By default, saturated observations are restored and unknown
+            light intensities are estimated.
+        white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
+            integer images; floating-point images then have none.
+        weights: name or file of a network's weights. None is the method's own.
+        rotations: number of rotations of the lights whose normals a network averages. None is the method's own.
+        batch_size: pixels per batch. None is the method's own.
+        device: where to compute; "auto" is a CUDA GPU if there is one.
+        precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
+        progress: called with the number of pixels just finished, about every 1,000 pixels for networks.
+
+    Returns:
+        A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the mask and zero
+        outside; confidence_map, (H, W) float32, the probability that a normal is off by at most 5 degrees, or None for
+        methods other than spline-net; and capture, with the observations and with warnings that you should read.
+
+    Raises:
+        splinecli.errors.UsageError: a shape, a type or an option does not fit.
+        splinecli.errors.InputError: a value is not finite or negative, the lights cannot give normals (fewer than
+            three, below the horizon, all in one plane), or the mask is empty.
+        splinecli.errors.ModelError: the weights cannot be used.
+
+    References:
+        Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and normal estimation
+        networks, ICCV 2019.
+    """
+    from splinecli.capture.arrays import capture_from_arrays
+    from splinecli.inference import estimate_normals
+    from splinecli.methods import MethodOptions, check_method, make_estimator
+
+    check_method(method)
+    capture = capture_from_arrays(
+        images,
+        light_directions,
+        mask,
+        light_intensities=light_intensities,
+        white_level=white_level,
+        as_stored=as_stored,
+    )
+    options = MethodOptions(weights, rotations, batch_size, device, precision)
+    return estimate_normals(capture, make_estimator(method, options), progress=progress)
+
+
+def integrate_normals(
+    normal_map: NDArray[np.floating],
+    mask: NDArray[np.bool_] | None = None,
+    camera_matrix: NDArray[np.floating] | None = None,
+    *,
+    stiffness: float = 2.0,
+) -> NDArray[np.float64]:
+    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
+
+    For an orthographic camera, the result is the height towards the camera in pixels. With a camera matrix, it is the
+    positive depth along the viewing axis, of unknown scale. `splinecli.surface.integration` has further options.
+
+    Args:
+        normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
+        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not zero.
+        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
+        stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
+
+    Raises:
+        splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
+        splinecli.errors.InputError: the mask is empty, a normal in the mask is not a unit vector, or the camera matrix
+            is not valid.
+
+    References:
+        Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022.
+    """
+    from splinecli.surface.integration import integrate_normals
+
+    return integrate_normals(normal_map, mask, camera_matrix, stiffness=stiffness)

@@ -1,5 +1,6 @@
 """Captures: photographs of one object under known lights, read from folders of files."""
 
+from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.images import read_image, read_mask
 from splinecli.capture.formats.normal_files import read_normal_map, read_normals
@@ -19,6 +20,7 @@ __all__ = [
     "CaptureWarning",
     "RadiometricCalibration",
     "WhiteLevel",
+    "capture_from_arrays",
     "capture_name",
     "find_capture_files",
     "find_captures",

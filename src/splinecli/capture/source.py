@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,9 +18,10 @@ from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration
 from splinecli.capture.masks import read_capture_mask
+from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
-from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError
 
@@ -99,13 +100,16 @@ class CaptureSource:
             ground_truth, upside_down = read_ground_truth(
                 self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
             )
-        found = self._read_observations(indices, mask, first, progress)
+        images = self._stored_pixels(indices, mask, first)
+        del first
+        saturation = self.find_saturation(int(np.count_nonzero(mask)), indices)
+        found = collect_observations(images, saturation, progress)
         warnings = [*self.warnings, *found.warnings()]
         if upside_down:
             warnings.append(capture_warnings.ground_truth_upside_down())
         capture = Capture(
             name=self.files.name,
-            observations=found.observations,
+            observations=found.values,
             light_directions=self.light_directions[list(indices)],
             light_indices=indices,
             mask=mask,
@@ -168,36 +172,21 @@ class CaptureSource:
         """Return the mask (H, W) for images of this shape. Raises InputError."""
         return read_capture_mask(self.files, shape) if self.automatic_mask is None else self.automatic_mask
 
-    def _read_observations(
-        self,
-        indices: tuple[int, ...],
-        mask: NDArray[np.bool_],
-        first: NDArray[Any],
-        progress: Progress | None,
-    ) -> _Observations:
-        """Return the mask's pixels under these lights; `first` is the first image, decoded."""
-        n_pixels = int(np.count_nonzero(mask))
+    def _stored_pixels(
+        self, indices: Sequence[int], mask: NDArray[np.bool_], first: NDArray[Any]
+    ) -> Iterator[StoredPixels]:
+        """Yield the mask's pixels under these lights; `first` is the first image, decoded."""
         linearise = Lineariser(self.radiometry, mask, len(self.files.images))
-        saturation = self.find_saturation(n_pixels, indices)
-        observations = np.empty((n_pixels, len(indices)), np.float32)
-        any_8_bit = False
         stored: NDArray[Any] | None = first
         del first
-        for position, index in enumerate(indices):
+        for index in indices:
             path = self.files.images[index]
             if stored is None:
                 stored = decode_image(path)
             check_size(stored.shape, mask.shape, path, like=self.files.images[indices[0]].name)
-            any_8_bit |= stored.dtype == np.uint8
             pixels = stored[mask]
             stored = None  # let go before the next is decoded: one full image at a time
-            saturation.add(position, pixels, path)
-            observations[:, position] = _observe(
-                linearise(pixels, path, index), self.light_intensities[index]
-            )
-            if progress is not None:
-                progress()
-        return _Observations(observations, *saturation.finish(), any_8_bit)
+            yield StoredPixels(path, pixels, linearise(pixels, path, index), self.light_intensities[index])
 
     def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
         linear = linearise(pixels, self.files.images[index], index)
@@ -205,35 +194,3 @@ class CaptureSource:
         colours = np.array(np.broadcast_to(linear, (len(linear), 3)), np.float32)
         colours /= self.light_intensities[index].astype(np.float32)
         return colours
-
-
-@dataclass(frozen=True, eq=False)
-class _Observations:
-    """Observations (P, F) as read, which of them are saturated (None for none), and from which stored value."""
-
-    observations: NDArray[np.float32]
-    white_level: WhiteLevel | None
-    saturated: NDArray[np.bool_] | None
-    any_8_bit: bool
-
-    def warnings(self) -> list[CaptureWarning]:
-        n_saturated = 0 if self.saturated is None else np.count_nonzero(self.saturated)
-        n_black = len(self.observations) - np.count_nonzero(self.observations.any(axis=1))
-        warnings = [
-            capture_warnings.white_level(self.white_level),
-            capture_warnings.saturated(n_saturated / max(self.observations.size, 1)),
-            capture_warnings.black_pixels(n_black / max(len(self.observations), 1)),
-            capture_warnings.eight_bit() if self.any_8_bit else None,
-        ]
-        return [warning for warning in warnings if warning is not None]
-
-
-def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return observations (P,) from linear pixels (P, C) under a light of RGB intensity (3,).
-
-    Each channel is divided by its intensity, then the mean is taken. A gray image is equal in all channels.
-    """
-    weights = 1 / (3 * intensity)
-    if linear.shape[1] == 1:
-        weights = weights.sum(keepdims=True)
-    return linear @ weights.astype(np.float32)

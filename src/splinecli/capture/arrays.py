@@ -1,0 +1,125 @@
+"""A capture from arrays that are already in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splinecli.capture.formats.images import to_linear
+from splinecli.capture.lights.light_files import unit_directions
+from splinecli.capture.observations import StoredPixels, collect_observations
+from splinecli.capture.record import Capture
+from splinecli.capture.restore.white_level import SaturationFinder
+from splinecli.capture.stored import StoredCapture
+from splinecli.errors import InputError, UsageError
+
+_KINDS = (np.uint8, np.uint16)
+
+
+def capture_from_arrays(
+    images: ArrayLike | Sequence[NDArray[Any]],
+    light_directions: ArrayLike,
+    mask: ArrayLike | None = None,
+    *,
+    light_intensities: ArrayLike | None = None,
+    white_level: float | None = None,
+    as_stored: bool = False,
+    name: str = "capture",
+) -> Capture:
+    """Return the capture of these images, restored as `infer` restores the capture of a folder.
+
+    Args:
+        images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by their full range;
+            floating-point values are taken as they are.
+        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
+        mask: (H, W), not zero at the pixels of the object. None takes all pixels.
+        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
+        white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
+            integer images; floating-point images then have none.
+        as_stored: use the values alone. By default, saturated observations are restored and unknown light intensities
+            are estimated.
+        name: the name of the capture, for messages.
+
+    Raises:
+        UsageError: a shape or a type does not fit.
+        InputError: a value is not finite or negative, the lights cannot give normals, or the mask is empty.
+    """
+    stack = _checked_images(images)
+    shape, n_lights = stack[0].shape[:2], len(stack)
+    directions = _checked_directions(light_directions, n_lights)
+    intensities = _checked_intensities(light_intensities, n_lights)
+    inside = np.ones(shape, np.bool_) if mask is None else np.asarray(mask) != 0
+    if inside.shape != shape:
+        raise UsageError(f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images")
+
+    def pixels() -> Iterator[StoredPixels]:
+        for index, image in enumerate(stack):
+            values = image[inside].reshape(np.count_nonzero(inside), -1)
+            path = Path(f"images[{index}]")
+            yield StoredPixels(path, values, to_linear(values, path), intensities[index])
+
+    found = collect_observations(pixels(), SaturationFinder(int(inside.sum()), n_lights, given=white_level))
+    capture = Capture(
+        name=name,
+        observations=found.values,
+        light_directions=directions,
+        light_indices=tuple(range(n_lights)),
+        mask=inside,
+        warnings=tuple(found.warnings()),
+        white_level=found.white_level,
+    )
+    stored = StoredCapture(capture, found.saturated, intensities_known=light_intensities is not None)
+    return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
+
+
+def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    stack = [np.asarray(image) for image in images]  # type: ignore[union-attr]
+    if not stack:
+        raise UsageError("found no images, expected (F, H, W) or (F, H, W, 3)")
+    for index, image in enumerate(stack):
+        if image.shape != stack[0].shape:
+            raise UsageError(
+                f"found an image of shape {image.shape} at images[{index}], expected {stack[0].shape} as images[0]"
+            )
+        if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
+            raise UsageError(
+                f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)"
+            )
+        if image.dtype not in _KINDS and image.dtype.kind != "f":
+            raise UsageError(
+                f"found images of type {image.dtype}, expected uint8, uint16 or floating point",
+                hint="Convert them with images.astype(...), without a change of scale",
+            )
+    return stack
+
+
+def _checked_directions(directions: ArrayLike, n_lights: int) -> NDArray[np.float64]:
+    vectors = np.asarray(directions, np.float64)
+    if vectors.shape != (n_lights, 3):
+        raise UsageError(
+            f"found light directions of shape {vectors.shape}, expected (F, 3) = {(n_lights, 3)}, one for each image"
+        )
+    if not np.isfinite(vectors).all():
+        raise InputError("a light direction is not finite")
+    rows = [f" in row {row}" for row in range(n_lights)]
+    return unit_directions(vectors, Path("light_directions"), [None] * n_lights, rows)
+
+
+def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> NDArray[np.float64]:
+    """Return intensities (F, 3); ones where none are given."""
+    if intensities is None:
+        return np.ones((n_lights, 3))
+    values = np.asarray(intensities, np.float64)
+    if values.shape == (n_lights,):
+        values = values[:, None]
+    if values.shape not in ((n_lights, 1), (n_lights, 3)):
+        raise UsageError(
+            f"found light intensities of shape {values.shape}, expected (F,) or (F, 3) with F = {n_lights}"
+        )
+    if not (np.isfinite(values) & (values > 0)).all():
+        raise InputError("a light intensity is not a finite number above 0")
+    return np.broadcast_to(values, (n_lights, 3))

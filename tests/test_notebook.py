@@ -1,0 +1,167 @@
+"""The functions for notebooks: the same normals as `splinecli infer`, from arrays."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import splinecli
+from splinecli.cli.main import main
+from splinecli.errors import InputError, UsageError
+from splinecli.surface.integration import integrate_normals
+
+MEDALLION = Path(__file__).resolve().parents[1] / "examples/medallion"
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+
+
+def medallion() -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Images (F, H, W, 3), light directions (F, 3), intensities (F, 3) and mask (H, W), as a notebook reads them."""
+    paths = [str(MEDALLION / f"{number:02d}.png") for number in range(1, 11)]
+    images = np.stack([cv2.imread(path, cv2.IMREAD_UNCHANGED) for path in paths])  # type: ignore[misc]
+    if images.ndim == 4:
+        images = images[..., ::-1]
+    directions = np.loadtxt(MEDALLION / "light_directions.txt")
+    intensities = np.loadtxt(MEDALLION / "light_intensities.txt")
+    mask = cv2.imread(str(MEDALLION / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None
+    return images, directions, intensities, mask > 0
+
+
+def matte(dtype: type = np.float64, scale: float = 1.0) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Images (F, H, W) of a matte bowl, and its normals (H, W, 3)."""
+    y, x = np.mgrid[0.2:-0.2:13j, -0.2:0.2:11j]
+    normals = np.stack((x, y, np.ones_like(x)), axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return (scale * np.moveaxis(normals @ LIGHTS.T, -1, 0)).astype(dtype), normals
+
+
+@pytest.mark.parametrize("intensities_known", [True, False])
+def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Path) -> None:
+    """With unknown intensities, both estimate them from the images."""
+    images, directions, intensities, mask = medallion()
+    folder = tmp_path / "medallion"
+    folder.mkdir()
+    for path in MEDALLION.iterdir():
+        if intensities_known or path.name != "light_intensities.txt":
+            (folder / path.name).write_bytes(path.read_bytes())
+    options = ["--method", "iw12", "--format", "npy", "-q", "-o", str(tmp_path / "out")]
+    assert main(["infer", str(folder), *options]) == 0
+    expected = np.load(tmp_path / "out/medallion/normals.npy")
+    estimate = splinecli.estimate_normals(
+        images,
+        directions,
+        mask,
+        light_intensities=intensities if intensities_known else None,
+        method="iw12",
+    )
+    assert (estimate.capture.estimated_intensities is None) == intensities_known
+    assert estimate.normal_map.tobytes() == expected.tobytes()
+
+
+def test_normals_and_confidence_of_the_network() -> None:
+    images, directions, intensities, mask = medallion()
+    small = np.zeros_like(mask)
+    small[80:110, 80:110] = mask[80:110, 80:110]
+    done: list[int] = []
+    estimate = splinecli.estimate_normals(
+        images, directions, small, light_intensities=intensities, progress=done.append
+    )
+    assert sum(done) == small.sum() > 0
+    np.testing.assert_allclose(np.linalg.norm(estimate.normal_map[small], axis=1), 1, atol=1e-5)
+    assert not estimate.normal_map[~small].any()
+    assert estimate.confidence_map is not None
+    assert 0.5 < estimate.confidence_map[small].mean() <= 1
+    assert not estimate.confidence_map[~small].any()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "scale"), [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)]
+)
+def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
+    images, normals = matte(dtype, scale)
+    estimate = splinecli.estimate_normals(
+        images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS))
+    )
+    # 8 bits round by up to 0.25 %.
+    np.testing.assert_allclose(estimate.normal_map, normals, atol=1e-2 if dtype is np.uint8 else 1e-4)
+
+
+def test_intensities_divide_each_channel() -> None:
+    images, normals = matte()
+    intensities = np.random.default_rng(0).uniform(0.5, 2, (len(LIGHTS), 3))
+    colour = images[..., None] * intensities[:, None, None]
+    estimate = splinecli.estimate_normals(list(colour), LIGHTS, light_intensities=intensities, method="ls")
+    np.testing.assert_allclose(estimate.normal_map, normals, atol=1e-5)
+
+
+def test_saturated_values_are_restored_unless_as_stored() -> None:
+    lights = np.concatenate((LIGHTS, LIGHTS[1:] * (-1, -1, 1)))
+    _, normals = matte()
+    images = np.moveaxis(normals @ lights.T, -1, 0)
+    clipped = np.minimum(65_535 * images / 0.85, 65_535).astype(np.uint16)
+    assert 0.1 < (clipped == 65_535).mean() < 0.5
+
+    def worst(images: NDArray[Any], **options: Any) -> float:
+        known = np.ones(len(lights))
+        estimate = splinecli.estimate_normals(images, lights, light_intensities=known, method="ls", **options)
+        return float(np.abs(estimate.normal_map - normals).max())
+
+    stored, restored = worst(clipped, as_stored=True), worst(clipped)
+    assert stored > 0.02
+    assert restored < 0.3 * stored
+    # Floating-point images have no full scale, but a white level can be given.
+    shares = clipped / 65_535
+    assert worst(shares) == pytest.approx(stored)
+    assert worst(shares, white_level=1.0) == pytest.approx(restored, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"images": np.ones((4, 5))}, UsageError, "found images of shape"),
+        ({"images": np.ones((4, 5, 6, 2))}, UsageError, "expected (F, H, W) or (F, H, W, 3)"),
+        ({"images": np.ones((4, 5, 6), np.int64)}, UsageError, "found images of type int64"),
+        ({"images": []}, UsageError, "found no images"),
+        ({"images": [np.ones((5, 6)), np.ones((5, 7))]}, UsageError, "images[1]"),
+        ({"images": -np.ones((4, 5, 6))}, InputError, "images[0]: found the negative value -1"),
+        ({"light_directions": LIGHTS[:3]}, UsageError, "expected (F, 3) = (4, 3), one for each image"),
+        (
+            {"light_directions": -LIGHTS},
+            InputError,
+            "light_directions: found a light below the horizon in row 0",
+        ),
+        ({"mask": np.ones((5, 5))}, UsageError, "found a mask of shape (5, 5), expected (H, W) = (5, 6)"),
+        ({"mask": np.zeros((5, 6))}, InputError, "the mask is empty"),
+        ({"light_intensities": np.ones(3)}, UsageError, "found light intensities of shape (3,)"),
+        ({"light_intensities": np.zeros(4)}, InputError, "not a finite number above 0"),
+        ({"method": "l2"}, UsageError, "no method named 'l2'"),
+    ],
+)
+def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message: str) -> None:
+    arguments: dict[str, Any] = {"images": np.ones((4, 5, 6)), "light_directions": LIGHTS, "method": "ls"}
+    with pytest.raises(error) as caught:
+        splinecli.estimate_normals(**(arguments | change))
+    assert message in str(caught.value)
+
+
+def test_heights() -> None:
+    _, normals = matte()
+    expected = integrate_normals(normals, None)
+    np.testing.assert_array_equal(splinecli.integrate_normals(normals), expected)
+
+
+def test_importing_the_package_loads_neither_torch_nor_numpy() -> None:
+    code = (
+        "import json, sys, splinecli; "
+        "print(json.dumps([name for name in ('numpy', 'torch', 'cv2') if name in sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert json.loads(done.stdout) == []
