@@ -13,7 +13,8 @@ import pytest
 
 from html_page import HtmlPage
 from splinecli import __version__
-from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
+from splinecli.evaluation.outcome import Evaluation, Result, Skipped
+from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.report import html_report
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
@@ -51,6 +52,7 @@ def test_one_evaluation() -> None:
     assert protocol == {
         "Methods": "ls, iw12",
         "Captures": "ball, cat",
+        "Image values": "saturated observations restored, unknown light intensities estimated, as infer does",
         "Lights": "10 lights",
         "Trials": "4",
         "Draws of lights": "at random from the seed, the same for all methods",

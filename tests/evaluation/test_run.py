@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,10 @@ from numpy.typing import NDArray
 from splinecli.capture import read_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.run import Protocol, TrialStore, evaluate, evaluate_all
+from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.run import evaluate, evaluate_all
+from splinecli.evaluation.trials import TrialStore
+from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
 
 WriteDome = Callable[..., Path]
@@ -242,15 +246,36 @@ def test_normals_that_are_none_are_not_scored(write_dome: WriteDome, vector: Seq
 
 def test_progress(write_dome: WriteDome) -> None:
     folders = [write_dome("a"), write_dome("b")]
-    seen: list[tuple[int, int]] = []
+    seen: list[tuple[float, int, str]] = []
     protocols = [Protocol(n_lights=7, trials=2), Protocol()]
     evaluate_all(
-        folders, [make_estimator("ls")], protocols, on_progress=lambda done, total: seen.append((done, total))
+        folders,
+        [make_estimator("ls")],
+        protocols,
+        on_progress=lambda done, total, note: seen.append((done, total, note)),
     )
-    assert [total for _, total in seen] == [6] * len(seen)
-    done = [done for done, _ in seen]
+    assert {total for _, total, _ in seen} == {6}
+    done = [done for done, _, _ in seen]
     assert done == sorted(done)
     assert done[-1] == 6
+    notes = [note for _, _, note in seen]
+    assert [note for note in notes if "reading b" in note] == [
+        f"reading b, image {i} of 8" for i in range(1, 9)
+    ]
+    assert notes[-1] == "trial 6 of 6"
+
+
+def test_a_trial_that_runs_moves_the_progress(write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiles = partial(estimate_normals, tile_pixels=10)
+    monkeypatch.setattr("splinecli.evaluation.run.estimate_normals", tiles)
+    seen: list[float] = []
+    evaluate_all(
+        [write_dome()],
+        [make_estimator("ls")],
+        [Protocol(7, trials=1)],
+        on_progress=lambda done, total, note: seen.append(done),
+    )
+    assert seen[-10:] == pytest.approx(np.arange(1, 11) / 10)  # 100 pixels in tiles of 10
 
 
 @pytest.mark.parametrize("jobs", [2, 5])
@@ -295,7 +320,9 @@ def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> 
     assert len(path.read_text().splitlines()) == 4
 
 
-@pytest.mark.parametrize("change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw"])
+@pytest.mark.parametrize(
+    "change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw", "reading"]
+)
 def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_path: Path, change: str) -> None:
     folder, path = write_dome(), tmp_path / "trials.jsonl"
     settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
@@ -310,10 +337,10 @@ def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_pat
     elif change == "method":
         fake.fingerprint = "other weights"
     else:
-        name = {"seed": "seed", "pixels": "max_pixels", "noise": "light_noise_deg", "draw": "n_lights"}[
-            change
-        ]
-        settings[name] = 5
+        name = {"seed": "seed", "pixels": "max_pixels", "noise": "light_noise_deg", "draw": "n_lights"}.get(
+            change, "as_stored"
+        )
+        settings[name] = True if change == "reading" else 5
     evaluate_all([folder], [fake], [Protocol(**settings)], store=TrialStore(path))
     assert fake.lights
 

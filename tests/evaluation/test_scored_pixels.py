@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from splinecli.capture import Capture
+from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError
-from splinecli.evaluation.scored_pixels import keep_scored_pixels
+from splinecli.evaluation.scored_pixels import scored_rows
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
 MASK = np.random.default_rng(5).random((9, 7)) < 0.7
@@ -26,28 +27,30 @@ def capture() -> Capture:
 
 
 def test_pixels_without_ground_truth_go(capture: Capture) -> None:
-    kept = keep_scored_pixels(capture)
     wanted = MASK.copy()
     wanted[:, 3:5] = False
+    rows = scored_rows(capture)
+    np.testing.assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
+    kept = StoredCapture(capture, None, knows_intensities=True).choose_pixels(rows).capture
     np.testing.assert_array_equal(kept.mask, wanted)
     np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
     assert kept.light_indices == (4, 7, 9)
 
 
 def test_a_part_of_the_pixels(capture: Capture) -> None:
-    parts = [keep_scored_pixels(capture, max_pixels=10, seed=seed) for seed in (0, 0, 1)]
+    parts = [scored_rows(capture, max_pixels=10, seed=seed) for seed in (0, 0, 1)]
     for part in parts:
-        assert part.n_pixels == 10
-        assert not part.mask[:, 3:5].any()
-        np.testing.assert_array_equal(part.observations[:, 0], np.flatnonzero(part.mask))
-    np.testing.assert_array_equal(parts[0].mask, parts[1].mask)
-    assert (parts[0].mask != parts[2].mask).any()
+        assert len(part) == 10
+        assert (np.diff(part) > 0).all()
+        assert set(part) <= set(scored_rows(capture))
+    np.testing.assert_array_equal(parts[0], parts[1])
+    assert (parts[0] != parts[2]).any()
 
 
 def test_more_than_there_are_is_all(capture: Capture) -> None:
-    assert keep_scored_pixels(capture, max_pixels=1000).n_pixels == keep_scored_pixels(capture).n_pixels
+    np.testing.assert_array_equal(scored_rows(capture, max_pixels=1000), scored_rows(capture))
 
 
 def test_without_ground_truth(capture: Capture) -> None:
     with pytest.raises(InputError, match="c: no ground truth"):
-        keep_scored_pixels(replace(capture, ground_truth=None))
+        scored_rows(replace(capture, ground_truth=None))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splinecli.evaluation.records import Evaluation, Protocol, Result
+from splinecli.evaluation.outcome import Evaluation, Result
+from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.statistics import (
     AVERAGE,
     Comparison,
@@ -145,7 +146,7 @@ def test_one_method_has_nobody_to_differ_from() -> None:
         ),
         (
             Comparison("ball", "a", "b", 10, 0.1, 0.5, (-0.2, 0.4), 0.3, 0.31),
-            "a and b cannot be told apart (+0.10 degrees, 95 % interval -0.20 to +0.40, p = 0.31, 10 trials).",
+            "a and b do not differ significantly (+0.10 degrees, 95 % interval -0.20 to +0.40, p = 0.31, 10 trials).",
         ),
         (
             Comparison("ball", "a", "b", 1, 2.0, 0.0, None, None, None),

@@ -7,17 +7,14 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from splinecli import __version__
-from splinecli.evaluation.records import Evaluation, Protocol, Result, Skipped
-from splinecli.evaluation.tables import (
-    best_cells,
-    latex,
-    markdown,
-    protocol_in_words,
-    results_csv,
-    results_document,
-    table_rows,
-)
+from splinecli.evaluation.document import results_csv, results_document
+from splinecli.evaluation.outcome import Evaluation, Result, Skipped
+from splinecli.evaluation.protocol import Protocol, protocol_in_words
+from splinecli.evaluation.report import html_report
+from splinecli.evaluation.tables import best_cells, latex, markdown, table_rows
 
 TEN = Evaluation(
     Protocol(n_lights=10, trials=2, seed=7, max_pixels=500),
@@ -46,26 +43,31 @@ TABLE = """\
 | ls | 4.50 | **9.00** | 6.75 |
 | spline-net | **3.25** | **9.00** | **6.13** |
 """
+PROTOCOL = "10 lights, 2 random draws, seed 7, at most 500 pixels of each capture, images restored"
+CAPTION = f"Mean angular error in degrees: {PROTOCOL}.\n"
 
 
 def test_markdown_of_one() -> None:
-    assert markdown([TEN]) == TABLE
+    assert markdown([TEN]) == f"{TABLE}\n{CAPTION}"
 
 
 def test_markdown_of_two() -> None:
     assert markdown([TEN, ALL]) == (
-        f"## 10 lights\n\n{TABLE}"
+        f"## 10 lights\n\n{TABLE}\n{CAPTION}"
         "\n## all lights\n\n"
         "| method | ball | cat | average |\n"
         "|---|---:|---:|---:|\n"
         "| ls | **4.00** | 8.50 | 6.25 |\n"
         "| spline-net | 4.50 | **6.00** | **5.25** |\n"
+        "\nMean angular error in degrees: all lights, seed 7, at most 500 pixels of each capture,"
+        " images restored.\n"
     )
 
 
 def test_one_method_has_no_best() -> None:
     alone = replace(TEN, results=TEN.results[:1])
-    assert markdown([alone]) == "| method | ball | average |\n|---|---:|---:|\n| ls | 4.50 | 4.50 |\n"
+    table = "| method | ball | average |\n|---|---:|---:|\n| ls | 4.50 | 4.50 |\n"
+    assert markdown([alone]) == f"{table}\n{CAPTION}"
 
 
 def test_a_bar_in_a_name_does_not_end_the_cell() -> None:
@@ -85,15 +87,15 @@ def test_rows_for_a_terminal() -> None:
 
 def test_csv() -> None:
     assert results_csv([TEN, ALL]) == (
-        "method,capture,n_lights,light_noise_deg,mae_deg,std_deg,trials,seconds\n"
-        "ls,ball,10,0.0,4.5,0.5,2,0.0013\n"
-        "spline-net,ball,10,0.0,3.25,0.0,2,1.5\n"
-        "ls,cat,10,0.0,9.002,0.001,2,0.001\n"
-        "spline-net,cat,10,0.0,9.004,0.0,2,1.25\n"
-        "ls,ball,96,0.0,4.0,0.0,1,0.01\n"
-        "spline-net,ball,96,0.0,4.5,0.0,1,2.0\n"
-        "ls,cat,50,0.0,8.5,0.0,1,0.01\n"
-        "spline-net,cat,50,0.0,6.0,0.0,1,2.0\n"
+        "method,capture,n_lights,light_noise_deg,mae_deg,std_deg,trials,seconds,as_stored\n"
+        "ls,ball,10,0.0,4.5,0.5,2,0.0013,False\n"
+        "spline-net,ball,10,0.0,3.25,0.0,2,1.5,False\n"
+        "ls,cat,10,0.0,9.002,0.001,2,0.001,False\n"
+        "spline-net,cat,10,0.0,9.004,0.0,2,1.25,False\n"
+        "ls,ball,96,0.0,4.0,0.0,1,0.01,False\n"
+        "spline-net,ball,96,0.0,4.5,0.0,1,2.0,False\n"
+        "ls,cat,50,0.0,8.5,0.0,1,0.01,False\n"
+        "spline-net,cat,50,0.0,6.0,0.0,1,2.0,False\n"
     )
 
 
@@ -106,6 +108,7 @@ def test_json_of_one() -> None:
 
 JSON = """\
 {
+ "schema": 1,
  "protocol": {
   "n_lights": 10,
   "trials": 2,
@@ -113,7 +116,8 @@ JSON = """\
   "draws": null,
   "light_noise_deg": 0.0,
   "max_pixels": 500,
-  "skip_first": {}
+  "skip_first": {},
+  "as_stored": false
  },
  "methods": {},
  "results": [
@@ -126,6 +130,7 @@ JSON = """\
    "std_deg": 0.5,
    "trials": 2,
    "seconds": 0.0013,
+   "as_stored": false,
    "maes_deg": [
     4.0,
     5.0
@@ -140,6 +145,7 @@ JSON = """\
    "std_deg": 0.0,
    "trials": 2,
    "seconds": 1.5,
+   "as_stored": false,
    "maes_deg": [
     3.25,
     3.25
@@ -232,10 +238,22 @@ def test_the_draws_file_is_named() -> None:
     assert results_document([drawn])["protocol"]["draws"] == "draws.txt"
 
 
+@pytest.mark.parametrize("as_stored", [False, True])
+def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> None:
+    evaluation = replace(TEN, protocol=replace(TEN.protocol, as_stored=as_stored))
+    words = "images as stored." if as_stored else "images restored."
+    assert words in markdown([evaluation])
+    assert words in latex([evaluation])
+    document = results_document([evaluation])
+    assert document["protocol"]["as_stored"] is as_stored
+    assert {record["as_stored"] for record in document["results"]} == {as_stored}
+    assert all(line.endswith(f",{as_stored}") for line in results_csv([evaluation]).splitlines()[1:])
+    shown = "as stored: nothing restored" if as_stored else "saturated observations restored"
+    assert shown in html_report([evaluation], [], [])
+
+
 def test_latex_of_one() -> None:
-    assert latex([TEN]) == LATEX.replace(
-        "PROTOCOL", "10 lights, 2 random draws, seed 7, at most 500 pixels of each capture"
-    )
+    assert latex([TEN]) == LATEX.replace("PROTOCOL", PROTOCOL)
 
 
 LATEX = r"""% Needs \usepackage{booktabs} in the preamble.
@@ -281,7 +299,9 @@ def test_latex_escapes_names() -> None:
 
 def test_protocols_in_words() -> None:
     all_lights = ALL.protocol
-    assert protocol_in_words(replace(TEN.protocol, max_pixels=None)) == "10 lights, 2 random draws, seed 7"
-    assert protocol_in_words(replace(all_lights, max_pixels=None, seed=0)) == "all lights, seed 0"
+    whole = replace(TEN.protocol, max_pixels=None)
+    assert protocol_in_words(whole) == "10 lights, 2 random draws, seed 7, images restored"
+    as_stored = replace(all_lights, max_pixels=None, seed=0, as_stored=True)
+    assert protocol_in_words(as_stored) == "all lights, seed 0, images as stored"
     noisy = replace(all_lights, light_noise_deg=2.5, trials=1, max_pixels=None)
-    assert protocol_in_words(noisy) == "all lights, light noise of 2.5 degrees, 1 trial, seed 7"
+    assert protocol_in_words(noisy).startswith("all lights, light noise of 2.5 degrees, 1 trial, seed 7")

@@ -1,8 +1,8 @@
-"""Figures of single captures: what every method makes of the first draw, and what SPLINE-Net sees of some pixels."""
+"""Figures of single captures: the maps of every method for the first draw, and observation maps of some pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,25 +11,25 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError
-from splinecli.evaluation.records import Protocol
-from splinecli.evaluation.run import first_trial, see_trial
-from splinecli.evaluation.tables import heading
+from splinecli.evaluation.plan import first_trial
+from splinecli.evaluation.protocol import Protocol, heading
+from splinecli.evaluation.trial_capture import TrialSource
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import Estimator
 from splinecli.pictures.method_maps import method_maps
 from splinecli.pictures.observation_maps import observation_map_figure
 
 SHOWN_PERCENTILES = (10, 50, 90, 99)
-"""Of SPLINE-Net's errors: the pixels whose maps are shown unless others are chosen."""
+"""Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
 
 MAPS = "_observation_maps"
 
 MOST_LISTED = 16
-"""A title names the lights of a draw up to this many."""
+"""Largest number of lights that a title lists."""
 
 
 class CaptureFigure(NamedTuple):
-    """A picture: its file's stem, what it shows in words, and PNG."""
+    """A picture: the stem of its file name, its caption, and the PNG."""
 
     stem: str
     caption: str
@@ -43,14 +43,18 @@ def capture_figures(
     estimators: Sequence[Estimator],
     protocol: Protocol,
     pixels: Sequence[tuple[int, int]] = (),
+    on_progress: Callable[[float], None] | None = None,
 ) -> list[CaptureFigure]:
-    """The methods' maps under the protocol's first draw, and where SPLINE-Net is among them some pixels' maps.
+    """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
 
-    All pixels that have ground truth are estimated, whatever the protocol's max_pixels.
+    All pixels in the mask are estimated, also where the protocol has max_pixels.
 
     Args:
-        name: what the capture is called in the tables; stem: the same as a file's name.
-        pixels: row and column of those whose observation maps are shown; by default at the SHOWN_PERCENTILES.
+        folder: the capture.
+        name: name of the capture in the tables.
+        stem: stem of the figures' file names.
+        pixels: (row, column) of the pixels whose observation maps are shown; by default those at SHOWN_PERCENTILES.
+        on_progress: called with the share of the work that was just done.
 
     Raises:
         InputError: the capture cannot be read or scored.
@@ -58,29 +62,30 @@ def capture_figures(
     """
     source = open_capture(folder)
     trial = first_trial(source, name, protocol)
-    whole = source.read(range(protocol.skipped_lights(name), source.n_lights), as_stored=True)
-    capture = see_trial(whole, trial)
+    lights = range(protocol.skipped_lights(name), source.n_lights)
+    advance = on_progress or (lambda share: None)
+    steps = 1 + len(estimators)
+    stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps))
+    capture = TrialSource(stored).see(trial)
     assert capture.ground_truth is not None  # or there is no first trial
-    estimates = {e.name: estimate_normals(capture, e) for e in estimators}
-    words = f"{name}, {heading(protocol)}{_listed(trial.lights)}"
-    maps = method_maps(
-        capture.ground_truth,
-        capture.mask,
-        {method: estimate.normal_map for method, estimate in estimates.items()},
-        {method: _errors(estimate) for method, estimate in estimates.items()},
-        title=words,
-    )
-    figures = [CaptureFigure(stem, f"{words}. Normal maps above error maps, ground truth at the left.", maps)]
+    estimates = {
+        e.name: estimate_normals(capture, e, progress=lambda count: advance(count / capture.n_pixels / steps))
+        for e in estimators
+    }
+    title = f"{name}, {heading(protocol)}{_listed(trial.lights)}"
+    figures = [_maps_figure(capture, estimates, stem, title)]
     for estimator in estimators:
         if estimator.name == "spline-net":
-            png = _observation_maps(whole, capture, estimator, estimates[estimator.name], pixels, title=words)
-            caption = f"{words}. Observation maps of single pixels, turned into the network's frame."
+            whole = stored.capture if trial.as_stored else stored.restore(stored.estimate_intensities())
+            chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
+            png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)
+            caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
             figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
-    """Names of files for captures, all different, whatever letters or slashes the captures' names hold."""
+    """Return a different stem of a file name for each capture, also where names have slashes."""
     stems: list[str] = []
     for name in names:
         plain = stem = name.replace("/", "_")
@@ -92,9 +97,39 @@ def file_stems(names: Sequence[str]) -> list[str]:
     return stems
 
 
+def _maps_figure(
+    capture: Capture, estimates: Mapping[str, NormalEstimate], stem: str, title: str
+) -> CaptureFigure:
+    assert capture.ground_truth is not None
+    png = method_maps(
+        capture.ground_truth,
+        capture.mask,
+        {method: estimate.normal_map for method, estimate in estimates.items()},
+        {method: _errors(estimate) for method, estimate in estimates.items()},
+        title=title,
+    )
+    return CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)
+
+
 def _errors(estimate: NormalEstimate) -> NDArray[np.float32]:
     assert estimate.error_map_deg is not None
     return estimate.error_map_deg
+
+
+def _chosen_pixels(
+    capture: Capture, estimate: NormalEstimate, pixels: Sequence[tuple[int, int]]
+) -> NDArray[np.intp]:
+    """Return the (row, column) of the pixels to show, (N, 2). Raises UsageError for one without ground truth."""
+    errors = _errors(estimate)
+    chosen = np.array(pixels or _typical_pixels(errors))
+    for row, column in chosen:
+        inside = 0 <= row < errors.shape[0] and 0 <= column < errors.shape[1]
+        if not inside or np.isnan(errors[row, column]):
+            raise UsageError(
+                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
+                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
+            )
+    return chosen
 
 
 def _observation_maps(
@@ -102,7 +137,7 @@ def _observation_maps(
     capture: Capture,
     estimator: Estimator,
     estimate: NormalEstimate,
-    pixels: Sequence[tuple[int, int]],
+    pixels: NDArray[np.intp],
     *,
     title: str,
 ) -> bytes:
@@ -110,16 +145,8 @@ def _observation_maps(
 
     assert isinstance(estimator, NetworkEstimator)
     errors = _errors(estimate)
-    chosen = np.array(pixels or _typical_pixels(errors))
-    for row, column in chosen:
-        if not (0 <= row < errors.shape[0] and 0 <= column < errors.shape[1]) or np.isnan(
-            errors[row, column]
-        ):
-            raise UsageError(
-                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
-                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
-            )
-    place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[chosen[:, 0], chosen[:, 1]] - 1
+    rows, columns = pixels[:, 0], pixels[:, 1]
+    place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
     sparse, dense, truth = estimator.maps(
         capture.observations[place],
         capture.light_directions,
@@ -130,8 +157,8 @@ def _observation_maps(
         sparse,
         dense,
         truth if whole.n_lights > capture.n_lights else None,
-        pixels=chosen,
-        error_deg=errors[chosen[:, 0], chosen[:, 1]],
+        pixels=pixels,
+        error_deg=errors[rows, columns],
         title=title,
         grid=estimator.network.config.grid,
     )

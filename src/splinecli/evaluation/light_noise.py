@@ -1,4 +1,4 @@
-"""Light directions as a careless calibration would give them."""
+"""Errors of light directions, as a careless calibration makes them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splinecli.normals import unit
 
 LARGEST_SIGMA_DEG = 30.0
-"""Beyond it, "noise" has lost its meaning."""
+"""Largest standard deviation that an evaluation accepts."""
 
 _LARGEST_TILT_DEG = 89.0
 
@@ -16,14 +16,14 @@ _LARGEST_TILT_DEG = 89.0
 def tilt_lights(
     light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Unit light directions (F, 3), each turned by an angle from N(0, sigma_deg) in a random direction.
+    """Return unit light directions (F, 3), each turned by an angle from N(0, sigma_deg) in a random direction.
 
-    The root mean square of the angles is sigma_deg. A light that would sink below the horizon (z <= 0) is
-    turned the opposite way, which keeps it above, so that every direction stays one that a capture may have.
+    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is turned the
+    opposite way and stays above it, so that a capture may have any of the directions.
     """
     n_lights = len(light_directions)
     angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
-    # A Gaussian vector less its part along the light: every direction across the light is equally likely.
+    # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
     across = generator.normal(size=(n_lights, 3))
     along = np.einsum("fi,fi->f", across, light_directions)
     across = unit(across - along[:, None] * light_directions)

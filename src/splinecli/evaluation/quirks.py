@@ -1,4 +1,4 @@
-"""What is particular about a capture and how the evaluation dealt with it, in sentences for the report."""
+"""Notes on what is special about a capture and how the evaluation treated it."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from splinecli.capture import Capture
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
-from splinecli.evaluation.records import Protocol
+from splinecli.evaluation.protocol import Protocol
 
 DAMAGED_IMAGES = {"bearPNG": 20}
-"""DiLiGenT's Bear: its first 20 images are corrupted, as the benchmark's users found."""
+"""The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
 
 
 def describe_quirks(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
-    """Sentences on a capture, whole as it was read; none for one without peculiarities."""
+    """Return sentences about a capture with all its pixels; none for an ordinary one."""
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
     if skipped:

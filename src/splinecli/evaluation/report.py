@@ -1,4 +1,4 @@
-"""An evaluation as one HTML file that holds everything it shows: to be mailed, printed, or opened years later."""
+"""An evaluation as one HTML file that needs no other file: to mail, to print, or to keep."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli import __version__
-from splinecli.evaluation.records import Evaluation
+from splinecli.evaluation.outcome import Evaluation, all_captures, all_skipped
+from splinecli.evaluation.protocol import EVERY_CAPTURE, heading, lights_in_words
 from splinecli.evaluation.statistics import (
     AVERAGE,
     SIGNIFICANCE,
@@ -20,18 +21,19 @@ from splinecli.evaluation.statistics import (
     p_in_words,
     trial_averages,
 )
-from splinecli.evaluation.tables import best_cells, heading, lights_in_words, table_rows
+from splinecli.evaluation.tables import best_cells, table_rows
 from splinecli.results.templates import render
 
-_MOST_SENTENCES = 3  # of three methods; the pairs of more are read faster in a matrix
+_MOST_SENTENCES = 3  # pairs, those of three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
-
+_RESTORED = "saturated observations restored, unknown light intensities estimated, as infer does"
+_AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
 
 Mark = Literal["", "star", "best"]
 
 
 class Cell(NamedTuple):
-    """A table's cell: its text, a smaller remark, and a mark: a star, or for the best a star and a colour."""
+    """A table's cell: its text, a remark in smaller type, and a mark. "best" is a star and a colour."""
 
     text: str
     remark: str = ""
@@ -45,19 +47,19 @@ Table = list[list[Cell]]
 def html_report(
     evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]
 ) -> str:
-    """The report of one evaluation, or of several of the same methods under other lights or light noises.
+    """Return the report of one evaluation, or of several that differ in the lights or the light noise.
 
     Args:
-        figures: captions, which are the images' alternative texts too, and PNG.
-        notes: sentences about the captures and the run.
+        figures: pairs of a caption, which is also the alternative text, and a PNG.
+        notes: sentences about the captures.
     """
     first = evaluations[0]
     return render(
         "report.html",
-        title=f"{_count(len(first.methods), 'method')} on {_count(len(first.captures), 'capture')}",
+        title=f"{_count(len(first.methods), 'method')} on {_count(len(all_captures(evaluations)), 'capture')}",
         protocol=_protocol(evaluations),
         notes=notes,
-        skipped=list(dict.fromkeys((s.capture, s.reason) for e in evaluations for s in e.skipped)),
+        skipped=[(s.capture, s.reason) for s in all_skipped(evaluations)],
         summary=_summary(evaluations) if len(evaluations) > 1 else None,
         several_methods=len(first.methods) > 1,
         sections=[_section(evaluation) for evaluation in evaluations],
@@ -73,7 +75,7 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     drawn = "at random from the seed" if first.draws_file is None else f"those of {first.draws_file.name}"
     trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
     left_out = ", ".join(
-        f"the first {count} of {'every other capture' if name == '*' else name}"
+        f"the first {count} of {'every other capture' if name == EVERY_CAPTURE else name}"
         for name, count in first.skip_first.items()
     )
     everything = "all that have ground truth"
@@ -86,7 +88,8 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     return [
         ("Methods", ", ".join(evaluations[0].methods)),
         *([("Weights", ", ".join(weights))] if weights else []),
-        ("Captures", ", ".join(dict.fromkeys(c for e in evaluations for c in e.captures))),
+        ("Captures", ", ".join(all_captures(evaluations))),
+        ("Image values", _AS_STORED if first.as_stored else _RESTORED),
         ("Lights", ", ".join(lights)),
         ("Trials", " or ".join(map(str, trials))),
         ("Draws of lights", f"{drawn}, the same for all methods"),
@@ -112,7 +115,7 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _summary(evaluations: Sequence[Evaluation]) -> Table:
-    """Methods by evaluations: the last column of each evaluation's table."""
+    """Return a table of methods by evaluations: the last column of each evaluation's table."""
     columns = [[row[-1] for row in _error_table(evaluation)] for evaluation in evaluations]
     columns = [
         [Cell(heading(evaluation.protocol)), *column[1:]]
@@ -123,7 +126,7 @@ def _summary(evaluations: Sequence[Evaluation]) -> Table:
 
 
 def _error_table(evaluation: Evaluation) -> Table:
-    """Methods by captures and the average: MAE, its standard deviation over the trials, the best marked."""
+    """Return a table of methods by captures and the average: MAE and its standard deviation over the trials."""
     header, *rows = table_rows(evaluation)
     best = best_cells([header, *rows])
     maes_deg = {(r.method, r.capture): r.maes_deg for r in evaluation.results}
@@ -142,7 +145,7 @@ def _error_table(evaluation: Evaluation) -> Table:
 
 
 def _seconds_table(evaluation: Evaluation) -> Table:
-    """Methods by captures: seconds a trial."""
+    """Return a table of methods by captures: seconds for each trial."""
     seconds = {(r.method, r.capture): r.seconds for r in evaluation.results}
     body = [
         [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]
@@ -152,7 +155,7 @@ def _seconds_table(evaluation: Evaluation) -> Table:
 
 
 def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:
-    """MAE of the row's method minus that of the column's; marked where they differ beyond the spread."""
+    """Return a table of the MAE of the row's method minus that of the column's; a mark where they differ."""
     cells = {}
     for c in comparisons:
         for row, column, difference_deg in (
@@ -184,7 +187,7 @@ def _pair_row(comparison: Comparison) -> dict[str, str]:
 
 
 def _figure(caption: str, png: bytes) -> dict[str, Any]:
-    width, height = struct.unpack(">II", png[16:24])  # of the IHDR chunk, always the first
+    width, height = struct.unpack(">II", png[16:24])  # from the IHDR chunk, which always comes first
     data = base64.b64encode(png).decode("ascii")
     return {"caption": caption, "data": data, "width": width, "height": height, "wide": width > 2 * height}
 

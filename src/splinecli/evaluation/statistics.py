@@ -1,9 +1,9 @@
-"""Whether two methods differ by more than the draws of lights make them differ.
+"""Tests of whether two methods differ by more than the random draws of lights explain.
 
-Methods see the same draws, and a draw that is hard for one is mostly hard for the other. So the differences trial by
-trial are tested, not the two spreads: a paired t-test (Student, Biometrika 1908), with the correction of Holm
-(Scandinavian Journal of Statistics 1979) over the pairs of methods on one capture. What is tested is the spread over
-draws: a difference beyond it holds for this capture under other lights, not for other captures.
+All methods see the same draws, and a draw that is hard for one method is usually hard for the others. The test
+therefore uses the differences trial by trial: a paired t-test (Student, Biometrika 1908), corrected for the number of
+pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979). The test covers the spread over draws
+only. A significant difference holds for other lights on this capture, not for other captures.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.evaluation.records import Evaluation
+from splinecli.evaluation.outcome import Evaluation
 
 AVERAGE = "average"
-"""What stands for all captures together where a capture's name is expected."""
+"""Name that stands for the average over all captures, in place of a capture's name."""
 
 SIGNIFICANCE = 0.05
+"""p-value below which two methods differ."""
 
 # Error maps are float32: MAEs closer than this are equal.
 _SAME_DEG = 1e-6
@@ -28,16 +29,22 @@ _SAME_DEG = 1e-6
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two methods on one capture, or on the average over the captures (AVERAGE), trial by trial.
+    """The difference of two methods on one capture, or on the average over the captures, trial by trial.
 
-    Without a test, interval_deg, p_value and p_holm are None: with one trial, and where the trials' differences are
-    all the same but not zero, which is one trial told several times. Where they are all zero, the interval is (0, 0)
-    and p is 1. "The same" is to 1e-6 degrees, the precision of the error maps.
+    There is no test with one trial, or where the differences of all trials are equal but not zero: this is one trial
+    several times. interval_deg, p_value and p_holm are then None. Where all differences are zero, the interval is
+    (0, 0) and p is 1. Differences count as equal within 1e-6 degrees, the precision of the error maps.
 
-    trials: those that were paired. difference_deg, std_deg: mean and population standard deviation over them of the
-    MAE of `first` minus that of `second`; below zero `first` is better. interval_deg: of 95 % for the mean
-    difference. p_value: two-sided. p_holm: the same, corrected for the number of pairs tested on this capture; the
-    interval is not, so it may leave zero out where p_holm is above SIGNIFICANCE.
+    Args:
+        capture: name of the capture, or AVERAGE.
+        first, second: names of the methods.
+        trials: number of trials that were compared.
+        difference_deg: mean over the trials of the MAE of `first` minus that of `second`; `first` is better below 0.
+        std_deg: population standard deviation of the differences.
+        interval_deg: 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0
+            while p_holm is above SIGNIFICANCE.
+        p_value: two-sided.
+        p_holm: p_value corrected for the number of pairs that were tested on this capture.
     """
 
     capture: str
@@ -57,9 +64,9 @@ class Comparison:
 
 
 def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
-    """Every pair of methods on every capture, then on the average over the captures; none of one method alone.
+    """Return the comparison of every pair of methods on every capture, then on the average over the captures.
 
-    On the average, trial t is the mean of trial t of every capture (trial_averages).
+    Trial t of the average is the mean of trial t over the captures; see trial_averages.
     """
     comparisons: list[Comparison] = []
     for capture in evaluation.captures:
@@ -71,10 +78,10 @@ def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
 
 
 def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
-    """The method's MAE in degrees of each trial, averaged over the captures.
+    """Return the MAE of a method in degrees for each trial, averaged over the captures.
 
-    A capture's only trial, as where it has K lights in all, stands for each of the others' trials. Where numbers of
-    trials differ otherwise, the trials that every capture has.
+    A capture with one trial only, for example because it has K lights in all, repeats it. Where the numbers of trials
+    differ otherwise, only the trials that every capture has are averaged.
     """
     maes_deg = [result.maes_deg for result in evaluation.results if result.method == method]
     most = max(map(len, maes_deg))
@@ -83,7 +90,7 @@ def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
 
 
 def in_words(comparison: Comparison) -> str:
-    """A comparison as a sentence."""
+    """Return a comparison as a sentence."""
     c = comparison
     better, worse = (c.first, c.second) if c.difference_deg < 0 else (c.second, c.first)
     size = f"{abs(c.difference_deg):.2f} degrees"
@@ -96,19 +103,20 @@ def in_words(comparison: Comparison) -> str:
         low, high = sorted((abs(low), abs(high)))
         return f"{better} is better than {worse} by {size} (95 % interval {low:.2f} to {high:.2f}, {test})."
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"
-    return f"{c.first} and {c.second} cannot be told apart ({c.difference_deg:+.2f} degrees, {interval}, {test})."
+    details = f"{c.difference_deg:+.2f} degrees, {interval}, {test}"
+    return f"{c.first} and {c.second} do not differ significantly ({details})."
 
 
 def p_in_words(p_value: float) -> str:
-    """A p-value as text: "p < 0.001", "p = 0.032"."""
+    """Return a p-value as text: "p < 0.001", "p = 0.032"."""
     return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.3f}" if p_value < 0.1 else f"p = {p_value:.2f}"
 
 
 def _compare_all(capture: str, maes_deg: dict[str, tuple[float, ...]]) -> list[Comparison]:
     pairs = combinations(maes_deg, 2)
-    found = [_compare(capture, a, b, np.array(maes_deg[a]), np.array(maes_deg[b])) for a, b in pairs]
-    corrected = iter(holm([c.p_value for c in found if c.p_value is not None]))
-    return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in found]
+    compared = [_compare(capture, a, b, np.array(maes_deg[a]), np.array(maes_deg[b])) for a, b in pairs]
+    corrected = iter(holm([c.p_value for c in compared if c.p_value is not None]))
+    return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in compared]
 
 
 def _compare(
@@ -121,7 +129,7 @@ def _compare(
 
 
 def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] | None, float | None]:
-    """The interval of 95 % and the p-value of a t-test of differences (T,) against zero."""
+    """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
     if len(differences) < 2:
         return None, None
     if np.abs(differences).max() < _SAME_DEG:
@@ -136,7 +144,10 @@ def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] 
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction: the k-th smallest of m times m + 1 - k, never falling, at most 1."""
+    """Return p-values after Holm's step-down correction.
+
+    The k-th smallest of m p-values is multiplied by m + 1 - k. Corrected values do not decrease and are at most 1.
+    """
     order = np.argsort(p_values, kind="stable")
     stepped = np.array(p_values)[order] * np.arange(len(p_values), 0, -1)
     corrected = np.empty(len(p_values))

@@ -1,4 +1,4 @@
-"""Finished trials, kept as they come: an evaluation that was cut off, or is asked for more, goes on from them."""
+"""Trials and their scores. Scores are stored as they come, so that an interrupted evaluation can go on."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from typing import Any
 from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
 from splinecli.capture.stamp import digest
-from splinecli.evaluation.records import Protocol
+from splinecli.evaluation.protocol import Protocol
 from splinecli.files import refusals_as_output_errors
 from splinecli.methods import Estimator
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one capture under one draw of lights, and all that decides its score.
+    """One method on one capture under one draw of lights, with everything that decides its score.
 
     Args:
-        capture: its name in the tables. method: its name.
-        number: from 0. lights: the draw. light_noise_deg, seed, max_pixels: of the protocol.
-        made_of: a digest of the capture's files and of the method's settings.
+        capture: name of the capture in the tables.
+        method: name of the method.
+        number: number of the trial, from 0.
+        lights: the draw.
+        light_noise_deg, seed, max_pixels, as_stored: see Protocol.
+        made_of: digest of the capture's files and of the method's settings.
     """
 
     capture: str
@@ -34,13 +37,31 @@ class Trial:
     light_noise_deg: float
     seed: int
     max_pixels: int | None
+    as_stored: bool
     made_of: str
+
+    @classmethod
+    def of(
+        cls, capture: str, method: str, number: int, lights: Draw, protocol: Protocol, *, made_of: str
+    ) -> Trial:
+        """Return a trial of a protocol."""
+        return cls(
+            capture,
+            method,
+            number,
+            lights,
+            protocol.light_noise_deg,
+            protocol.seed,
+            protocol.max_pixels,
+            protocol.as_stored,
+            made_of,
+        )
 
     @property
     def key(self) -> str:
-        """SHA-256 of what decides the score: the noise depends on seed and number, the pixels on the seed."""
+        """SHA-256 of what decides the score. The noise depends on seed and number, the pixels on the seed."""
         values = asdict(self)
-        del values["capture"]  # a name in the tables; the files themselves are in made_of
+        del values["capture"]  # only a name in the tables: made_of has the files themselves
         if self.light_noise_deg == 0:
             del values["number"]
             if self.max_pixels is None:
@@ -50,20 +71,27 @@ class Trial:
 
 @dataclass(frozen=True)
 class Score:
-    """mae_deg: over the scored pixels; seconds: spent estimating their normals."""
+    """The score of a trial.
+
+    Args:
+        mae_deg: mean angular error over the scored pixels.
+        seconds: time spent on estimating their normals.
+        estimated_intensities: whether the light intensities were estimated from the images.
+    """
 
     mae_deg: float
     seconds: float
+    estimated_intensities: bool
 
 
 class TrialStore:
-    """Scores by trial, in memory and in a file of JSON lines, where there is one.
+    """Scores by trial, in memory and, where a path is given, in a file of JSON lines.
 
-    A line that cannot be read, such as one that was cut short, counts as not there.
+    A line that cannot be read, such as one that was cut short, is ignored.
 
     Args:
-        path: the file, made at the first score; None for none.
-        fresh: begin anew.
+        path: the file, which the first score creates; None keeps the scores in memory only.
+        fresh: whether to delete the scores of an earlier evaluation.
 
     Raises:
         OutputError: the file cannot be read or written.
@@ -82,15 +110,18 @@ class TrialStore:
         for line in content.splitlines():
             record = _read_line(line)
             if record is not None:
-                self._scores[record["key"]] = Score(record["mae_deg"], record["seconds"])
-        # The next line must not be glued to one that was cut short.
+                self._scores[record["key"]] = Score(
+                    record["mae_deg"], record["seconds"], record["estimated_intensities"]
+                )
+        # The next line must not be appended to one that was cut short.
         self._break_first = bool(content) and not content.endswith("\n")
 
     def find(self, trial: Trial) -> Score | None:
+        """Return the score of a trial, or None where it is not stored."""
         return self._scores.get(trial.key)
 
     def add(self, trial: Trial, score: Score) -> None:
-        """Keep a score; any thread may. Raises OutputError."""
+        """Store a score. Any thread may call this. Raises OutputError."""
         with self._lock:
             self._scores[trial.key] = score
             if self._path is None:
@@ -104,23 +135,19 @@ class TrialStore:
 def plan_trials(
     capture: str, stamp: list[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
 ) -> list[Trial]:
-    """The trials of one method on one capture, whose files stamp_capture has stamped."""
+    """Return the trials of one method on one capture, given the stamp of the capture's files."""
     made_of = digest([__version__, estimator.fingerprint, *stamp])
     return [
-        Trial(
-            capture, estimator.name, number, draw, protocol.light_noise_deg, protocol.seed,
-            protocol.max_pixels, made_of,
-        )
+        Trial.of(capture, estimator.name, number, draw, protocol, made_of=made_of)
         for number, draw in enumerate(draws)
-    ]  # fmt: skip
+    ]
 
 
 def _read_line(line: str) -> dict[str, Any] | None:
     try:
         record = json.loads(line)
-        numbers = (record["mae_deg"], record["seconds"])
+        numbers, estimated = (record["mae_deg"], record["seconds"]), record["estimated_intensities"]
     except (ValueError, TypeError, KeyError):
         return None
-    if not all(isinstance(number, float) for number in numbers) or not isinstance(record.get("key"), str):
-        return None
-    return dict(record)
+    usable = all(isinstance(number, float) for number in numbers) and isinstance(estimated, bool)
+    return dict(record) if usable and isinstance(record.get("key"), str) else None

@@ -12,7 +12,8 @@ import tifffile
 
 from splinecli.capture import capture_name, find_captures, open_capture, read_capture
 from splinecli.errors import InputError
-from splinecli.evaluation.run import Protocol, evaluate
+from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.run import evaluate
 from splinecli.methods import make_estimator
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.evaluation.curves import light_noise_curves, lights_curves
-from splinecli.evaluation.records import Evaluation, Protocol, Result
+from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
+from splinecli.evaluation.outcome import Evaluation, Result
+from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import method_names
 from splinecli.pictures.plotting import method_looks
 

@@ -1,0 +1,242 @@
+"""The trials of an evaluation, planned before any image is read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from splinecli.capture import CaptureSource, capture_name, open_capture
+from splinecli.capture.lights.draws import Draw, DrawsFile, draw_lights, read_draws
+from splinecli.capture.record import MIN_LIGHTS
+from splinecli.capture.stamp import stamp_capture
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.evaluation.outcome import Evaluation, Result, Skipped
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
+from splinecli.evaluation.quirks import describe_quirks
+from splinecli.evaluation.scored_pixels import scored_rows
+from splinecli.evaluation.statistics import AVERAGE
+from splinecli.evaluation.trial_capture import TrialSource
+from splinecli.evaluation.trials import Trial, TrialStore, plan_trials
+from splinecli.methods import Estimator
+
+Unit = tuple[Trial, Estimator]
+"""A trial and the method that it scores."""
+
+OnImage = Callable[[int, int], object]
+"""Called with the number of images read so far and their total."""
+
+
+@dataclass
+class Task:
+    """A protocol with the trials of each capture and method, and the captures that failed."""
+
+    protocol: Protocol
+    draws_file: DrawsFile | None
+    trials: dict[tuple[str, str], list[Trial]] = field(default_factory=dict)
+    failures: dict[str, SplinecliError] = field(default_factory=dict)
+    notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, protocol: Protocol) -> Task:
+        """Return the task of a protocol, with its draws file read. Raises UsageError, InputError."""
+        return cls(*read_draws_file(protocol))
+
+    def fail(self, capture: str, error: SplinecliError) -> None:
+        """Record why a capture cannot be scored, and drop its trials."""
+        self.failures[capture] = error
+        self.trials = {key: trials for key, trials in self.trials.items() if key[0] != capture}
+
+    def evaluation(self, captures: Sequence[str], store: TrialStore) -> Evaluation:
+        """Return the outcome, in the order of the captures. Raises an error where all captures failed."""
+        results, n_estimated = [], {}
+        for (capture, method), trials in self.trials.items():
+            scores = [score for trial in trials if (score := store.find(trial)) is not None]
+            seconds = math.fsum(score.seconds for score in scores) / len(scores)
+            maes_deg = tuple(score.mae_deg for score in scores)
+            results.append(Result(method, capture, len(trials[0].lights), maes_deg, seconds))
+            n_estimated[capture] = (sum(score.estimated_intensities for score in scores), len(scores))
+        if not results:
+            raise _nothing_scored([self.failures[name] for name in captures])
+        skipped = (Skipped(name, str(self.failures[name])) for name in captures if name in self.failures)
+        notes = [note for name in captures for note in self.notes.get(name, ())]
+        notes += [
+            f"{name}: no file gives the light intensities; they were estimated in {count} of {of} trials."
+            for name, (count, of) in n_estimated.items()
+            if count
+        ]
+        return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes))
+
+
+@dataclass
+class CaptureJob:
+    """One capture with its trials under all protocols.
+
+    Args:
+        name: name of the capture in the tables.
+        source: the opened capture.
+        tasks: the protocols that can score it.
+        draws: for each draw, the trial and the method of each method that sees it.
+    """
+
+    name: str
+    source: CaptureSource
+    tasks: list[Task]
+    draws: list[list[Unit]]
+
+    @classmethod
+    def plan(
+        cls, folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[Task]
+    ) -> CaptureJob | None:
+        """Return the job of a capture. Returns None where no protocol can score it; the tasks then hold the reasons."""
+        try:
+            source = open_capture(folder)
+            stamp = stamp_capture(source)
+        except (InputError, UsageError, OSError) as error:
+            for task in tasks:
+                task.fail(name, as_input_error(error, folder))
+            return None
+        job = cls(name, source, [], [])
+        for task in tasks:
+            try:
+                draws = draws_for(source, name, task.protocol, task.draws_file)
+            except (InputError, UsageError) as error:
+                task.fail(name, error)
+                continue
+            job.tasks.append(task)
+            by_method = [plan_trials(name, stamp, e, draws, task.protocol) for e in estimators]
+            for estimator, trials in zip(estimators, by_method, strict=True):
+                task.trials[name, estimator.name] = trials
+            # All methods of a draw come together: they share its capture, and the remaining time can be estimated.
+            job.draws += [
+                list(zip(trials, estimators, strict=True)) for trials in zip(*by_method, strict=True)
+            ]
+        return job if job.tasks else None
+
+    def missing(self, store: TrialStore) -> list[list[Unit]]:
+        """Return the draws with the trials that the store does not have; draws without any are left out."""
+        draws = [[unit for unit in draw if store.find(unit[0]) is None] for draw in self.draws]
+        return [draw for draw in draws if draw]
+
+    def read(self, draws: Sequence[Sequence[Unit]], on_image: OnImage | None = None) -> TrialSource:
+        """Return the capture under all lights of these draws. Raises InputError, UsageError."""
+        lights = sorted(set().union(*(trial.lights for draw in draws for trial, _ in draw)))
+        n_read = 0
+
+        def count() -> None:
+            nonlocal n_read
+            n_read += 1
+            if on_image is not None:
+                on_image(n_read, len(lights))
+
+        try:
+            stored = self.source.read_stored(lights, count)
+        except OSError as error:
+            raise as_input_error(error, self.source.files.folder) from error
+        for task in self.tasks:
+            task.notes[self.name] = describe_quirks(stored.capture, self.name, task.protocol)
+        # All protocols of an evaluation score the same pixels.
+        protocol = self.tasks[0].protocol
+        rows = scored_rows(stored.capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
+        as_stored = all(task.protocol.as_stored for task in self.tasks)
+        return TrialSource.with_pixels(stored, rows, as_stored=as_stored)
+
+
+def as_input_error(error: SplinecliError | OSError, folder: Path) -> SplinecliError:
+    """Return the error that names the file which the system refused to read; others as they are."""
+    if isinstance(error, SplinecliError):
+        return error
+    path = Path(error.filename) if error.filename else folder
+    return InputError(f"cannot be read ({error.strerror or error})", path=path)
+
+
+def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
+    """Return the first trial of a capture, without a method. Raises what evaluate_all raises."""
+    protocol, draws_file = read_draws_file(protocol)
+    draw = draws_for(source, name, protocol, draws_file)[0]
+    return Trial.of(name, "", 0, draw, protocol, made_of="")
+
+
+def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
+    """Return the protocol with the number of lights and trials of its draws file, and the file's draws.
+
+    Raises:
+        UsageError: the protocol asks for another number of lights.
+        InputError: the file is wrong.
+    """
+    if protocol.draws_file is None:
+        return protocol, None
+    draws_file = read_draws(protocol.draws_file)
+    if protocol.n_lights not in (None, draws_file.n_lights):
+        raise UsageError(
+            f"{protocol.n_lights} lights a draw wanted,"
+            f" the draws in {draws_file.path} have {draws_file.n_lights}"
+        )
+    return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
+
+
+def draws_for(
+    source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None
+) -> list[Draw]:
+    """Return the draws of a capture, one for each trial.
+
+    Raises:
+        InputError: the capture has no ground truth, or a draw of the file does not fit it.
+        UsageError: it has too few lights.
+    """
+    if source.files.ground_truth is None:  # known before the images are read
+        raise InputError(
+            "no ground truth, so nothing to score against",
+            path=source.files.folder,
+            hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
+        )
+    skipped = protocol.skipped_lights(name)
+    left = source.n_lights - skipped
+    fewest = max(MIN_LIGHTS, protocol.n_lights or 0)
+    if skipped and left < fewest:
+        raise UsageError(
+            f"{name}: {max(left, 0)} of {source.n_lights} images stay when the first {skipped} are left out,"
+            f" expected at least {fewest}"
+        )
+    if draws_file is not None:
+        draws_file.check_against(source.light_directions, skipped=skipped)
+        return list(draws_file.draws)
+    draws = draw_lights(
+        source.light_directions[skipped:], protocol.n_lights, trials=protocol.trials, seed=protocol.seed
+    )
+    draws = [tuple(light + skipped for light in draw) for draw in draws]
+    # All lights are one draw, but their noise differs from trial to trial.
+    return draws * protocol.trials if len(draws) == 1 and protocol.light_noise_deg > 0 else draws
+
+
+def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
+    """Return the folders, each once, with the names of the captures.
+
+    Where two names are equal, all captures are named by the last parts of their paths. No capture gets the name of
+    the tables' average.
+    """
+    folders = list({folder.resolve(): folder for folder in captures}.values())
+    names = [capture_name(folder) for folder in folders]
+    if len({*names, AVERAGE}) <= len(names):
+        # Like capture_name, this keeps the name of a link.
+        parts = [(f.resolve() if ".." in f.parts else f.absolute()).parts for f in folders]
+        depth = 1 + (AVERAGE in names)
+        while len({path[-depth:] for path in parts}) < len(parts):
+            depth += 1
+        names = ["/".join(path[-depth:]) for path in parts]
+    return dict(zip(folders, names, strict=True))
+
+
+def check_skip_first(protocol: Protocol, names: Sequence[str]) -> None:
+    """Raise UsageError where skip_first names a capture that does not exist."""
+    for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
+        raise UsageError(f"no capture named {name!r} to skip images of; there are {', '.join(names)}")
+
+
+def _nothing_scored(failures: list[SplinecliError]) -> SplinecliError:
+    if len(failures) == 1:
+        return failures[0]
+    kind = UsageError if all(isinstance(failure, UsageError) for failure in failures) else InputError
+    first = str(failures[0]).removesuffix(".")
+    return kind(f"none of the {len(failures)} captures could be scored; the first: {first}")

@@ -1,0 +1,93 @@
+"""How an evaluation is done: the lights, trials, noise and pixels, and how captures are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from splinecli.capture.lights.draws import check_draw_settings
+from splinecli.errors import UsageError
+from splinecli.evaluation.light_noise import LARGEST_SIGMA_DEG
+
+EVERY_CAPTURE = "*"
+"""Key of `skip_first` for all captures that have no key of their own."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Settings of an evaluation. Two methods are comparable only under the same protocol.
+
+    Args:
+        n_lights: K, the lights in each draw. None means all lights of a capture, or the number in the draws file.
+        trials: T, the number of random draws. Without light noise, all lights need one trial only.
+        seed: seed of the draws, of the light noise and of the choice of pixels.
+        draws_file: file that gives the draws instead; see read_draws.
+        light_noise_deg: standard deviation of the angle by which each trial tilts the light directions.
+        max_pixels: number of pixels to score in each capture, chosen at random. None scores all pixels that have
+            ground truth.
+        skip_first: number of first images to leave out, by the name of the capture; EVERY_CAPTURE for all others. The
+            first 20 images of DiLiGenT's Bear are damaged.
+        as_stored: score the stored values alone, as the published tables do. By default, saturated observations are
+            restored and unknown light intensities are estimated, as `infer` does.
+
+    Raises:
+        UsageError: a value is out of its range.
+    """
+
+    n_lights: int | None = None
+    trials: int = 1
+    seed: int = 0
+    draws_file: Path | None = None
+    light_noise_deg: float = 0.0
+    max_pixels: int | None = None
+    skip_first: Mapping[str, int] = field(default_factory=dict)
+    as_stored: bool = False
+
+    def __post_init__(self) -> None:
+        check_draw_settings(self.n_lights, self.trials, self.seed)
+        if not 0 <= self.light_noise_deg <= LARGEST_SIGMA_DEG:
+            raise UsageError(
+                f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}"
+            )
+        if self.max_pixels is not None and self.max_pixels < 1:
+            raise UsageError(f"at most {self.max_pixels} pixels to score, expected at least 1")
+        for name, count in self.skip_first.items():
+            if count < 0:
+                raise UsageError(f"{count} images of {name} to skip, expected a number from 0")
+
+    def skipped_lights(self, capture: str) -> int:
+        """Return how many first lights of a capture are left out."""
+        return self.skip_first.get(capture, self.skip_first.get(EVERY_CAPTURE, 0))
+
+
+def lights_value(protocol: Protocol) -> int | str:
+    """Return the number of lights in each draw, or "all"."""
+    return "all" if protocol.n_lights is None else protocol.n_lights
+
+
+def lights_in_words(protocol: Protocol) -> str:
+    """Return the lights of a draw as text: "10 lights", "all lights"."""
+    return f"{lights_value(protocol)} lights"
+
+
+def heading(protocol: Protocol) -> str:
+    """Return what differs between evaluations: "10 lights", "all lights, light noise of 2 degrees"."""
+    noise = f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
+    return lights_in_words(protocol) + noise
+
+
+def protocol_in_words(protocol: Protocol) -> str:
+    """Return the whole protocol as text: "10 lights, 20 random draws, seed 0, images restored"."""
+    parts = [heading(protocol)]
+    if protocol.draws_file is not None:
+        parts.append(f"the {protocol.trials} draws of {protocol.draws_file.name}")
+    elif protocol.n_lights is not None:
+        parts.append(f"{protocol.trials} random {'draw' if protocol.trials == 1 else 'draws'}")
+    elif protocol.light_noise_deg:  # without noise, all lights are one trial, whatever number was given
+        parts.append(f"{protocol.trials} {'trial' if protocol.trials == 1 else 'trials'}")
+    parts.append(f"seed {protocol.seed}")
+    if protocol.max_pixels is not None:
+        parts.append(f"at most {protocol.max_pixels} pixels of each capture")
+    parts.append("images as stored" if protocol.as_stored else "images restored")
+    return ", ".join(parts)

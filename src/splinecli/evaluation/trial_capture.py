@@ -1,0 +1,86 @@
+"""What a trial sees of a capture: the scored pixels under the lights of its draw, restored as `infer` would."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture
+from splinecli.capture.lights.draws import NOISE_STREAM, in_one_plane
+from splinecli.capture.stored import StoredCapture
+from splinecli.evaluation.light_noise import tilt_lights
+from splinecli.evaluation.trials import Trial
+
+_RETILTS = 100
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """A capture that was read once, from which each trial takes its lights.
+
+    Every draw is restored by itself: a saturated observation is restored from the other lights of the draw, as
+    `infer` restores it when it reads only these lights.
+
+    Args:
+        stored: the capture with the stored values of its lights.
+        rows: rows of the observations to score; None for all of them.
+    """
+
+    stored: StoredCapture
+    rows: NDArray[np.integer] | None = None
+
+    @classmethod
+    def with_pixels(cls, stored: StoredCapture, rows: NDArray[np.integer], *, as_stored: bool) -> TrialSource:
+        """Return a source that scores the given rows of the observations only.
+
+        Args:
+            as_stored: whether no trial restores. Otherwise all pixels are kept where the light intensities are
+                unknown, because `infer` estimates them from all pixels.
+        """
+        if len(rows) == stored.capture.n_pixels:
+            return cls(stored)
+        if as_stored or stored.intensities_known:
+            return cls(stored.choose_pixels(rows))
+        return cls(stored, rows)
+
+    def see(self, trial: Trial) -> Capture:
+        """Return the capture under the lights of a trial, with the trial's noise on their directions."""
+        position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
+        seen = self.stored.choose_lights([position[light] for light in trial.lights])
+        if trial.light_noise_deg:
+            directions = _tilted(seen.capture.light_directions, trial)
+            seen = replace(seen, capture=replace(seen.capture, light_directions=directions))
+        # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
+        intensities = None if trial.as_stored else seen.estimate_intensities()
+        if self.rows is not None:
+            seen = seen.choose_pixels(self.rows)
+        return seen.capture if trial.as_stored else seen.restore(intensities)
+
+
+class SharedDraw:
+    """The capture that the methods of one draw share. The first method that needs it makes it."""
+
+    def __init__(self, source: TrialSource, trial: Trial) -> None:
+        self._source, self._trial = source, trial
+        self._lock = Lock()
+        self._capture: Capture | None = None
+
+    def capture(self) -> Capture:
+        """Return the capture under the lights of the draw. Any thread may call this."""
+        with self._lock:
+            if self._capture is None:
+                self._capture = self._source.see(self._trial)
+            return self._capture
+
+
+def _tilted(light_directions: NDArray[np.float64], trial: Trial) -> NDArray[np.float64]:
+    generator = np.random.default_rng([NOISE_STREAM, trial.seed, trial.number])
+    # Few lights and much noise can give lights in one plane. Such noise is drawn again.
+    for _ in range(_RETILTS):
+        tilted = tilt_lights(light_directions, trial.light_noise_deg, generator)
+        if not in_one_plane(tilted):
+            break
+    return tilted

@@ -1,0 +1,236 @@
+"""What `evaluate` does: score methods on captures, and write tables, plots and a report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from splinecli.capture import find_captures, open_capture
+from splinecli.errors import InputError, UsageError
+from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems
+from splinecli.evaluation.files import TRIALS, make_plots, write_figures, write_results
+from splinecli.evaluation.outcome import Evaluation
+from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
+from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.run import evaluate_all
+from splinecli.evaluation.trials import TrialStore
+from splinecli.files import check_writable, held_folder
+from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
+from splinecli.pipeline.observer import SILENT, Observer
+
+DEFAULT_TRIALS = 100
+DEFAULT_LIGHTS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """The options of `evaluate`.
+
+    Args:
+        methods: names of the methods; a name that comes twice counts once.
+        method_options: weights, rotations, batch size, device and precision.
+        n_lights: numbers of lights in each draw, None for all lights; one evaluation for each. Empty for
+            DEFAULT_LIGHTS, or for the number in the draws file.
+        light_noise_deg: standard deviations of the light noise; one evaluation for each.
+        trials: number of random draws; None for DEFAULT_TRIALS.
+        seed, max_pixels, skip_first, as_stored: see Protocol.
+        draws: path of a draws file, in place of random draws.
+        jobs: number of trials at a time; None for the cores, or for 1 on a GPU.
+        figures: whether to draw the methods' maps of the first draw of each capture.
+        pixels: (row, column) of the pixels whose observation maps the figures show.
+        output: folder for the results.
+        overwrite: whether to compute again what the folder has.
+
+    Raises:
+        UsageError: a value is out of its range, or two options contradict each other.
+    """
+
+    methods: tuple[str, ...] = (DEFAULT_METHOD,)
+    method_options: MethodOptions = field(default_factory=MethodOptions)
+    n_lights: tuple[int | None, ...] = ()
+    light_noise_deg: tuple[float, ...] = (0.0,)
+    trials: int | None = None
+    seed: int = 0
+    draws: str | None = None
+    max_pixels: int | None = None
+    skip_first: dict[str, int] = field(default_factory=dict)
+    as_stored: bool = False
+    jobs: int | None = None
+    figures: bool = False
+    pixels: tuple[tuple[int, int], ...] = ()
+    output: str = "evaluation"
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.draws is not None and self.n_lights:
+            raise UsageError(
+                "--draws and --n-lights exclude each other", hint="The draws say how many lights"
+            )
+        if self.draws is not None and self.trials is not None:
+            raise UsageError(
+                "--draws and --trials exclude each other", hint="Each line of the draws is a trial"
+            )
+        for name in self.methods:
+            check_method(name)
+        if self.pixels and not (self.figures and "spline-net" in self.methods):
+            raise UsageError(
+                "--pixel chooses the observation maps that --figures shows",
+                hint="Add --figures and --method spline-net",
+            )
+        _ = self.protocols
+
+    @property
+    def protocols(self) -> list[Protocol]:
+        """One protocol for each number of lights and each light noise. Raises UsageError."""
+        counts = self.n_lights or ((DEFAULT_LIGHTS,) if self.draws is None else (None,))
+        return [
+            Protocol(
+                count,
+                self.trials or DEFAULT_TRIALS,
+                self.seed,
+                None if self.draws is None else Path(self.draws),
+                noise,
+                self.max_pixels,
+                self.skip_first,
+                self.as_stored,
+            )
+            for count, noise in product(dict.fromkeys(counts), dict.fromkeys(self.light_noise_deg))
+        ]
+
+
+@dataclass(frozen=True)
+class EvaluateOutcome:
+    """What `evaluate` did.
+
+    Args:
+        evaluations: one for each protocol.
+        document: the content of results.json.
+        warnings: sentences for the user, for example on weights used with other lights than trained for.
+        figure_problems: why figures could not be drawn.
+    """
+
+    evaluations: list[Evaluation]
+    document: dict[str, Any]
+    warnings: list[str]
+    figure_problems: list[str]
+
+
+def evaluate_captures(
+    datasets: Sequence[Path], options: EvaluateOptions, observer: Observer = SILENT
+) -> EvaluateOutcome:
+    """Score the methods on the captures, and write the results to the output folder.
+
+    All options are checked before the first image is read.
+
+    Args:
+        datasets: folders of captures with ground truth, or such captures.
+
+    Raises:
+        UsageError: an option does not fit the captures or the methods.
+        InputError: no capture could be scored, or a folder or the draws file is wrong.
+        ModelError: weights cannot be used.
+        OutputError: the output folder cannot be written.
+    """
+    captures = [capture for dataset in datasets for capture in find_captures(dataset)]
+    output, protocols = Path(options.output), options.protocols
+    check_writable(output)
+    check_skip_first(protocols[0], list(distinct_names(captures).values()))
+    read_draws_file(protocols[0])
+    _check_counts(captures, protocols)
+    estimators = _make_estimators(options)
+    with held_folder(output):
+        with observer.progress("evaluating", 1.0) as advance:
+            evaluations = evaluate_all(
+                captures,
+                estimators,
+                protocols,
+                store=TrialStore(output / TRIALS, fresh=options.overwrite),
+                jobs=options.jobs or _default_jobs(estimators),
+                on_progress=_follow(advance),
+            )
+        plots = make_plots(evaluations)
+        document = write_results(output, evaluations, plots)
+        problems: list[str] = []
+        if options.figures:
+            figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
+            write_figures(output, evaluations, plots, figures)
+    return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
+
+
+def _make_estimators(options: EvaluateOptions) -> list[Estimator]:
+    estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
+    if options.method_options.weights is not None and not any(e.weights for e in estimators):
+        names = ", ".join(e.name for e in estimators)
+        raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
+    return estimators
+
+
+def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> None:
+    """Raise UsageError where more lights are wanted than any capture has."""
+    most = 0
+    for capture in captures:
+        with suppress(InputError, OSError):  # the evaluation skips the capture and says why
+            most = max(most, open_capture(capture).n_lights)
+    for protocol in protocols:
+        if most and protocol.n_lights is not None and protocol.n_lights > most:
+            raise UsageError(f"{protocol.n_lights} lights wanted, the captures have at most {most}")
+
+
+def _default_jobs(estimators: Sequence[Estimator]) -> int:
+    if any(estimator.device.startswith("cuda") for estimator in estimators):
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _follow(advance: Callable[..., None]) -> Callable[[float, int, str], None]:
+    """Return a callback that moves a bar of length 1 with the trials."""
+    shown = 0.0
+
+    def follow(done: float, total: int, note: str) -> None:
+        nonlocal shown
+        share = done / total if total else 1.0
+        advance(share - shown, note)
+        shown = share
+
+    return follow
+
+
+def _draw_figures(
+    captures: Sequence[Path],
+    estimators: Sequence[Estimator],
+    evaluation: Evaluation,
+    pixels: Sequence[tuple[int, int]],
+    observer: Observer,
+) -> tuple[list[CaptureFigure], list[str]]:
+    """Return the figures of the captures that were scored, and the problems of those without figures."""
+    folders = {name: folder for folder, name in distinct_names(captures).items()}
+    names = [name for name in folders if name in evaluation.captures]
+    figures: list[CaptureFigure] = []
+    problems: list[str] = []
+    with observer.progress("drawing", len(names)) as advance:
+        for name, stem in zip(names, file_stems(names), strict=True):
+            try:
+                figures += capture_figures(
+                    folders[name], name, stem, estimators, evaluation.protocol, pixels, advance
+                )
+            except (InputError, UsageError) as error:
+                problems.append(str(error))
+    return figures, problems
+
+
+def _untrained(evaluations: Sequence[Evaluation]) -> list[str]:
+    """Return warnings about shipped weights that were used with numbers of lights they were not trained for."""
+    used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
+    if not used:
+        return []
+    from splinecli.networks.weights import untrained_warning
+
+    counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
+    return [
+        warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)
+    ]
