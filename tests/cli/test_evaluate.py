@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -58,6 +59,66 @@ def test_the_draw_of_infer_is_the_first_of_evaluate(dataset, run):
         ).out
     )
     assert document["results"][0]["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
+
+
+@pytest.fixture
+def overexposed(make_capture):
+    """A capture whose lights are unequally bright, which no file says, and whose brightest observations are clipped."""
+    folder = make_capture("overexposed")
+    for index, intensity in enumerate((1.0, 0.8, 1.2, 0.7, 1.3, 0.9, 1.1, 1.0)):
+        path = str(folder / f"image{index + 1}.png")
+        image = cv2.imread(path, cv2.IMREAD_UNCHANGED) * intensity * 0.9
+        cv2.imwrite(path, np.minimum(np.rint(image), 65535).astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize("n_lights", ["all", 7])
+@pytest.mark.parametrize("method", ["iw12", "ls"])
+def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lights):
+    lights = [] if n_lights == "all" else ["--n-lights", n_lights, "--seed", 3]
+    figures = []
+    for policy in ([], ["--as-stored"]):
+        shared = [overexposed, "--method", method, *policy, "--json", "--overwrite"]
+        (report,) = json.loads(run("infer", *shared, *lights).out)
+        document = json.loads(
+            run("evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1).out
+        )
+        (result,) = document["results"]
+        assert result["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
+        assert document["protocol"]["as_stored"] is bool(policy)
+        figures.append(result["mae_deg"])
+    restored, as_stored = figures
+    assert restored < as_stored / 2
+    assert [bool(document["notes"]), bool(policy)] == [False, True]
+
+
+def test_a_part_of_the_pixels_has_the_intensities_of_all(overexposed, run):
+    """The scored pixels keep the normals that they have when all pixels are scored."""
+    from splinecli.evaluation.plan import CaptureJob, Task
+    from splinecli.evaluation.protocol import Protocol
+    from splinecli.methods import make_estimator
+
+    seen = []
+    for max_pixels in (None, 20):
+        tasks = [Task.of(Protocol(7, max_pixels=max_pixels))]
+        job = CaptureJob.plan(overexposed, "overexposed", [make_estimator("ls")], tasks)
+        seen.append(job.read(job.draws).see(job.draws[0][0][0]))
+    whole, part = seen
+    assert part.n_pixels == 20
+    np.testing.assert_array_equal(part.estimated_intensities, whole.estimated_intensities)
+    position = np.cumsum(whole.mask.ravel())[np.flatnonzero(part.mask)] - 1
+    np.testing.assert_array_equal(part.observations, whole.observations[position])
+
+
+@pytest.mark.parametrize(("policy", "mae_deg"), [([], 2.03), (["--as-stored"], 9.56)])
+def test_the_medallion_without_its_intensities(run, tmp_path, monkeypatch, policy, mae_deg):
+    folder = Path(__file__).resolve().parents[2] / "examples/medallion"
+    shutil.copytree(folder, tmp_path / "medallion")
+    monkeypatch.chdir(tmp_path)
+    Path("medallion/light_intensities.txt").unlink()
+    arguments = ["medallion", "--method", "iw12", "--n-lights", "all", *policy, "--json"]
+    document = json.loads(run("evaluate", *arguments).out)
+    assert document["results"][0]["mae_deg"] == pytest.approx(mae_deg, abs=0.01)
 
 
 def test_draws_from_a_file(dataset, run):
