@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from browser import OpenPage
-from splinecli.evaluation.records import Evaluation, Protocol, Result
+from splinecli.evaluation.outcome import Evaluation, Result
+from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.report import html_report
 from splinecli.results.index import index_page
 
