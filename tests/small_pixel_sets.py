@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import DTypeLike
 
-from splinecli.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+from splinecli.pixel_sets.store import Pixels, PixelSet
+from splinecli.pixel_sets.writer import PixelSetWriter
 
 MakeSet = Callable[..., PixelSet]
 

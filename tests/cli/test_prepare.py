@@ -45,7 +45,7 @@ def arrays(entry: str) -> dict[str, np.ndarray]:
 def test_a_capture(run, capture, truth):
     result = run("prepare", capture, "-o", "set")
     assert result.code == 0
-    assert result.out == "set: 1 entries of 1 scenes, 448 pixels, 0 MB; look at set/contact_sheet.png\n"
+    assert result.out == "set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
     assert result.err == "sphere: 448 pixels, 8 lights, sphere\n"
     found = arrays("sphere")
     mask = found["mask"]
@@ -121,12 +121,76 @@ def test_another_capture_of_a_name_joins_later_under_another(run, make_capture):
     assert run("prepare", "b/a", "-o", "set").err == "a-2: 448 pixels, 8 lights, b/a\n"
 
 
-def test_a_capture_that_changed_is_not_taken_for_what_it_was(run, capture):
-    run("prepare", capture, "-o", "set", "--quiet")
+def change_ambient(capture: Path) -> None:
+    cv2.imwrite(str(capture / "ambient.png"), np.full((24, 24), 600, np.uint16))
+
+
+def change_ground_truth(capture: Path) -> None:
     np.save(capture / "normals_gt.npy", np.load(capture / "normals_gt.npy")[::-1])
-    result = run("prepare", capture, "-o", "set")
-    assert (result.code, result.out) == (5, "")
-    assert "the entry sphere was made with files = " in result.err
+
+
+@pytest.mark.parametrize("change", [change_ambient, change_ground_truth])
+def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture, change):
+    one, two = make_capture("one"), make_capture("two")
+    run("prepare", one, "-o", "set", "--quiet")
+    before = arrays("one")
+    change(one)
+    result = run("prepare", one, two, "-o", "set", "--json")
+    # The stale entry is kept and named, and the other capture is added.
+    summary = json.loads(result.out)
+    hint = "Add --update to read it again, or choose another -o."
+    message = f"one: its files changed since the entry one was made. {hint}"
+    assert (result.code, result.err) == (5, f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n")
+    assert (summary["entries"], summary["skipped"]) == (
+        2,
+        [{"source": "one", "reason": message, "exit_code": 5}],
+    )
+    np.testing.assert_array_equal(arrays("one")["observations"], before["observations"])
+    assert run("prepare", one, two, "-o", "set", "--update", "--quiet").code == 0
+    after = arrays("one")
+    assert any((after[name] != before[name]).any() for name in ("observations", "normals"))
+    assert run("prepare", one, two, "-o", "set", "--quiet").code == 0
+
+
+def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
+    # One image is exposed four times as long, so that some of its pixels are clipped at 65535.
+    picture = cv2.imread(str(capture / "image2.png"), cv2.IMREAD_UNCHANGED).astype(np.float64)
+    cv2.imwrite(str(capture / "image2.png"), (1.4 * picture).clip(0, 65535).astype(np.uint16))
+    np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
+    assert run("prepare", capture, "-o", "set", "--quiet").code == 0
+    assert run("prepare", capture, "-o", "raw", "--as-stored", "--quiet").code == 0
+    recipes = [
+        json.loads((Path(folder) / "manifest.json").read_text())["entries"][0]["recipe"]["reading"]
+        for folder in ("set", "raw")
+    ]
+    assert recipes == ["restored", "as stored"]
+    found = arrays("sphere")
+    stored = np.load("raw/sphere/observations.npy")
+    # The oracle: a matte sphere.
+    expected = found["normals"] @ found["light_directions"].T * 60_000 / 65_535
+    clipped = np.abs(stored - expected).max(axis=1) > 0.01
+    assert clipped.sum() > 20
+    np.testing.assert_allclose(found["observations"], expected, atol=2e-3)
+    # The two readings do not share an entry.
+    refused = run("prepare", capture, "-o", "raw")
+    assert refused.code == 5
+    assert "was made with reading = 'as stored', not 'restored'" in refused.err
+
+
+def test_the_help_gives_the_defaults_of_rendered_scenes(run):
+    from splinecli.synthesis.scenes import SceneConfig
+
+    text = " ".join(run("prepare", "--help").out.split())
+    assert f"rendered images. [default: {SceneConfig().size}]" in text
+    assert f"lights of a rendered scene. [default: {SceneConfig().lights}]" in text
+
+
+def test_json_when_no_capture_can_be_read(run, capture):
+    (capture / "normals_gt.npy").unlink()
+    result = run("prepare", capture, "-o", "set", "--json")
+    summary = json.loads(result.out)
+    assert (result.code, summary["entries"], summary["contact_sheet"]) == (3, 0, None)
+    assert "no ground truth" in summary["skipped"][0]["reason"]
 
 
 @pytest.fixture
@@ -164,7 +228,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
     refused = run(*arguments, "--scenes", 2, "--seed", 1)
     assert (refused.code, refused.err) == (
         5,
-        "splinecli: set: the entry cube-diffuse was made with seed = 0, this asks for 1. Choose another -o.\n",
+        "splinecli: set: the entry cube-diffuse was made with seed = 0, not 1. Choose another -o.\n",
     )
 
 
@@ -173,7 +237,7 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
     result = run("prepare", "--mesh", "back.obj", "--size", 16, "--lights", 20, "-o", "set")
     assert (result.code, result.out) == (3, "")
     assert result.err.startswith(
-        "splinecli: back.obj: the camera sees nothing of it. The camera looks along -z"
+        "splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z"
     )
 
 

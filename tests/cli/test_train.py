@@ -60,7 +60,8 @@ def settings() -> dict[str, Any]:
 
 def write_set(folder: str, *, finished: bool = True) -> None:
     """Matte pixels in three scenes under 14 lights."""
-    from splinecli.pixel_sets.store import Pixels, PixelSetWriter
+    from splinecli.pixel_sets.store import Pixels
+    from splinecli.pixel_sets.writer import PixelSetWriter
 
     random = np.random.default_rng(0)
     writer = PixelSetWriter(Path(folder))
@@ -175,8 +176,9 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
 
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
     from splinecli.training import distributed
+    from splinecli.training import run as training_run
 
-    monkeypatch.setattr(distributed, "join_workers", lambda device: (distributed.Workers(0, 3), device))
+    monkeypatch.setattr(training_run, "join_workers", lambda device: (distributed.Workers(0, 3), device))
     result = run("train", "-o", "run", "--steps", 1)
     assert (result.code, result.out) == (2, "")
     assert "3 processes cannot share the 4 shards" in result.err
@@ -185,7 +187,7 @@ def test_processes_that_cannot_share_a_batch(run, monkeypatch):
 
 def test_a_restarted_worker_goes_on_by_itself(run, no_pictures, monkeypatch):
     assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
-    monkeypatch.setattr("splinecli.training.distributed.is_to_go_on", lambda: True)
+    monkeypatch.setattr("splinecli.training.run.restarts_are_allowed", lambda: True)
     assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
     assert [row["step"] for row in rows()] == ["3", "5"]
     # Where there is no checkpoint yet, it begins.
@@ -246,7 +248,5 @@ def test_another_preset_is_refused_by_its_network(run, no_pictures):
     run("train", "-o", "run", "--steps", 1)
     result = run("train", "-o", "run", "--resume", "--steps", 2, "--preset", "paper")
     assert (result.code, result.out) == (4, "")
-    message = (
-        "run/checkpoint.safetensors: the run was begun with network.size = 'compact', this asks for 'paper'"
-    )
+    message = "run/checkpoint.safetensors: the run was started with network.size = 'compact', not 'paper'"
     assert message in result.err

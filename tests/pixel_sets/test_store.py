@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from splinecli.errors import InputError, OutputError
-from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, PixelSetWriter, open_pixel_set
+from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, open_pixel_set
+from splinecli.pixel_sets.writer import PixelSetWriter
 
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 MakeSet = Callable[..., PixelSet]
@@ -126,14 +127,9 @@ def test_an_entry_made_in_another_way_is_not_taken_for_this_one(
 ) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     writer = PixelSetWriter(tmp_path)
-    assert writer.holds("a", dict(reversed(RECIPE.items())))
-    assert not writer.holds("b", RECIPE)
-    with pytest.raises(
-        OutputError, match=r"the entry a was made with seed = 1, this asks for 2\. Choose another -o\."
-    ):
-        writer.holds("a", {**RECIPE, "seed": 2})
-    with pytest.raises(OutputError, match=r"was made with scenes = .* asks for None"):
-        writer.holds("a", {"seed": 1})
+    assert writer.difference("a", dict(reversed(RECIPE.items()))) is None
+    assert writer.difference("a", {**RECIPE, "seed": 2}) == "seed = 1, not 2"
+    assert writer.difference("a", {"seed": 1}) == "scenes = {'lights': 30}, not None"
     assert open_folder_names(tmp_path) == ["a", MANIFEST]
 
 
@@ -141,9 +137,38 @@ def open_folder_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+def test_an_entry_is_replaced_as_a_whole(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
+    writer = PixelSetWriter(tmp_path)
+    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    writer.finish()
+    again = PixelSetWriter(tmp_path)
+    again.add("a", "a", "a test", {"seed": 2}, matte_pixels(9, 4, seed=1))
+    with pytest.raises(InputError, match="not finished"):
+        open_pixel_set(tmp_path)
+    (entry,) = again.finish().entries
+    assert (entry.n_pixels, entry.n_lights, entry.recipe) == (9, 4, {"seed": 2})
+    assert open_pixel_set(tmp_path).entries == (entry,)
+
+
+def test_a_killed_replacement_leaves_an_unfinished_set(
+    tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = PixelSetWriter(tmp_path)
+    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
+    writer.finish()
+    # Killed after the earlier entry was removed and before the new one has its name.
+    monkeypatch.setattr(Path, "rename", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        PixelSetWriter(tmp_path).add("a", "a", "a test", {"seed": 2}, matte_pixels(9, 4))
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="not finished"):
+        open_pixel_set(tmp_path)
+    assert "a" not in PixelSetWriter(tmp_path)
+
+
 def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("\\begin")
-    with pytest.raises(OutputError, match="is not empty and holds no pixel set"):
+    with pytest.raises(OutputError, match="has files in it but is not a pixel set"):
         PixelSetWriter(tmp_path)
     assert everything(tmp_path) == {"thesis.tex": b"\\begin"}
     with pytest.raises(OutputError, match="is a file"):
@@ -152,14 +177,16 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
 
 def test_a_manifest_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / MANIFEST).write_text('{"name": "an app"}')
-    with pytest.raises(InputError, match="is no manifest of a pixel set: found format None"):
+    with pytest.raises(InputError, match="not the manifest of a pixel set: found format None"):
         PixelSetWriter(tmp_path)
     assert everything(tmp_path) == {MANIFEST: b'{"name": "an app"}'}
 
 
 def test_an_unfinished_set_is_refused(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    with pytest.raises(InputError, match=r"not finished\. Run its 'splinecli prepare' again: it goes on\."):
+    with pytest.raises(
+        InputError, match=r"not finished\. Run the same 'splinecli prepare' again to finish it\."
+    ):
         open_pixel_set(tmp_path)
     with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
         PixelSetWriter(tmp_path / "empty").finish()
@@ -212,8 +239,8 @@ def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is not JSON"),
-        ("[]", "is no manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'"),
+        ("{", "not JSON"),
+        ("[]", "not the manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'"),
         ('{"format": "splinecli-pixel-set-2"}', "found format 'splinecli-pixel-set-2', expected"),
         (f'{{"format": "{FORMAT}", "complete": true}}', r"an entry is incomplete \('entries'\)"),
         (
@@ -240,7 +267,7 @@ def test_a_damaged_manifest_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_no_set_at_all(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no pixel set: its manifest\.json cannot be read") as caught:
+    with pytest.raises(InputError, match=r"not a pixel set: its manifest\.json cannot be read") as caught:
         open_pixel_set(tmp_path / "nowhere")
     assert caught.value.path == tmp_path / "nowhere"
     assert "splinecli prepare" in str(caught.value)

@@ -11,7 +11,14 @@ import pytest
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
-from splinecli.training.config_files import configure, configure_resumed, parse_parameter, read_config_file
+from splinecli.training.config_files import (
+    configure,
+    configure_resumed,
+    parse_light_counts,
+    parse_parameter,
+    parse_sources,
+    read_config_file,
+)
 
 
 def write(path: Path, text: str) -> Path:
@@ -113,7 +120,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_config_file(tmp_path)
     with pytest.raises(ModelError, match=r"a\.json: is not JSON"):
         read_config_file(write(tmp_path / "a.json", "{"))
-    with pytest.raises(ModelError, match=r"a\.json: holds no table of settings"):
+    with pytest.raises(ModelError, match=r"a\.json: is not a table of settings"):
         read_config_file(write(tmp_path / "a.json", "[1]"))
     (tmp_path / "b.toml").write_bytes(b"preset = '\xff'")
     with pytest.raises(ModelError, match=r"b\.toml: is not TOML"):
@@ -152,17 +159,17 @@ def test_bad_parameters(text: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": 1}, "seed = 0, this asks for 1"),
-        ({"network": {"width": 32}}, r"network\.width = 64, this asks for 32"),
+        ({"seed": 1}, "seed = 0, not 1"),
+        ({"network": {"width": 32}}, r"network\.width = 64, not 32"),
         ({"pixels": {"wall_share": 0.1}}, r"pixels\.wall_share = 0\.45"),
-        ({"sources": {"/data/set": 1.0}}, r"sources\./data/set = None, this asks for 1\.0"),
+        ({"sources": {"/data/set": 1.0}}, r"sources\./data/set = None, not 1\.0"),
     ],
 )
 def test_another_run_is_refused_by_the_name_of_the_setting(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    with pytest.raises(ModelError, match=f"the run was begun with {message}") as caught:
+    with pytest.raises(ModelError, match=f"the run was started with {message}") as caught:
         configure_resumed(TrainingConfig(), path, changes=[change])
     assert caught.value.path == path
 
@@ -170,17 +177,17 @@ def test_another_run_is_refused_by_the_name_of_the_setting(
 def test_another_preset_is_refused_by_its_network(tmp_path: Path) -> None:
     # Of the many settings that differ, the one that says most.
     for given in ({"preset_name": "paper"}, {"file": write(tmp_path / "a.toml", 'preset = "paper"')}):
-        with pytest.raises(ModelError, match=r"network\.size = 'compact', this asks for 'paper'"):
+        with pytest.raises(ModelError, match=r"network\.size = 'compact', not 'paper'"):
             configure_resumed(preset("compact"), tmp_path, **given)
 
 
-def test_what_is_not_asked_for_stays_as_it_was_begun(tmp_path: Path) -> None:
-    begun = preset("compact", seed=5, batch_size=32)
-    assert configure_resumed(begun, tmp_path) == begun
-    assert configure_resumed(begun, tmp_path, changes=[{"batch_size": 32}]) == begun
+def test_a_setting_that_is_not_given_stays_as_it_was(tmp_path: Path) -> None:
+    started = preset("compact", seed=5, batch_size=32)
+    assert configure_resumed(started, tmp_path) == started
+    assert configure_resumed(started, tmp_path, changes=[{"batch_size": 32}]) == started
     # A preset stands for all its settings.
-    with pytest.raises(ModelError, match="batch_size = 32, this asks for 256"):
-        configure_resumed(begun, tmp_path, "compact", changes=[{"seed": 5}])
+    with pytest.raises(ModelError, match="batch_size = 32, not 256"):
+        configure_resumed(started, tmp_path, "compact", changes=[{"seed": 5}])
 
 
 def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
@@ -193,3 +200,33 @@ def test_paths_of_sources_become_absolute(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     file = write(tmp_path / "a.toml", "[sources]\nset = 2.0\ngenerator = 1.0")
     assert configure(None, file).sources == {str(tmp_path / "set"): 2.0, "generator": 1.0}
+
+
+def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    config = configure(
+        changes=[
+            {"sources": {"~/set": 1.0}},
+            {"pixels": {"measured_materials": "~/merl.npz"}},
+            {"start_from": "~/mine.safetensors"},
+        ]
+    )
+    assert config.sources == {str(tmp_path / "set"): 1.0}
+    assert config.pixels.measured_materials == str(tmp_path / "merl.npz")
+    assert config.start_from == str(tmp_path / "mine.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))],
+)
+def test_light_counts(text: str, expected: tuple[int, int, int]) -> None:
+    assert tuple(parse_light_counts(text).values()) == expected
+
+
+def test_sources_of_the_command_line() -> None:
+    sets = [Path("a"), Path("b")]
+    assert parse_sources([], None) == {GENERATOR: 1.0}
+    assert parse_sources(sets, None) == {"a": 1.0, "b": 1.0}
+    assert parse_sources(sets, 0.5) == {"a": 1.0, "b": 1.0, GENERATOR: 0.5}
+    assert parse_sources([], 0.0) == {}

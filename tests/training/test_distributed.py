@@ -18,7 +18,7 @@ from splinecli.networks.weights import load_weights
 from splinecli.training import distributed
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import METRICS
-from splinecli.training.distributed import Workers, is_launched, is_to_go_on, join_workers
+from splinecli.training.distributed import Workers, is_launched, join_workers, restarts_are_allowed
 from splinecli.training.loop import WEIGHTS, Trainer
 from splinecli.training.run_log import read_metrics
 
@@ -48,7 +48,7 @@ def test_every_shard_is_somebody_s(count: int, total: int, shards: list[list[int
 
 
 def test_shards_that_cannot_be_shared_out(tiny: TrainingConfig, tmp_path: Path) -> None:
-    message = r"3 processes cannot share the 4 shards of a batch evenly\. Give --param shards=3, or start"
+    message = r"3 processes cannot share the 4 shards of a batch evenly\. Add --param shards=3, or start"
     with pytest.raises(UsageError, match=message):
         Trainer(tiny, tmp_path / "run", CPU, workers=Workers(0, 3))
     assert not (tmp_path / "run").exists()
@@ -58,7 +58,7 @@ def test_alone_nothing_is_exchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("WORLD_SIZE", "TORCHELASTIC_RUN_ID", "TORCHELASTIC_MAX_RESTARTS"):
         monkeypatch.delenv(name, raising=False)
     assert not is_launched()
-    assert not is_to_go_on()
+    assert not restarts_are_allowed()
     assert join_workers(CPU) == (Workers(0, 1), CPU)
     numbers = torch.ones(6)
     assert Workers().average([], numbers) is numbers
@@ -71,9 +71,9 @@ def test_torchrun_s_signs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert is_launched()
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
-    assert not is_to_go_on()
+    assert not restarts_are_allowed()
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "1")
-    assert is_to_go_on()
+    assert restarts_are_allowed()
 
 
 def test_a_restart_never_meets_the_addresses_of_before(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,6 +31,10 @@ class Messages(Observer):
         """Print a line that begins with "splinecli: warning:"."""
         self.say(f"splinecli: warning: {message}")
 
+    def error(self, message: str) -> None:
+        """Print a line that begins with "splinecli:", with `quiet` as well."""
+        print(f"splinecli: {message}", file=sys.stderr)
+
     def table(self, rows: Sequence[Sequence[str]]) -> None:
         """Print a table: a header row, then rows of a name and numbers."""
         if self.quiet:

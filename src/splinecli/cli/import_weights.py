@@ -1,4 +1,4 @@
-"""`splinecli import-weights`: the authors' checkpoints in, a weight file out."""
+"""`splinecli import-weights`: turn the authors' checkpoints into a weight file."""
 
 from __future__ import annotations
 
@@ -12,20 +12,31 @@ from splinecli.errors import OutputError
 
 
 def import_weights(
-    li_net: Annotated[Path, typer.Argument(metavar="G.ckpt", help="The authors' LI-Net, their generator.")],
+    li_net: Annotated[
+        Path, typer.Argument(metavar="G.ckpt", help="The authors' LI-Net, which they call the generator.")
+    ],
     ne_net: Annotated[
-        Path, typer.Argument(metavar="D.ckpt", help="The authors' NE-Net, their discriminator.")
+        Path, typer.Argument(metavar="D.ckpt", help="The authors' NE-Net, which they call the discriminator.")
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE.safetensors", help="The weight file to write.")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.safetensors",
+            help="The weight file to write.",
+            rich_help_panel="Output",
+        ),
     ],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier file.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing file.", rich_help_panel="Output")
+    ] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 
-    Give it to --weights. The two files belong to one step of their training, such as 200000-G.ckpt and
-    200000-D.ckpt. Only tensors are read from them; no code in them is run.
+    Other commands take the weight file with --weights. Both checkpoints must be of one training step, such as
+    200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in them is not run.
     """
     if output.is_dir():
         raise OutputError("is a folder, expected a file", path=output, hint="Name a file with -o")

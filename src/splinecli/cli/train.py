@@ -1,26 +1,43 @@
-"""`splinecli train`: LI-Net and NE-Net on pixel sets, on the online pixel generator, or on both."""
+"""`splinecli train`: train LI-Net and NE-Net on pixel sets, on generated pixels, or on both."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from splinecli.cli.console import Messages
 from splinecli.cli.options import Device, DeviceOption, QuietOption, complete_weights
 from splinecli.errors import UsageError
+from splinecli.training.defaults import (
+    CHECKPOINT_SECONDS,
+    DEFAULT_PRESET,
+    PRESET_NAMES,
+    WEIGHTS,
+)
 
 if TYPE_CHECKING:
-    from splinecli.training.config import TrainingConfig
+    from splinecli.training.config_files import Settings
+    from splinecli.training.loop import Trainer
     from splinecli.training.run_log import Metrics
+
+INPUT, LENGTH, SETTINGS, OUTPUT = "Input", "Length", "Settings", "Output"
 
 
 def train(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the run.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="RUN",
+            help=f"Folder of the run. Its files are renewed every {CHECKPOINT_SECONDS} seconds.",
+            rich_help_panel=OUTPUT,
+        ),
+    ],
     sets: Annotated[
         list[Path] | None, typer.Argument(metavar="SET", help="Pixel sets made by 'splinecli prepare'.")
     ] = None,
@@ -28,24 +45,34 @@ def train(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="compact, paper or cnn-ps. [default: compact]",
-            # Written out, for the presets themselves import torch.
-            autocompletion=lambda: ["compact", "paper", "cnn-ps"],
+            help=f"Settings to begin with: {', '.join(PRESET_NAMES)}. [default: {DEFAULT_PRESET}]",
+            autocompletion=lambda: list(PRESET_NAMES),
+            rich_help_panel=SETTINGS,
         ),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Settings (TOML, or a run's config.json).")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Settings from a TOML file or a run's config.json.",
+            rich_help_panel=SETTINGS,
+        ),
     ] = None,
     param: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3; repeatable."),
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="One setting, such as pixels.wall_share=0.3. Repeatable.",
+            rich_help_panel=SETTINGS,
+        ),
     ] = None,
     start_from: Annotated[
         str | None,
         typer.Option(
-            metavar="WEIGHTS",
-            help="Begin with these weights, a shipped name or a file.",
+            metavar="NAME|FILE",
+            help="Begin with these weights instead of random ones.",
             autocompletion=complete_weights,
+            rich_help_panel=INPUT,
         ),
     ] = None,
     generator_weight: Annotated[
@@ -53,134 +80,119 @@ def train(
         typer.Option(
             metavar="W",
             min=0,
-            help="Share of generated pixels, where a SET's is 1. [default: 0; 1 without SET]",
+            help="Weight of generated pixels, where each SET has weight 1. [default: 0; 1 without SET]",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     n_lights: Annotated[
-        str | None, typer.Option(metavar="K|MIN-MAX", help="Lights of each pixel. [default: the preset's]")
+        str | None,
+        typer.Option(
+            metavar="K|MIN-MAX",
+            help="Number of lights of each pixel. [default: the preset's]",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Length in steps.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Train for N steps.", rich_help_panel=LENGTH)
+    ] = None,
     minutes: Annotated[
-        float | None, typer.Option(metavar="M", min=0.01, help="Length in minutes, instead of steps.")
+        float | None,
+        typer.Option(metavar="M", min=0.01, help="Train for M minutes.", rich_help_panel=LENGTH),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from the run's checkpoint.", rich_help_panel=LENGTH)
+    ] = False,
     seed: Annotated[
-        int | None, typer.Option(metavar="S", min=0, max=2**32 - 1, help="Seed of the run. [default: 0]")
+        int | None,
+        typer.Option(
+            metavar="S",
+            min=0,
+            max=2**32 - 1,
+            help="Seed of the run. [default: 0]",
+            rich_help_panel=SETTINGS,
+        ),
     ] = None,
     tensorboard: Annotated[
         bool,
-        typer.Option("--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard')."),
+        typer.Option(
+            "--tensorboard",
+            help="Also write RUN/tensorboard (needs the extra 'tensorboard').",
+            rich_help_panel=OUTPUT,
+        ),
     ] = False,
     device: DeviceOption = Device.auto,
     quiet: QuietOption = False,
 ) -> None:
     """Train LI-Net and NE-Net.
 
-    Without a SET, on pixels that are made as they are needed. Writes RUN/weights.safetensors (give it to --weights),
-    checkpoint.safetensors, config.json, metrics.csv, curves.png and maps.png, and renews them every minute. Ctrl-C
-    loses at most that; --resume goes on. Settings come from the preset, then the file, then the options. Under
-    torchrun all processes train together.
+    Without a SET, the pixels are generated during training. Writes weights.safetensors, which --weights of other
+    commands takes, checkpoint.safetensors, config.json, metrics.csv, curves.png and maps.png into RUN. After Ctrl-C,
+    --resume continues from the checkpoint. Settings come from the preset, then from --config, then from the other
+    options. With torchrun, several processes train together.
     """
-    from splinecli.devices import choose_device, use_available_cores
-    from splinecli.files import check_writable, held_folder
-    from splinecli.training.config_files import parse_parameter
-    from splinecli.training.defaults import CHECKPOINT, WEIGHTS
-    from splinecli.training.distributed import is_to_go_on, join_workers, leave_workers
-    from splinecli.training.loop import Trainer
-
     if steps is not None and minutes is not None:
         raise UsageError("--steps and --minutes exclude each other")
-    changes: list[dict[str, Any]] = []
-    if sets or generator_weight is not None:
-        changes.append({"sources": _sources(sets or [], generator_weight)})
-    if n_lights is not None:
-        changes.append({"pixels": _light_counts(n_lights)})
-    if start_from is not None:
-        changes.append({"start_from": start_from})
-    changes += [parse_parameter(text) for text in param or []]
-    if seed is not None:
-        changes.append({"seed": seed})
-    # Under torchrun's --max-restarts the same command begins a run and goes on with it.
-    resume = resume or (is_to_go_on() and (output / CHECKPOINT).exists())
-    settings = _configure(output, preset, config, changes, resume=resume)
+
+    from splinecli.training.run import configure_run, open_run, resumes
+
+    changes = _changes(sets or [], generator_weight, n_lights, start_from, param or [], seed)
+    resume = resumes(output, resume=resume)
+    settings = configure_run(output, preset, config, changes, resume=resume)
     if steps is not None:
         settings = replace(settings, steps=steps, minutes=0.0)
     if minutes is not None:
         settings = replace(settings, minutes=minutes)
-    check_writable(output)
-    use_available_cores()
-    workers, own_device = join_workers(choose_device(device.value))
-    talk = Messages(quiet=quiet or not workers.leads)
-    with ExitStack() as stack:
-        stack.callback(leave_workers)
-        workers.shards(settings.shards)  # refused before the folder is made
-        if workers.leads:
-            stack.enter_context(held_folder(output))
-        trainer = Trainer(
-            settings, output, own_device, resume=resume, workers=workers, tensorboard=tensorboard
-        )
-        if trainer.single_scene_sets:
-            names = ", ".join(trainer.single_scene_sets)
-            talk.warn(
-                f"{names}: a single scene, of which nothing is held back: validation is on training pixels"
-            )
-        with talk.progress("training", 1.0, start=trainer.progress) as advance:
-            shown = trainer.progress
-
-            def report(progress: float, metrics: Metrics) -> None:
-                nonlocal shown
-                advance(progress - shown, _losses(metrics))
-                shown = progress
-                # On a terminal the bar says it; a log wants a line each time something was saved.
-                if metrics.validation_deg is not None and (progress >= 1 or not sys.stderr.isatty()):
-                    talk.say(f"step {metrics.step}, {metrics.pixels} pixels, {_losses(metrics)}")
-
-            trainer.run(report)
-    if not quiet and workers.leads:
-        print(output / WEIGHTS)
+    with open_run(settings, output, device.value, resume=resume, tensorboard=tensorboard) as trainer:
+        _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
+        if not quiet and trainer.workers.leads:
+            print(output / WEIGHTS)
 
 
-def _configure(
-    output: Path,
-    preset: str | None,
-    file: Path | None,
-    changes: list[dict[str, Any]],
-    *,
-    resume: bool,
-) -> TrainingConfig:
-    from splinecli.training.checkpoint import read_checkpoint_config
-    from splinecli.training.config_files import configure, configure_resumed
-    from splinecli.training.defaults import CHECKPOINT
+def _changes(
+    sets: list[Path],
+    generator_weight: float | None,
+    n_lights: str | None,
+    start_from: str | None,
+    parameters: list[str],
+    seed: int | None,
+) -> list[Settings]:
+    """Return the settings that the options change, in the order of their precedence. Raises UsageError."""
+    from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
 
-    if not resume:
-        return configure(preset, file, changes)
-    begun = read_checkpoint_config(output / CHECKPOINT)
-    return configure_resumed(begun, output / CHECKPOINT, preset, file, changes)
-
-
-def _sources(sets: list[Path], generator_weight: float | None) -> dict[str, float]:
-    from splinecli.training.config import GENERATOR
-
-    weights = {str(path): 1.0 for path in sets}
-    share = generator_weight if generator_weight is not None else 0.0 if sets else 1.0
-    return {**weights, GENERATOR: share} if share else weights
+    changes: list[Settings] = []
+    if sets or generator_weight is not None:
+        changes.append({"sources": parse_sources(sets, generator_weight)})
+    if n_lights is not None:
+        changes.append({"pixels": parse_light_counts(n_lights)})
+    if start_from is not None:
+        changes.append({"start_from": start_from})
+    changes += [parse_parameter(text) for text in parameters]
+    if seed is not None:
+        changes.append({"seed": seed})
+    return changes
 
 
-def _light_counts(text: str) -> dict[str, int]:
-    low, dash, high = text.partition("-")
-    try:
-        least, most = int(low), int(high if dash else low)
-    except ValueError:
-        raise UsageError(
-            f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96"
-        ) from None
-    if not 3 <= least <= most:
-        raise UsageError(f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first")
-    # 30 % of the pixels have the usual number: the published one where it is in the range.
-    return {"min_lights": least, "max_lights": most, "usual_lights": min(max(10, least), most)}
+def _run(trainer: Trainer, messages: Messages) -> None:
+    """Train to the end and show the progress."""
+    if trainer.single_scene_sets:
+        names = ", ".join(trainer.single_scene_sets)
+        messages.warn(f"{names}: the only scene of a set is used for training and for validation")
+    shown = trainer.progress
+    with messages.progress("training", 1.0, start=shown) as advance:
+
+        def report(progress: float, metrics: Metrics) -> None:
+            nonlocal shown
+            advance(progress - shown, _losses(metrics))
+            shown = progress
+            # A terminal shows the bar. A log file gets a line with each checkpoint.
+            if metrics.validation_deg is not None and (progress >= 1 or not sys.stderr.isatty()):
+                messages.say(f"step {metrics.step}, {metrics.pixels} pixels, {_losses(metrics)}")
+
+        trainer.run(report)
 
 
 def _losses(metrics: Metrics) -> str:
-    checked = "" if metrics.validation_deg is None else f", {metrics.validation_deg:.2f} deg in validation"
+    """Return the losses in words. Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg in validation"."""
+    validation = "" if metrics.validation_deg is None else f", {metrics.validation_deg:.2f} deg in validation"
     on_map = "" if metrics.map_error is None else f" map {metrics.map_error:.3f},"
-    return f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f},{on_map} {metrics.angle_deg:.2f} deg{checked}"
+    return f"{metrics.minutes:.1f} minutes: loss {metrics.loss:.3f},{on_map} {metrics.angle_deg:.2f} deg{validation}"

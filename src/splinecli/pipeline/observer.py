@@ -25,6 +25,9 @@ class Observer:
     def warn(self, message: str) -> None:
         """Receive a warning: the results may be worse than they could be."""
 
+    def error(self, message: str) -> None:
+        """Receive an error: one of several inputs cannot be used, and the work goes on without it."""
+
     @contextmanager
     def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Advance]:
         """Begin a stage of `total` steps, of which `start` are done. Yields the function that counts steps."""

@@ -1,4 +1,4 @@
-"""Configurations from files and the command line: a preset, changed by a file, changed by single settings."""
+"""Training configurations from a preset, a file and single settings."""
 
 from __future__ import annotations
 
@@ -12,28 +12,39 @@ from typing import Any
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.weights import shipped_names
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
+from splinecli.training.defaults import DEFAULT_PRESET
 
-DEFAULT_PRESET = "compact"
+CHANGEABLE = ("steps", "minutes", "learning_rate", "gradient_limit")
+"""The settings that may change when a run continues."""
+
+Settings = dict[str, Any]
+"""Nested settings, as in TrainingConfig.to_dict; only some of them may be given."""
 
 
-def read_config_file(path: Path) -> dict[str, Any]:
-    """The settings of a TOML file, or of a run's config.json. Raises ModelError."""
+def read_config_file(path: Path) -> Settings:
+    """Read the settings of a TOML file or of a run's config.json. Raises ModelError."""
     try:
         text = path.read_text("utf-8")
         values: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except OSError as error:
         raise ModelError(f"cannot be read ({error.strerror})", path=path) from error
-    except ValueError as error:  # both decoders' errors, and text that is not UTF-8
+    except ValueError as error:  # raised by both decoders, and for text that is not UTF-8
         raise ModelError(
             f"is not {'JSON' if path.suffix == '.json' else 'TOML'} ({error})", path=path
         ) from error
     if not isinstance(values, dict):
-        raise ModelError("holds no table of settings", path=path)
+        raise ModelError("is not a table of settings", path=path)
     return values
 
 
-def parse_parameter(text: str) -> dict[str, Any]:
-    """{"a": {"b": value}} from "a.b=value"; the value as in TOML, or else a plain text. Raises UsageError."""
+def parse_parameter(text: str) -> Settings:
+    """Parse one setting: "a.b=value" gives {"a": {"b": value}}.
+
+    The value is read as TOML. A value that is not TOML is taken as text.
+
+    Raises:
+        UsageError: there is no name or no "=".
+    """
     name, equals, value = text.partition("=")
     keys = [key.strip() for key in name.split(".")]
     if not equals or not all(keys):
@@ -44,21 +55,56 @@ def parse_parameter(text: str) -> dict[str, Any]:
         parsed = value.strip()
     for key in reversed(keys):
         parsed = {key: parsed}
-    settings: dict[str, Any] = parsed
+    settings: Settings = parsed
     return settings
 
 
-def configure(
-    preset_name: str | None = None, file: Path | None = None, changes: Sequence[dict[str, Any]] = ()
-) -> TrainingConfig:
-    """The preset (`preset_name`, or else the file's entry "preset", or else compact), changed.
+def parse_light_counts(text: str) -> dict[str, int]:
+    """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
 
-    First come the settings of the file, then `changes` in their order. A table of sources is replaced as a
-    whole, other tables key by key.
+    The usual number of lights is 10, as published, or the nearest number in the range.
 
     Raises:
-        UsageError: no such preset.
-        ModelError: a setting is unknown or cannot be; the message names the file it stands in.
+        UsageError: the text is no such range, or a pixel would have fewer than 3 lights.
+    """
+    low, dash, high = text.partition("-")
+    try:
+        fewest, most = int(low), int(high if dash else low)
+    except ValueError:
+        raise UsageError(
+            f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96"
+        ) from None
+    if not 3 <= fewest <= most:
+        raise UsageError(f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first")
+    return {"min_lights": fewest, "max_lights": most, "usual_lights": min(max(10, fewest), most)}
+
+
+def parse_sources(sets: Sequence[Path], generator_weight: float | None) -> dict[str, float]:
+    """Return the weights of the sources: 1 for each set, and the generator's.
+
+    Without `generator_weight`, the generator has weight 0 if there are sets, else 1.
+    """
+    weights = {str(path): 1.0 for path in sets}
+    if generator_weight is None:
+        generator_weight = 0.0 if sets else 1.0
+    return {**weights, GENERATOR: generator_weight} if generator_weight else weights
+
+
+def configure(
+    preset_name: str | None = None, file: Path | None = None, changes: Sequence[Settings] = ()
+) -> TrainingConfig:
+    """Return a preset, changed by the settings of a file and then by `changes`, in their order.
+
+    A table of sources is replaced as a whole. Other tables are merged key by key.
+
+    Args:
+        preset_name: name of the preset. None takes the file's entry "preset", or else DEFAULT_PRESET.
+        file: TOML or JSON, see read_config_file.
+        changes: further settings.
+
+    Raises:
+        UsageError: there is no such preset.
+        ModelError: a setting is unknown or its value is not allowed. The message names the file it is in.
     """
     settings = read_config_file(file) if file else {}
     named = settings.pop("preset", DEFAULT_PRESET)
@@ -73,22 +119,65 @@ def configure(
     return _with_absolute_paths(TrainingConfig.from_dict(values))
 
 
+def configure_resumed(
+    started: TrainingConfig,
+    path: Path,
+    preset_name: str | None = None,
+    file: Path | None = None,
+    changes: Sequence[Settings] = (),
+) -> TrainingConfig:
+    """Return the configuration with which a run continues.
+
+    Without a preset, every setting that is not given stays as it was.
+
+    Args:
+        started: the configuration in the run's checkpoint.
+        path: the checkpoint, for messages.
+        preset_name, file, changes: as for `configure`.
+
+    Raises:
+        UsageError, ModelError: as for `configure`.
+        ModelError: a setting differs that is not in CHANGEABLE. The message names it.
+    """
+    settings = read_config_file(file) if file else {}
+    if preset_name is None and "preset" not in settings:
+        values = started.to_dict()
+        for change in (settings, *changes):
+            values = _merge(values, change)
+        asked = _with_absolute_paths(TrainingConfig.from_dict(values))
+    else:
+        asked = configure(preset_name, file, changes)
+    old, new = _flat(started.to_dict()), _flat(asked.to_dict())
+    # In the order of the configuration, where the most telling settings, such as the network's size, come first.
+    for name in [*new, *(name for name in old if name not in new)]:
+        if name not in CHANGEABLE and old.get(name) != new.get(name):
+            raise ModelError(
+                f"the run was started with {name} = {old.get(name)!r}, not {new.get(name)!r}",
+                path=path,
+                hint="Leave the setting out to continue, or choose another -o",
+            )
+    return asked
+
+
 def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
-    # So that a run can be taken up from another folder.
+    """Make paths absolute, so that a run can continue from another working folder."""
     sources = {
-        name if name == GENERATOR else str(Path(name).absolute()): weight
-        for name, weight in config.sources.items()
+        name if name == GENERATOR else _absolute(name): weight for name, weight in config.sources.items()
     }
     pixels = config.pixels
     if pixels.measured_materials:
-        pixels = replace(pixels, measured_materials=str(Path(pixels.measured_materials).absolute()))
+        pixels = replace(pixels, measured_materials=_absolute(pixels.measured_materials))
     start_from = config.start_from
     if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
-        start_from = str(Path(start_from).absolute())
+        start_from = _absolute(start_from)
     return replace(config, sources=sources, pixels=pixels, start_from=start_from)
 
 
-def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def _absolute(path: str) -> str:
+    return str(Path(path).expanduser().absolute())
+
+
+def _merge(values: Settings, changes: Settings) -> Settings:
     merged = dict(values)
     for key, value in changes.items():
         known = merged.get(key)
@@ -97,47 +186,8 @@ def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-CHANGEABLE = ("steps", "minutes", "learning_rate", "gradient_limit")
-"""What a run may change when it is gone on with."""
-
-
-def configure_resumed(
-    begun: TrainingConfig,
-    path: Path,
-    preset_name: str | None = None,
-    file: Path | None = None,
-    changes: Sequence[dict[str, Any]] = (),
-) -> TrainingConfig:
-    """The configuration of a run that was begun, with what is asked for now.
-
-    Without a preset, what is not asked for stays as it was begun.
-
-    Raises:
-        UsageError, ModelError: as for `configure`; or a setting differs that only another run can have; the
-            message names it and the run's checkpoint, `path`.
-    """
-    settings = read_config_file(file) if file else {}
-    if preset_name is None and "preset" not in settings:
-        values = begun.to_dict()
-        for change in (settings, *changes):
-            values = _merge(values, change)
-        asked = _with_absolute_paths(TrainingConfig.from_dict(values))
-    else:
-        asked = configure(preset_name, file, changes)
-    old, new = _flat(begun.to_dict()), _flat(asked.to_dict())
-    # In the order of the configuration: what says most, such as the network's size, comes first.
-    for name in [*new, *(name for name in old if name not in new)]:
-        if name not in CHANGEABLE and old.get(name) != new.get(name):
-            raise ModelError(
-                f"the run was begun with {name} = {old.get(name)!r}, this asks for {new.get(name)!r}",
-                path=path,
-                hint="Leave the setting out to go on as it was begun, or choose another -o",
-            )
-    return asked
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def _flat(values: Settings, prefix: str = "") -> Settings:
+    flat: Settings = {}
     for key, value in values.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat

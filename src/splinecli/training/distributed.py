@@ -1,8 +1,8 @@
-"""Data-parallel training: the processes that torchrun starts, each on its shards of every batch.
+"""Data-parallel training: torchrun starts several processes, and each trains on its shards of every batch.
 
-Gradients are averaged after each backward pass, in one message, by gloo on processors and NCCL on GPUs. Every
-process computes the same update of the same weights, so nothing else has to be exchanged but the leader's
-clock.
+After each backward pass the processes average their gradients in one message, with gloo on CPUs and NCCL on GPUs.
+Every process then computes the same update of the same weights. They exchange nothing else but the training time of
+the first process.
 """
 
 from __future__ import annotations
@@ -23,31 +23,32 @@ from splinecli.errors import ModelError, UsageError
 
 @dataclass(frozen=True)
 class Workers:
-    """This process among `count`; `rank` 0 leads: it alone writes, reports and keeps the time."""
+    """The place of this process among `count` processes. Rank 0 leads: it alone writes and keeps the time."""
 
     rank: int = 0
     count: int = 1
 
     @property
     def leads(self) -> bool:
+        """Whether this process leads."""
         return self.rank == 0
 
     def shards(self, total: int) -> range:
-        """The shards of a batch that are this process's. Raises UsageError where they cannot be shared out."""
+        """Return the shards of a batch for this process. Raises UsageError if they cannot be shared evenly."""
         if total % self.count:
             raise UsageError(
                 f"{self.count} processes cannot share the {total} shards of a batch evenly",
-                hint=f"Give --param shards={self.count}, or start a number of processes that divides {total}",
+                hint=f"Add --param shards={self.count}, or start a number of processes that divides {total}",
             )
         return range(self.rank, total, self.count)
 
     def average(self, parameters: Iterable[nn.Parameter], numbers: Tensor) -> Tensor:
-        """Average the parameters' gradients over the processes, in place, and `numbers` (N,), returned."""
+        """Average the gradients over all processes, in place, and return the average of `numbers` (N,)."""
         if self.count == 1:
             return numbers
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         message = torch.cat([*(gradient.flatten() for gradient in gradients), numbers.to(gradients[0])])
-        with _losses_of_peers_named():
+        with _lost_peers_as_model_errors():
             dist.all_reduce(message)
         message /= self.count
         sizes = [*(gradient.numel() for gradient in gradients), len(numbers)]
@@ -57,43 +58,47 @@ class Workers:
         return numbers_averaged.to(numbers)
 
     def agree(self, value: float, device: torch.device) -> float:
-        """The leader's value."""
+        """Return the value of the first process, for all processes."""
         if self.count == 1:
             return value
         shared = torch.tensor([value], dtype=torch.float64, device=device)
-        with _losses_of_peers_named():
+        with _lost_peers_as_model_errors():
             dist.broadcast(shared, src=0)
         return float(shared.item())
 
 
 @contextmanager
-def _losses_of_peers_named() -> Iterator[None]:
-    """Raise ModelError where the others cannot be reached any more."""
+def _lost_peers_as_model_errors() -> Iterator[None]:
+    """Raise ModelError if another process can no longer be reached."""
     try:
         yield
     except RuntimeError as error:
         reason = (str(error).splitlines() or ["no reason given"])[0][:200]
         raise ModelError(
             f"another process of the run stopped ({reason})",
-            hint="Its own message says why; --resume goes on",
+            hint="See its own message for the reason. --resume continues the run",
         ) from error
 
 
 def is_launched() -> bool:
-    """Whether torchrun started this process."""
+    """Return whether torchrun started this process."""
     return "TORCHELASTIC_RUN_ID" in os.environ or int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
-def is_to_go_on() -> bool:
-    """Whether torchrun was told to start processes again when one fails: they then go on with the run.
+def restarts_are_allowed() -> bool:
+    """Return whether torchrun starts the processes again when one fails. They then continue the run.
 
-    Not whether it just did so: after the failure of another machine's process it does not say so to this one's.
+    Whether it has just done so cannot be known: torchrun does not report the failures of other machines.
     """
     return int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0
 
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
-    """Join the other processes, if torchrun started any; the device then is this process's own."""
+    """Join the other processes, if torchrun started any.
+
+    Returns:
+        The place of this process and its own device.
+    """
     if not is_launched():
         return Workers(), device
     if device.type == "cuda":
@@ -103,8 +108,8 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
         backend = "nccl" if device.type == "cuda" else "gloo"
         attempt = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
         if attempt and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
-            # torchrun keeps its store over a restart: the addresses of processes that are gone still stand in
-            # it. Only on one machine do all processes agree on the number of the attempt.
+            # torchrun keeps its store after a restart, with the addresses of processes that have ended. The number
+            # of the attempt makes a fresh part of it. Only on one machine do all processes know the same number.
             store, rank, count = next(rendezvous("env://"))
             store = PrefixStore(f"splinecli attempt {attempt}", store)
             dist.init_process_group(backend, store=store, rank=rank, world_size=count)
@@ -114,6 +119,6 @@ def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
 
 
 def leave_workers() -> None:
-    """Leave the group, if one was joined."""
+    """Leave the group of processes, if this process joined one."""
     if dist.is_available() and dist.is_initialized():
         dist.destroy_process_group()

@@ -1,8 +1,7 @@
 """The losses of SPLINE-Net (Zheng et al., ICCV 2019, section 3).
 
-Every loss is first a number for each pixel and then the mean over the pixels, so that a batch cut in equal
-parts has the mean of the parts' losses. The paper writes |.| of a map without saying whether its cells are
-summed or averaged: here a `norm` says it.
+Every loss is the mean of one number for each pixel. The loss of a batch is therefore the mean of the losses of equal
+parts of it. The paper does not say whether |.| sums or averages the cells of a map; here the argument `norm` does.
 """
 
 from __future__ import annotations
@@ -14,36 +13,47 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 Norm = Literal["mean", "sum"]
-"""How the cells of a map are put together."""
+"""Whether the values of a map's cells are averaged or summed."""
 
 AXIS_LENGTH = 0.01
-"""Length of a normal's projection (sine of its zenith angle) under which its azimuth fades out of a mirror."""
+"""Projected length of a normal (sine of its zenith angle) below which `mirror` reduces the effect of its azimuth."""
 
 
 def angular_loss(normals: Tensor, truth: Tensor) -> Tensor:
-    """arccos(n . n_gt) in radians, mean over pixels; normals, truth (P, 3) unit."""
+    """Return the mean of arccos(n . n_gt) in radians; normals and truth are (P, 3), unit."""
     return angles(normals, truth).mean()
 
 
 def angles(normals: Tensor, truth: Tensor) -> Tensor:
-    """arccos(n . n_gt) in radians, (P,).
+    """Return arccos(n . n_gt) in radians, (P,); normals and truth are (P, 3), unit.
 
-    As atan2(|n x n_gt|, n . n_gt): the same angle with a bounded gradient, where that of arccos is infinite
-    at 0.
+    Computed as atan2(|n x n_gt|, n . n_gt), because the gradient of arccos is infinite at an angle of 0.
     """
     sine = torch.linalg.cross(normals, truth).square().sum(-1).add(1e-12).sqrt()
     return torch.atan2(sine, (normals * truth).sum(-1))
 
 
 def map_loss(dense: Tensor, truth: Tensor, known: Tensor, norm: Norm = "mean") -> Tensor:
-    """|D - D_gt| over a pixel's cells with a known truth, known (P, 1, w, w), as the maps."""
+    """Return |D - D_gt| over the cells with a known true value.
+
+    Args:
+        dense: LI-Net's maps D, (P, 1, w, w).
+        truth: the true maps D_gt, of the same shape.
+        known: 1 in cells with a known true value, else 0, of the same shape.
+        norm: average or sum over the cells.
+    """
     return _over(known, (dense - truth).abs(), norm)
 
 
 def masked_map_loss(
     dense: Tensor, truth: Tensor, known: Tensor, holds: Tensor, norm: Norm = "mean"
 ) -> Tensor:
-    """|M_s o (D - D_gt)| over a pixel's cells that hold an observation, holds (P, 1, w, w)."""
+    """Return |M_s o (D - D_gt)|, over the cells of the sparse map alone.
+
+    Args:
+        dense, truth, known, norm: as for map_loss.
+        holds: 1 in cells of the sparse map that have an observation, else 0, (P, 1, w, w).
+    """
     return _over(known * holds, (dense - truth).abs(), norm)
 
 
@@ -53,11 +63,15 @@ def _over(cells: Tensor, values: Tensor, norm: Norm) -> Tensor:
 
 
 def mirror(maps: Tensor, normals: Tensor) -> Tensor:
-    """r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and the projected normal (P, 3).
+    """Return r(D, n): the maps mirrored about the axis through the centre and the projected normal.
 
-    The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells are
-    interpolated, so that the image has a gradient in the normal as well as in the map. A normal that looks at
-    the camera has no azimuth; its image is the map turned by 180 degrees, equally a symmetry of its.
+    The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells are interpolated,
+    so that the result has a gradient with respect to the normal as well as the map. A normal towards the camera has
+    no azimuth. Its map is rotated by 180 degrees, which is a symmetry of it as well.
+
+    Args:
+        maps: (P, C, w, w).
+        normals: (P, 3), unit.
     """
     size = maps.shape[-1]
     centre = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
@@ -66,16 +80,21 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
     axis = axis / axis.square().sum(1, keepdim=True).clamp(min=AXIS_LENGTH**2).sqrt()
     axis_x, axis_y = axis[:, 0, None, None], axis[:, 1, None, None]
     along = x * axis_x + y * axis_y
-    # grid_sample counts rows downwards: -y.
+    # grid_sample expects rows to count downwards, so y changes its sign.
     grid = torch.stack((2 * along * axis_x - x, -(2 * along * axis_y - y)), dim=-1)
     return grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
 
 
 def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
-    """|D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and (P,).
+    """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and (P,).
 
-    p is average pooling of stride 2. Compared are the cells that are filled, (P, 1, w, w), as are their mirror
-    images: near the rim and beside gaps a mirror image would mix values with nothing.
+    p is average pooling with stride 2. Only filled cells with a filled mirror image are compared. Near the rim and
+    beside gaps, a mirrored value would be mixed with empty cells.
+
+    Args:
+        dense: maps D, (P, 1, w, w).
+        normals: (P, 3), unit.
+        filled: 1 in cells with a value, else 0, (P, 1, w, w).
     """
     image, image_filled = torch.chunk(mirror(torch.cat((dense, filled), dim=1), normals), 2, dim=1)
     both = filled * (image_filled > 0.999)
@@ -86,13 +105,14 @@ def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor,
 
 
 def symmetric_loss(fine: Tensor) -> Tensor:
-    """Ls = |D - r(D, n)|, from what `asymmetries` gives: isotropic reflectance."""
+    """Return Ls = |D - r(D, n)|, the loss for isotropic reflectance, from the first result of `asymmetries`."""
     return fine.mean()
 
 
 def asymmetric_loss(fine: Tensor, coarse: Tensor, *, eta: float, lambda_c: float) -> Tensor:
-    """La = ||D - r(D, n)| - eta| + lambda_c ||p(D) - p(r(D, n))| - eta|: shadows and interreflections.
+    """Return La = ||D - r(D, n)| - eta| + lambda_c ||p(D) - p(r(D, n))| - eta|.
 
-    They leave a map a little asymmetric, in connected regions: eta is the amount, in summed cells.
+    Shadows and interreflections make a map slightly asymmetric, in connected regions. eta is the expected asymmetry,
+    summed over cells. `fine` and `coarse` are the results of `asymmetries`.
     """
     return ((fine - eta).abs() + lambda_c * (coarse - eta).abs()).mean()

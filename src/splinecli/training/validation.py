@@ -1,4 +1,4 @@
-"""Checks on pixels that a run never trains on, and the page of maps for the person who watches it."""
+"""The validation error of a run, and sample observation maps for maps.png."""
 
 from __future__ import annotations
 
@@ -20,15 +20,19 @@ SHOWN_PIXELS = 8
 
 
 def validation_deg(network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False) -> float:
-    """Mean angular error in degrees."""
+    """Return the mean angular error over the batch, in degrees."""
     maps, _, normals = _estimate(network, batch, bfloat16=bfloat16)
     return math.degrees(angular_loss(normals, to_pixel_frame(batch.scene.normals, maps)).item())
 
 
 class SampleMaps(NamedTuple):
-    """Maps of N pixels, each (N, w, w), NaN where there is nothing, and the errors of their normals (N,).
+    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals.
 
-    dense: None for a network without a LI-Net.
+    Attributes:
+        sparse: the sparse maps, (N, w, w).
+        dense: LI-Net's dense maps, (N, w, w); None without a LI-Net.
+        truth: the true maps with gaps filled, (N, w, w).
+        error_deg: (N,).
     """
 
     sparse: NDArray[np.float32]
@@ -38,7 +42,7 @@ class SampleMaps(NamedTuple):
 
 
 def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
-    """What the networks see, guess and should have guessed of some pixels of a batch, spread evenly over it."""
+    """Return the maps of up to SHOWN_PIXELS pixels, evenly spaced over the batch."""
     step = max(1, len(batch.observations) // SHOWN_PIXELS)
     maps, dense, normals = _estimate(network, batch)
     truth = dense_truth_in_frame(batch, maps, size=network.config.map_size)
@@ -62,7 +66,7 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
 def _estimate(
     network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
 ) -> tuple[PixelMaps, Tensor | None, Tensor]:
-    """What the networks see, LI-Net's dense maps and NE-Net's normals, in the pixels' frames."""
+    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the frames of the pixels."""
     network.eval()
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):

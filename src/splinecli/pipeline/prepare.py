@@ -1,0 +1,136 @@
+"""What `prepare` does: captures with ground truth and rendered scenes become a pixel set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.files import check_writable, held_folder, write_bytes
+from splinecli.pictures.contact_sheet import contact_sheet
+from splinecli.pipeline.observer import SILENT, Advance, Observer
+from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
+from splinecli.pixel_sets.rendered import ScenePlan, add_scene
+from splinecli.pixel_sets.store import MANIFEST, PixelSet
+from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.pictures.png import encode_png
+
+CONTACT_SHEET = "contact_sheet.png"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareOptions:
+    """What `prepare` puts into a pixel set.
+
+    Args:
+        output: the folder of the set, new or an earlier set to add to.
+        captures: folders of captures with ground truth.
+        scenes: the scenes to render.
+        as_stored: use the stored values of captures alone, see add_capture.
+        update: read captures again that changed since they were added.
+
+    Raises:
+        UsageError: there is nothing to prepare.
+    """
+
+    output: Path
+    captures: tuple[Path, ...]
+    scenes: ScenePlan
+    as_stored: bool = False
+    update: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.captures and not self.scenes.names:
+            raise UsageError("nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE")
+
+
+def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
+    """Write a pixel set, or add to it, and return its summary.
+
+    A capture that cannot be used is left out, and the observer receives the error. Every other error ends the work.
+    The same call then continues where it stopped.
+
+    Returns:
+        The values that `prepare --json` prints. `skipped` lists the captures that were left out, each with the
+        reason and an exit code.
+
+    Raises:
+        InputError: a mesh or the file of measured materials cannot be used.
+        OutputError: the set cannot be written, or has a scene that was rendered with other settings.
+        UsageError: the packages of the extra `render` are not installed.
+    """
+    check_writable(options.output)
+    options.scenes.check_inputs()
+    with held_folder(options.output):
+        writer = PixelSetWriter(options.output)
+        options.scenes.check_set(writer)
+        captures = name_captures(options.captures, writer)
+        with observer.progress("preparing", len(captures) + len(options.scenes.names)) as advance:
+            skipped = _add_captures(writer, captures, options, observer, advance)
+            _add_scenes(writer, options.scenes, observer, advance)
+        if not len(writer):
+            return _summary(PixelSet(options.output, ()), skipped)
+        pixel_set = writer.finish()
+        write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(pixel_set)))
+    return _summary(pixel_set, skipped)
+
+
+def _add_captures(
+    writer: PixelSetWriter,
+    captures: dict[str, Path],
+    options: PrepareOptions,
+    observer: Observer,
+    advance: Advance,
+) -> list[dict[str, Any]]:
+    """Add the captures and return what became of those that were left out."""
+    skipped: list[dict[str, Any]] = []
+    for name, folder in captures.items():
+        error = _add_capture(writer, name, folder, options)
+        if error is None:
+            observer.say(writer.describe(name))
+        else:
+            observer.error(str(error))
+            skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
+        advance(1)
+    return skipped
+
+
+def _add_capture(
+    writer: PixelSetWriter, name: str, folder: Path, options: PrepareOptions
+) -> SplinecliError | None:
+    """Add a capture, or return why it cannot be used. Raises OutputError if the set cannot be written."""
+    try:
+        add_capture(writer, name, folder, as_stored=options.as_stored, update=options.update)
+    except (InputError, CaptureChangedError) as error:
+        return error
+    except OSError as error:
+        return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
+    return None
+
+
+def _add_scenes(writer: PixelSetWriter, plan: ScenePlan, observer: Observer, advance: Advance) -> None:
+    for position in range(len(plan.names)):
+        done = 0.0
+
+        def reach(share: float) -> None:
+            nonlocal done
+            advance(share - done)
+            done = share
+
+        for name in add_scene(writer, plan, position, reach):
+            observer.say(writer.describe(name))
+        reach(1.0)
+
+
+def _summary(pixel_set: PixelSet, skipped: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "set": str(pixel_set.folder),
+        "entries": len(pixel_set.entries),
+        "scenes": len({entry.scene for entry in pixel_set.entries}),
+        "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
+        "bytes": sum(path.stat().st_size for path in pixel_set.folder.rglob("*.npy")),
+        "manifest": str(pixel_set.folder / MANIFEST),
+        "contact_sheet": str(pixel_set.folder / CONTACT_SHEET) if pixel_set.entries else None,
+        "skipped": skipped,
+    }

@@ -1,0 +1,131 @@
+"""Captures with ground truth as entries of a pixel set."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from splinecli.capture import capture_name, open_capture
+from splinecli.capture.stamp import digest, stamp_capture
+from splinecli.errors import InputError, OutputError
+from splinecli.pixel_sets.store import Pixels
+from splinecli.pixel_sets.writer import PixelSetWriter
+
+if TYPE_CHECKING:
+    from splinecli.capture import Capture, CaptureFiles, CaptureSource
+
+RESTORED, AS_STORED = "restored", "as stored"
+"""Values of the recipe's "reading"."""
+
+
+class CaptureChangedError(OutputError):
+    """A capture differs from the one that its entry was made from."""
+
+
+def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
+    """Choose the name of the entry of each capture.
+
+    A capture that is in the set keeps its name. A new capture is named after its folder, with a number if another
+    capture has that name. A folder that is given twice counts once, because its pixels must not both train and
+    validate.
+
+    Returns:
+        Folders by name.
+    """
+    captures: dict[str, Path] = {}
+    for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
+
+        def is_taken(name: str, source: str = str(resolved)) -> bool:
+            by_another = name in writer and writer.recipe_of(name).get("source") != source
+            return name in captures or by_another
+
+        captures[free_name(capture_name(folder), is_taken)] = folder
+    return captures
+
+
+def free_name(name: str, is_taken: Callable[[str], bool]) -> str:
+    """Return the name, or the name with the lowest number from 2 that is not taken."""
+    numbered = (f"{name}-{count}" for count in itertools.count(2))
+    return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
+
+
+def add_capture(
+    writer: PixelSetWriter, name: str, folder: Path, *, as_stored: bool = False, update: bool = False
+) -> None:
+    """Read a capture and write its pixels with ground truth, unless the set has them.
+
+    Of the images of CyclesPS's PRPS, only every second row and column counts: the training of CNN-PS reads them at
+    half their size.
+
+    Args:
+        writer: the set.
+        name: the name of the entry.
+        folder: the capture.
+        as_stored: use the stored values alone. By default, saturated observations are restored and unknown light
+            intensities are estimated, as `infer` does.
+        update: replace an entry whose capture changed.
+
+    Raises:
+        InputError: the capture cannot be read, or has no ground truth.
+        CaptureChangedError: the capture changed since its entry was made, and `update` is not set.
+        OutputError: the entry cannot be written.
+    """
+    source = open_capture(folder)
+    recipe = {
+        "source": str(folder.resolve()),
+        "files": digest(stamp_capture(source)),
+        "reading": AS_STORED if as_stored else RESTORED,
+    }
+    if name in writer:
+        difference = writer.difference(name, recipe)
+        if difference is None:
+            return
+        if not update:
+            raise _changed(name, difference, folder)
+    if source.files.ground_truth is None:
+        raise InputError("the capture has no ground truth, which training needs", path=folder)
+    pixels = _pixels(source.read(as_stored=as_stored), source, folder)
+    # The materials of an object of CyclesPS share its shape.
+    scene = _folder_of(source.files).name if source.files.boundaries else name
+    writer.add(name, scene, str(folder), recipe, pixels)
+
+
+def _changed(name: str, difference: str, folder: Path) -> CaptureChangedError:
+    problem = f"its entry {name} was made with {difference}"
+    if difference.startswith("files ="):
+        problem = f"its files changed since the entry {name} was made"
+    return CaptureChangedError(
+        problem, path=folder, hint="Add --update to read it again, or choose another -o"
+    )
+
+
+def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
+    """Return the pixels of a capture that have a true normal. Raises InputError if there are none."""
+    assert capture.ground_truth is not None
+    normals = capture.ground_truth[capture.mask]
+    step = _pixel_step(source.files)
+    rows, columns = np.nonzero(capture.mask)
+    used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
+    if not used.any():
+        raise InputError("no pixel of the mask has a ground-truth normal", path=folder)
+    mask = np.zeros_like(capture.mask)
+    mask[capture.mask] = used
+    return Pixels(
+        observations=capture.observations[used],
+        normals=normals[used].astype(np.float32),
+        light_directions=capture.light_directions.astype(np.float32),
+        mask=mask[::step, ::step],
+    )
+
+
+def _pixel_step(files: CaptureFiles) -> int:
+    """Return 2 for the images of CyclesPS's PRPS, which count at half their size, else 1."""
+    return 2 if files.boundaries and _folder_of(files).parent.name == "PRPS" else 1
+
+
+def _folder_of(files: CaptureFiles) -> Path:
+    return files.folder.absolute()

@@ -1,0 +1,154 @@
+"""Rendered scenes as entries of a pixel set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splinecli.errors import InputError, OutputError
+from splinecli.files import file_sha256
+from splinecli.pixel_sets.captures import free_name
+from splinecli.pixel_sets.store import Pixels
+from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.synthesis.measured import MeasuredLibrary
+from splinecli.synthesis.measured_files import read_measured
+from splinecli.synthesis.meshes import read_mesh
+from splinecli.synthesis.scenes import CLASSES, RenderedScene, SceneConfig, draw_scene, render_scene
+
+RENDERER = 1
+"""Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both."""
+
+# Meshes have random numbers of their own, so that a mesh changes no other scene.
+_FIRST_MESH_INDEX = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlan:
+    """The scenes to render: first one of each mesh, then `count` random ones.
+
+    Args:
+        config: size, lights and quality of all scenes.
+        seed: seed of all random numbers.
+        count: number of random scenes.
+        meshes: mesh files of the user.
+        measured_materials: a file of measured materials, or None.
+    """
+
+    config: SceneConfig
+    seed: int
+    count: int
+    meshes: tuple[Path, ...] = ()
+    measured_materials: Path | None = None
+
+    @cached_property
+    def library(self) -> MeasuredLibrary | None:
+        """The measured materials. Raises InputError."""
+        return None if self.measured_materials is None else read_measured(self.measured_materials)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of the scenes. A mesh gives its file name, with a number if another mesh has it."""
+        names: list[str] = []
+        for path in self.meshes:
+            names.append(free_name(path.stem, names.__contains__))
+        return (*names, *(f"scene{index:04}" for index in range(self.count)))
+
+    def entry_names(self, position: int) -> dict[str, str]:
+        """Return the names of a scene's entries by class of material."""
+        return {kind: f"{self.names[position]}-{kind}" for kind in CLASSES}
+
+    def recipe(self, position: int) -> dict[str, Any]:
+        """Return the values that decide the content of a scene."""
+        return {
+            "renderer": RENDERER,
+            **asdict(self.config),
+            "seed": self.seed,
+            "mesh": file_sha256(self.meshes[position]) if position < len(self.meshes) else None,
+            "measured_materials": self._materials_sha256,
+        }
+
+    @cached_property
+    def _materials_sha256(self) -> str | None:
+        return None if self.measured_materials is None else file_sha256(self.measured_materials)
+
+    def check_inputs(self) -> None:
+        """Read every mesh and the measured materials. Raises InputError if one cannot be used."""
+        for path in self.meshes:
+            read_mesh(path)
+        _ = self.library
+
+    def check_set(self, writer: PixelSetWriter) -> None:
+        """Raise OutputError if the set has one of the scenes, rendered with other settings."""
+        for position in range(len(self.names)):
+            recipe = self.recipe(position)
+            for name in self.entry_names(position).values():
+                difference = writer.difference(name, recipe) if name in writer else None
+                if difference is not None:
+                    raise OutputError(
+                        f"the entry {name} was made with {difference}",
+                        path=writer.folder,
+                        hint="Choose another -o",
+                    )
+
+
+def add_scene(
+    writer: PixelSetWriter,
+    plan: ScenePlan,
+    position: int,
+    progress: Callable[[float], None] | None = None,
+) -> list[str]:
+    """Render a scene of the plan in each class of materials, unless the set has it.
+
+    Args:
+        writer: the set, which `plan.check_set` has checked.
+        plan: all scenes.
+        position: the number of the scene in the plan.
+        progress: called with the finished share of the rendering, 0 to 1.
+
+    Returns:
+        The names of the scene's entries.
+
+    Raises:
+        InputError: the mesh or the file of measured materials cannot be used, or the camera sees nothing.
+        OutputError: an entry cannot be written.
+        UsageError: the packages of the extra `render` are not installed.
+    """
+    names = plan.entry_names(position)
+    if not all(name in writer for name in names.values()):
+        rendered = _render(plan, position, progress)
+        recipe = plan.recipe(position)
+        for kind, name in names.items():
+            source = f"rendered: {rendered.shape}"
+            writer.add(name, plan.names[position], source, recipe, _pixels(rendered, kind))
+    return list(names.values())
+
+
+def _render(plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None) -> RenderedScene:
+    mesh_file = plan.meshes[position] if position < len(plan.meshes) else None
+    mesh = None if mesh_file is None else read_mesh(mesh_file)
+    index = position - len(plan.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
+    draw_measured = plan.library.draw if plan.library else None
+    scene = draw_scene(plan.seed, index, plan.config, mesh, draw_measured=draw_measured)
+    rendered = render_scene(scene, plan.config, progress)
+    if not rendered.mask.any():
+        raise InputError(
+            "the camera sees nothing of the mesh",
+            path=mesh_file or plan.names[position],
+            hint="The camera looks along -z. A face is visible if its corners run anticlockwise towards the camera",
+        )
+    return rendered
+
+
+def _pixels(rendered: RenderedScene, kind: str) -> Pixels:
+    return Pixels(
+        # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
+        observations=rendered.observations[kind].astype(np.float16),
+        normals=rendered.normals.astype(np.float32),
+        light_directions=rendered.light_directions.astype(np.float32),
+        mask=rendered.mask,
+    )

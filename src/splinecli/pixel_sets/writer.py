@@ -1,0 +1,136 @@
+"""Writing of pixel sets, entry by entry, so that an interrupted command can continue."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splinecli import __version__
+from splinecli.errors import OutputError
+from splinecli.files import (
+    LOCK,
+    check_writable,
+    current_umask,
+    file_sha256,
+    refusals_as_output_errors,
+    write_text,
+)
+from splinecli.pixel_sets.store import (
+    ARRAYS,
+    FORMAT,
+    MANIFEST,
+    Entry,
+    Pixels,
+    PixelSet,
+    parse_entries,
+    read_manifest,
+)
+
+_TEMPORARY = ".unfinished-"
+
+
+class PixelSetWriter:
+    """Writes a new set, or adds entries to an existing one, finished or not.
+
+    An entry is written to a temporary folder, renamed, and only then named in the manifest.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Open the folder.
+
+        Raises:
+            OutputError: the folder cannot be written, or has other files in it.
+            InputError: its manifest is damaged.
+        """
+        check_writable(folder)
+        self.folder = folder
+        self._entries: dict[str, Entry] = {}
+        if (folder / MANIFEST).exists():
+            self._entries = {entry.name: entry for entry in parse_entries(read_manifest(folder), folder)}
+        elif folder.is_dir() and any(path.name != LOCK for path in folder.iterdir()):
+            raise OutputError("has files in it but is not a pixel set", path=folder, hint="Choose another -o")
+        else:
+            self._write_manifest(complete=False)
+        for unfinished in folder.glob(f"{_TEMPORARY}*"):  # left by a process that was killed
+            shutil.rmtree(unfinished, ignore_errors=True)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._entries
+
+    def recipe_of(self, name: str) -> dict[str, Any]:
+        """Return the recipe of an entry of the set."""
+        return self._entries[name].recipe
+
+    def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
+        """Compare the recipe of an entry of the set with the one asked for.
+
+        Returns:
+            The first setting that differs and its two values, in words. None if the recipes are equal.
+        """
+        asked, found = _plain(recipe), self._entries[name].recipe
+        for key in [*asked, *found]:
+            if asked.get(key) != found.get(key):
+                return f"{key} = {found.get(key)!r}, not {asked.get(key)!r}"
+        return None
+
+    def describe(self, name: str) -> str:
+        """Return a line for the user about an entry of the set."""
+        entry = self._entries[name]
+        return f"{name}: {entry.n_pixels} pixels, {entry.n_lights} lights, {entry.source}"
+
+    def add(self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels) -> None:
+        """Write an entry of at least one pixel, in place of an earlier entry of that name.
+
+        Raises:
+            OutputError: it cannot be written. The set is then as it was before.
+        """
+        folder = self.folder / name
+        with (
+            refusals_as_output_errors(folder),
+            tempfile.TemporaryDirectory(prefix=_TEMPORARY, dir=self.folder) as temporary,
+        ):
+            work = Path(temporary) / "entry"
+            work.mkdir()
+            for array in ARRAYS:
+                np.save(work / f"{array}.npy", getattr(pixels, array), allow_pickle=False)
+            checksums = {array: file_sha256(work / f"{array}.npy") for array in ARRAYS}
+            work.chmod(0o777 & ~current_umask())
+            if self._entries.pop(name, None):
+                # From here the manifest must not promise the earlier entry.
+                self._write_manifest(complete=False)
+            if folder.exists():
+                shutil.rmtree(folder)
+            work.rename(folder)
+        n_pixels, n_lights = pixels.observations.shape
+        self._entries[name] = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
+        self._write_manifest(complete=False)
+
+    def finish(self) -> PixelSet:
+        """Mark the set as finished and return it. Raises OutputError."""
+        self._write_manifest(complete=True)
+        return PixelSet(self.folder, tuple(self._entries.values()))
+
+    def _write_manifest(self, *, complete: bool) -> None:
+        manifest = {
+            "format": FORMAT,
+            "version": __version__,
+            "complete": complete,
+            "n_pixels": sum(entry.n_pixels for entry in self._entries.values()),
+            "entries": [asdict(entry) for entry in self._entries.values()],
+        }
+        write_text(self.folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+
+
+def _plain(recipe: dict[str, Any]) -> dict[str, Any]:
+    """Return the recipe as it reads back from JSON."""
+    plain: dict[str, Any] = json.loads(json.dumps(recipe))
+    return plain

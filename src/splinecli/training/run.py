@@ -1,0 +1,68 @@
+"""Start or continue a run in a folder, alone or with the other processes of torchrun."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from splinecli.devices import choose_device
+from splinecli.files import check_writable, held_folder
+from splinecli.training.checkpoint import read_checkpoint_config
+from splinecli.training.config import TrainingConfig
+from splinecli.training.config_files import Settings, configure, configure_resumed
+from splinecli.training.defaults import CHECKPOINT
+from splinecli.training.distributed import join_workers, leave_workers, restarts_are_allowed
+from splinecli.training.loop import Trainer
+
+
+def resumes(folder: Path, *, resume: bool) -> bool:
+    """Return whether a run continues: on request, or after torchrun has started its processes again.
+
+    With torchrun's --max-restarts, one command both starts a run and continues it.
+    """
+    return resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())
+
+
+def configure_run(
+    folder: Path,
+    preset_name: str | None,
+    file: Path | None,
+    changes: Sequence[Settings],
+    *,
+    resume: bool,
+) -> TrainingConfig:
+    """Return the configuration of a run that starts or continues. Raises ModelError, UsageError."""
+    if not resume:
+        return configure(preset_name, file, changes)
+    path = folder / CHECKPOINT
+    return configure_resumed(read_checkpoint_config(path), path, preset_name, file, changes)
+
+
+@contextmanager
+def open_run(
+    config: TrainingConfig, folder: Path, device_name: str, *, resume: bool, tensorboard: bool
+) -> Iterator[Trainer]:
+    """Join the other processes, lock the folder and yield the trainer.
+
+    Args:
+        config: the configuration, from `configure_run`.
+        folder: the folder of the run.
+        device_name: "auto", "cpu" or "cuda".
+        resume: continue from the checkpoint.
+        tensorboard: also write TensorBoard's event files.
+
+    Raises:
+        UsageError: the processes cannot share a batch, the device is not available, or TensorBoard is not installed.
+        ModelError: the checkpoint does not fit, or weights to start from cannot be used.
+        InputError: a pixel set cannot be used.
+        OutputError: the folder cannot be written, or has a run in it and `resume` is not set.
+    """
+    check_writable(folder)
+    workers, device = join_workers(choose_device(device_name))
+    with ExitStack() as stack:
+        stack.callback(leave_workers)
+        workers.shards(config.shards)  # raises UsageError before the folder is made
+        if workers.leads:
+            stack.enter_context(held_folder(folder))
+        yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard)
