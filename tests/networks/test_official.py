@@ -244,9 +244,9 @@ def test_files_of_old_and_without_statistics(
 @pytest.mark.parametrize(
     ("of", "changes", "message"),
     [
-        (0, {"main.0.weight": None}, "lacks 'main.0.weight'"),
-        (0, {"main.9.main.4.bias": None}, "lacks 'main.9.main.4.bias'"),
-        (0, {"main.0.bias": torch.zeros(64)}, "holds 'main.0.bias', which the network does not have"),
+        (0, {"main.0.weight": None}, "has no 'main.0.weight'"),
+        (0, {"main.9.main.4.bias": None}, "has no 'main.9.main.4.bias'"),
+        (0, {"main.0.bias": torch.zeros(64)}, "has 'main.0.bias', which the network does not have"),
         (
             0,
             {"main.3.weight": torch.zeros(128, 64, 3, 3)},
@@ -254,13 +254,13 @@ def test_files_of_old_and_without_statistics(
         ),
         (0, {"main.1.running_mean": torch.zeros(63)}, r"'main.1.running_mean' has the shape \(63,\)"),
         (0, {"main.1.num_batches_tracked": torch.zeros(1)}, r"num_batches_tracked' has the shape \(1,\)"),
-        (0, {"main.1.bias": torch.full((64,), torch.nan)}, "'main.1.bias' holds values that are not finite"),
-        (0, {"main.1.bias": torch.full((64,), 1e6)}, "'main.1.bias' holds values .* too large"),
+        (0, {"main.1.bias": torch.full((64,), torch.nan)}, "'main.1.bias' has values that are not finite"),
+        (0, {"main.1.bias": torch.full((64,), 1e6)}, "'main.1.bias' has values .* too large"),
         (0, {"main.1.bias": torch.zeros(64, dtype=torch.int64)}, "'main.1.bias' is of torch.int64"),
-        (1, {"conv2.bias": None, "dense.1.weight": None}, "lacks 'conv2.bias', 'dense.1.weight'"),
+        (1, {"conv2.bias": None, "dense.1.weight": None}, "has no 'conv2.bias', 'dense.1.weight'"),
         (1, {"dense.0.weight": torch.zeros(128, 80)}, "'dense.0.weight' has the shape"),
-        (1, {"dense.2.weight": torch.zeros(1)}, "holds 'dense.2.weight'"),
-        (1, {f"{n}": torch.zeros(1) for n in range(7)}, "holds '0', '1', '2', '3', '4' and 2 more tensors,"),
+        (1, {"dense.2.weight": torch.zeros(1)}, "has 'dense.2.weight'"),
+        (1, {f"{n}": torch.zeros(1) for n in range(7)}, "has '0', '1', '2', '3', '4' and 2 more tensors,"),
     ],
 )
 def test_tensors_that_do_not_fit(

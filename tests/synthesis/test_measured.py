@@ -294,9 +294,9 @@ def test_a_share_needs_a_file(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"W2": None}, "found no array 'W2'. docs/files-and-frames.md lists all seven"),
-        ({"names": np.array(["a", "b", "a"])}, r"shape \(3,\), expected a list of different texts"),
+        ({"names": np.array(["a", "b", "a"])}, r"shape \(3,\), expected a list of distinct texts"),
         ({"names": np.arange(3)}, "names of type int64"),
-        ({"names": np.array([], dtype=str)}, r"shape \(0,\), expected a list of different texts"),
+        ({"names": np.array([], dtype=str)}, r"shape \(0,\), expected a list of distinct texts"),
         (
             {"W1": np.zeros((3, 5, 5))},
             r"found W1 of type float64 and shape \(3, 5, 5\), expected .* \(3, 6, 5\)",
@@ -305,7 +305,7 @@ def test_a_share_needs_a_file(tmp_path: Path) -> None:
         ({"b1": np.float64(0)}, r"found W1 .* expected floating-point \(3, 6, 0\)"),
         ({"W3": np.zeros((3, 4, 1))}, r"found W3 .* expected floating-point \(3, 4, 3\)"),
         ({"b3": np.zeros((3, 3), int)}, "found b3 of type int64"),
-        ({"b2": np.full((3, 4), np.nan)}, "b2 holds values that are not finite"),
+        ({"b2": np.full((3, 4), np.nan)}, "b2 has values that are not finite"),
         ({"names": np.array(["a", None, 1], dtype=object)}, "not an .npz file of plain arrays, or damaged"),
     ],
 )
@@ -334,7 +334,7 @@ def test_implausible_materials_are_dropped_with_a_reason(tmp_path: Path) -> None
     kept = read_measured(write(tmp_path, arrays))
     assert kept.names == ("first", "third")
     assert list(kept.dropped) == ["second"]
-    assert kept.dropped["second"].startswith("too bright: it throws back")
+    assert kept.dropped["second"].startswith("too bright: it reflects")
     # The others are as they were.
     normals, lights = random_configurations(1, 9)
     torch.testing.assert_close(
@@ -353,7 +353,7 @@ def test_implausible_materials_are_dropped_with_a_reason(tmp_path: Path) -> None
     arrays["W2"][1] = np.finfo(np.float32).max
     assert (
         read_measured(write(tmp_path, arrays)).dropped["second"]
-        == "too bright: it throws back nan of the light"
+        == "too bright: it reflects nan % of the light"
     )
 
 

@@ -1,15 +1,15 @@
-"""The authors' own weights of SPLINE-Net (Zheng et al., ICCV 2019), turned into a network of ours.
+"""Import the authors' own weights of SPLINE-Net (Zheng et al., ICCV 2019).
 
-Their PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt (NE-Net). The paper size
-has the same layers; what differs is put into the weights once, so that nothing has to be turned round later:
+Their PyTorch code saves two state dictionaries, NUMBER-G.ckpt (LI-Net) and NUMBER-D.ckpt (NE-Net). Our network of
+size "paper" has the same layers but other conventions. The import changes the weights once to account for these:
 
-- Rows: in their maps y grows with the row, in ours it falls. Every kernel is turned over along its height, and the
-  columns of the first linear layer along the rows of the map that they read. All paddings are symmetric and all
-  sizes even, so that the network of turned-over kernels maps turned-over maps just as theirs maps maps.
-- Channels: theirs are (dense, sparse), ours (sparse, dense).
-- Cells and disc: the configuration's grid "cnn-ps".
+- Rows: in their maps y grows with the row, in ours it falls. Every kernel is flipped along its height, and so are the
+  map rows that the first linear layer reads. All paddings are symmetric and all sizes even, so the result is the
+  flipped result of their network.
+- Channels: theirs are (dense, sparse), ours are (sparse, dense).
+- Cells and disc: the setting grid = "cnn-ps".
 
-Normals are taken to be in our frame: x right, y up, z to the camera.
+Their normals are assumed to be in our frame: x right, y up, z to the camera.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_strictly
 
-# Module by module, our name to theirs: LI-Net's sequences are called otherwise, NE-Net's modules one by one.
+# Our module names and theirs. LI-Net differs in the name of its sequences, NE-Net in the name of each module.
 _LI_NET_SEQUENCE = ("layers", "main")
 _NE_NET_MODULES = {
     "stem": "conv1",
@@ -39,21 +39,23 @@ _NE_NET_MODULES = {
     "hidden": "dense.0",
     "out": "dense.1",
 }
-# What their instance norms track in training. The authors normalise by each map's own statistics, at test time as
-# well (they never leave the training mode), so these numbers were never used.
+# Statistics that their instance norms collect in training. The authors' code normalises by the statistics of each
+# map, also at test time (it never leaves the training mode), so these values are not used.
 _TRACKED = ("running_mean", "running_var", "num_batches_tracked")
 _MOST_NAMES = 5
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
-    """The authors' network, float32, in evaluation mode: dropout, which their test leaves on, is off.
+    """Return the authors' network, float32, in evaluation mode.
+
+    Dropout is off in evaluation mode, while the authors' test code leaves it on.
 
     Args:
-        li_net_file: their generator's state dictionary (G).
-        ne_net_file: their discriminator's, which estimates the normals (D).
+        li_net_file: state dictionary of their generator (G), which is LI-Net.
+        ne_net_file: state dictionary of their discriminator (D), which is NE-Net.
 
     Raises:
-        ModelError: a file cannot be read or is no state dictionary; a tensor is missing, unknown, of another
+        ModelError: a file cannot be read or is not a state dictionary, or a tensor is missing, unknown, of another
             shape or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
@@ -69,12 +71,12 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
 
 
 def _flip_rows(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors with every kernel, the 4-dimensional ones, turned over along its height."""
+    """Flip every kernel (every 4-dimensional tensor) along its height."""
     return {prefix + name: tensor.flip(2) if tensor.ndim == 4 else tensor for name, tensor in tensors.items()}
 
 
 def _flip_columns(weight: Tensor, side: int) -> Tensor:
-    """A linear layer's weight (out, C * side * side) for features whose rows are turned over."""
+    """Flip the map rows in the weight (out, C * side * side) of a linear layer."""
     return weight.reshape(len(weight), -1, side, side).flip(2).flatten(1)
 
 
@@ -108,21 +110,27 @@ def _rename(
     names: dict[str, str],
     dropped: dict[str, torch.Size],
 ) -> dict[str, Tensor]:
-    """Their tensors under our names, float32, with every one of the file accounted for.
+    """Return their tensors under our names, float32.
 
     Args:
-        names: our name -> theirs, each of which has to be there.
-        dropped: their names and shapes of tensors that may be there and are of no use.
+        path: the file, for messages.
+        state: the tensors of the file by their name.
+        network: our network, for the expected shapes.
+        names: their name by our name. The file must have each of them.
+        dropped: expected shapes of tensors that are not needed, by their name.
+
+    Raises:
+        ModelError: a tensor is missing, unknown, of another shape or type, or not finite.
     """
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
     shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
     missing = [name for name in shapes if name not in state]
     if missing:
-        raise ModelError(f"lacks {_listed(missing)}", path=path, hint=hint)
+        raise ModelError(f"has no {_listed(missing)}", path=path, hint=hint)
     shapes |= dropped
     unknown = [name for name in state if name not in shapes]
     if unknown:
-        raise ModelError(f"holds {_listed(unknown)}, which the network does not have", path=path, hint=hint)
+        raise ModelError(f"has {_listed(unknown)}, which the network does not have", path=path, hint=hint)
     for name, tensor in state.items():
         if tensor.shape != shapes[name]:
             found, expected = tuple(tensor.shape), tuple(shapes[name])
@@ -130,27 +138,27 @@ def _rename(
     for name in names.values():
         if not state[name].is_floating_point():
             raise ModelError(f"tensor {name!r} is of {state[name].dtype}, expected real numbers", path=path)
-        # As float16, which weight files hold.
+        # Weight files are float16.
         if not torch.isfinite(state[name].half()).all():
-            raise ModelError(f"tensor {name!r} holds values that are not finite, or too large", path=path)
+            raise ModelError(f"tensor {name!r} has values that are not finite, or too large", path=path)
     return {ours: state[theirs].float() for ours, theirs in names.items()}
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file that torch.save wrote. Nothing but tensors and plain containers is unpickled."""
+    """Read the tensors of a file that torch.save wrote. Only tensors and plain containers are unpickled."""
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what torch mutters about odd files is said below, or not needed
+            warnings.simplefilter("ignore")  # the errors below cover what PyTorch warns of
             state = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise ModelError(f"cannot be read ({error.strerror or error})", path=path, hint=hint) from error
-    except Exception as error:  # a damaged pickle fails in a dozen ways
+    except Exception as error:  # damaged pickles raise many kinds of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
         isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in state.items()
     ):
-        raise ModelError("not a state dictionary, names with their tensors", path=path, hint=hint)
+        raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
     return state
 
 

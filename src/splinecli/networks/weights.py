@@ -1,4 +1,4 @@
-"""Weight files: safetensors with their network's configuration and a checksum. Nothing is ever unpickled."""
+"""Weight files: safetensors with the configuration of the network and a checksum. Nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -25,7 +25,13 @@ SHIPPED = resources.files("splinecli") / "assets"
 
 @dataclass(frozen=True)
 class LoadedNetwork:
-    """A network ready to estimate (float32, evaluation mode), the name it was asked by, the SHA-256."""
+    """A network that is ready to estimate normals (float32, evaluation mode).
+
+    Attributes:
+        network: the network.
+        name: the shipped name, or the file name without its suffix.
+        sha256: SHA-256 of the weight file.
+    """
 
     network: SplineNet
     name: str
@@ -33,7 +39,7 @@ class LoadedNetwork:
 
 
 def tensors_sha256(tensors: dict[str, Tensor]) -> str:
-    """SHA-256 over names, types, shapes and bytes, in the order of the names."""
+    """Return the SHA-256 of the tensors' names, types, shapes and bytes, sorted by name."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -43,7 +49,7 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
 
 
 def save_weights(network: SplineNet, path: Path) -> None:
-    """Write the network's parameters as float16 with its configuration. Raises OutputError."""
+    """Write the parameters of a network as float16, with its configuration. Raises OutputError."""
     tensors = {
         name: tensor.detach().cpu().half().clone(memory_format=torch.contiguous_format)
         for name, tensor in network.state_dict().items()
@@ -57,10 +63,15 @@ def save_weights(network: SplineNet, path: Path) -> None:
 
 
 def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of one of splinecli's safetensors files, checked against the checksum inside.
+    """Read the tensors and the metadata of a safetensors file of splinecli, and verify its checksum.
 
-    Raises ModelError where the file is missing, is no such file, or is damaged; `hint` says where a right one
-    is had.
+    Args:
+        path: the file.
+        expected_format: the format entry that the file must have.
+        hint: advice to add to an error.
+
+    Raises:
+        ModelError: the file is missing, has another format, or is damaged.
     """
     try:
         if path.is_dir():
@@ -69,9 +80,9 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
             raise ModelError("no such file", path=path, hint=hint)
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            found = metadata.get("format", "no format entry")
+            found = metadata.get("format", "none")
             if found != expected_format:
-                problem = f"not splinecli's: found {found}, expected {expected_format}"
+                problem = f"wrong format: found {found}, expected {expected_format}"
                 raise ModelError(problem, path=path, hint=hint)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
@@ -82,7 +93,7 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
 
 
 def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str, Any]:
-    """The JSON object under a key of a file's metadata, which no checksum covers. Raises ModelError."""
+    """Return the JSON object under a key of a file's metadata. The checksum does not cover it. Raises ModelError."""
     try:
         values = json.loads(metadata.get(key, ""))
     except json.JSONDecodeError as error:
@@ -93,7 +104,7 @@ def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str,
 
 
 def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) -> None:
-    """Fill the network; every tensor must be there, of its shape, and no other. Raises ModelError."""
+    """Load the tensors into the network. Raises ModelError for a missing, unknown or misshapen tensor."""
     try:
         network.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
@@ -102,7 +113,15 @@ def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) ->
 
 
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
-    """Rebuild the network of a weight file. Raises ModelError."""
+    """Load the network of a weight file.
+
+    Args:
+        path: the file.
+        name: the name of the result. None takes the file name without its suffix.
+
+    Raises:
+        ModelError: the file cannot be used.
+    """
     names = ", ".join(shipped_names())
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
@@ -111,24 +130,27 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     load_strictly(network, tensors, path)
     for key, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
-            raise ModelError(f"tensor {key!r} holds values that are not finite", path=path)
+            raise ModelError(f"tensor {key!r} has values that are not finite", path=path)
     network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return LoadedNetwork(network, name or path.stem, file_sha256(path))
 
 
 def shipped_names() -> list[str]:
-    """Names of the weights that come in the package."""
+    """Return the names of the weights in the package."""
     return sorted(manifest())
 
 
 def manifest() -> dict[str, dict[str, Any]]:
-    """name -> {file, sha256, method, description, lights: [fewest, most] in training} of the shipped weights."""
+    """Return what assets/weights.json says of the shipped weights, by name.
+
+    Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most lights in training.
+    """
     entries: dict[str, dict[str, Any]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
     return entries
 
 
 def untrained_warning(sha256: str, n_lights: int) -> list[str]:
-    """A sentence where these are shipped weights that were not trained with so many lights; else none."""
+    """Return a warning if these are shipped weights that were not trained with this number of lights."""
     for name, entry in manifest().items():
         fewest, most = entry["lights"]
         if entry["sha256"] == sha256 and not fewest <= n_lights <= most:
@@ -145,10 +167,10 @@ def _exists(path: Path) -> bool:
 
 
 def resolve_weights(name_or_file: str) -> LoadedNetwork:
-    """Load shipped weights by name, or a file by path. Raises ModelError."""
+    """Load shipped weights by name, or a weight file by path. Raises ModelError."""
     entry = manifest().get(name_or_file)
     if entry is None:
-        path = Path(name_or_file)
+        path = Path(name_or_file).expanduser()
         if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
             names = ", ".join(shipped_names())
             raise ModelError(
@@ -159,7 +181,7 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         loaded = load_weights(path, name=name_or_file)
     if loaded.sha256 != entry["sha256"]:
         raise ModelError(
-            f"the shipped weights {name_or_file!r} were changed: their SHA-256 is not the manifest's",
+            f"the shipped weights {name_or_file!r} were changed: their SHA-256 does not match weights.json",
             hint="Reinstall splinecli",
         )
     return loaded

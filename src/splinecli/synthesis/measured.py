@@ -1,10 +1,11 @@
-"""Measured reflectances: small networks fitted to the MERL materials, for pixels that a formula cannot draw.
+"""Measured reflectances: small networks fitted to the MERL materials.
 
-Data: Matusik, Pfister, Brand and McMillan, "A Data-Driven Reflectance Model", SIGGRAPH 2003 (100 isotropic
-materials). Networks: Sztrajman, Rainer, Ritschel and Weyrich, "Neural BRDF Representation and Importance
-Sampling", Computer Graphics Forum 40(6), 2021: from the half vector and the difference vector (Rusinkiewicz, "A
-New Change of Variables for Efficient BRDF Representation", 1998) to the BRDF in RGB, 1 / sr, without the cosine.
-The files that hold them (docs/files-and-frames.md) are read and checked in measured_files.py.
+They add materials to the training pixels that no formula describes. The data are 100 isotropic materials from
+Matusik, Pfister, Brand and McMillan, "A Data-Driven Reflectance Model", SIGGRAPH 2003. The networks are those of
+Sztrajman, Rainer, Ritschel and Weyrich, "Neural BRDF Representation and Importance Sampling", Computer Graphics Forum
+40(6), 2021. They map the half vector and the difference vector (Rusinkiewicz, "A New Change of Variables for Efficient
+BRDF Representation", 1998) to the BRDF in RGB, in 1 / sr, without the cosine. measured_files.py reads their files,
+which docs/files-and-frames.md describes.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Natural logarithm of the highest BRDF + 1, 22,000 / sr: what a damaged network says stays finite.
+# Natural logarithm of the highest BRDF + 1, 22,000 / sr, so that the output of a damaged network stays finite.
 _HIGHEST_LOG = 10.0
-# cos 80 degrees. Where light and view are further than 160 degrees apart, MERL itself is extrapolated and the
-# networks' highlights grow without bound; there the value at 160 degrees is taken.
+# cos 80 degrees. With light and view more than 160 degrees apart, the MERL data are extrapolated and the highlights
+# of the networks grow without bound. The value at 160 degrees is used there.
 _LOWEST_L_DOT_H = math.cos(math.radians(80))
-# Evaluations at a time: on a processor the hidden layers are to stay in its cache.
+# Evaluations at a time. On a CPU the hidden layers should fit in its cache.
 _AT_ONCE_CPU = 1 << 16
 _AT_ONCE_ELSEWHERE = 1 << 22
 
@@ -31,12 +32,12 @@ class MeasuredLibrary:
     """M measured materials on one device.
 
     Attributes:
-        names: of the materials, in the file's order.
-        layers: the networks' three layers, (M, H + 1, 6), (M, H' + 1, H + 1) and (M, 3, H' + 1); the biases
-            are the weights of an input, and of a hidden unit in each layer, that is always 1.
-        albedos: of the three channels, averaged over view and light, cosine-weighted (M, 3).
-        brightest: of the three channels, the largest share thrown back of the light from one direction (M, 3).
-        dropped: the file's other materials and what is wrong with them.
+        names: names of the materials, in the order of the file.
+        layers: the three layers of the networks, (M, H + 1, 6), (M, H' + 1, H + 1) and (M, 3, H' + 1). One input, and
+            one hidden unit of each layer, is always 1. Its weights are the biases.
+        albedos: reflected share of diffuse light, for each channel, (M, 3).
+        brightest: largest reflected share of the light from one direction, for each channel, (M, 3).
+        dropped: the materials of the file that were left out, with the reason.
     """
 
     names: tuple[str, ...]
@@ -46,16 +47,20 @@ class MeasuredLibrary:
     dropped: Mapping[str, str]
 
     def as_measured(self, names: Sequence[str]) -> MeasuredMaterial:
-        """A pixel of each named material, gray as the mean of its channels. Raises ValueError for others."""
+        """Return a pixel of each named material, gray as the mean of its channels.
+
+        Raises:
+            ValueError: there is no material of that name.
+        """
         index = torch.tensor([self.names.index(name) for name in names], device=self.albedos.device)
         return MeasuredMaterial(self, index, self.albedos.new_full((len(index), 3), 1 / 3))
 
     def draw(self, pixels: int, generator: torch.Generator) -> MeasuredMaterial:
-        """Random materials, uniform over the library, each varied by a gray of its own and by its scale.
+        """Draw materials uniformly from the library and vary their gray value and brightness.
 
-        The gray is a mix of the three channels with weights uniform over all that sum to 1: what another
-        camera, light or pigment would show. The scale is 2^U(-1, 1.5), for MERL's whites throw back no more
-        than a third; it ends where some direction's light would be thrown back whole.
+        The gray value is a random mix of the three channels, as another camera, light or pigment would give. The
+        weights are uniform over all that sum to 1. The scale is 2^U(-1, 1.5), because the whites of MERL reflect at
+        most a third of the light. It is limited so that no direction's light is reflected by more than 100 %.
         """
         device = self.albedos.device
         index = torch.randint(len(self.names), (pixels,), generator=generator, device=device)
@@ -69,25 +74,31 @@ class MeasuredLibrary:
 
 @dataclass(frozen=True)
 class MeasuredMaterial:
-    """P pixels of a library's materials: index (P,) into them, weights (P, 3) of the channels in the gray."""
+    """Materials of P pixels.
+
+    Attributes:
+        library: all materials.
+        index: (P,) positions in the library.
+        weights: (P, 3) weights of the channels in the gray value.
+    """
 
     library: MeasuredLibrary
     index: Tensor
     weights: Tensor
 
     def take(self, pixels: slice | Tensor) -> MeasuredMaterial:
-        """The materials of some of the pixels."""
+        """Return the materials of some of the pixels."""
         return MeasuredMaterial(self.library, self.index[pixels], self.weights[pixels])
 
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
-        """pi times the reflected radiance (P, D); arguments as in Material.shade, float32.
+        """Return pi times the reflected radiance, (P, D); arguments as in Material.shade, float32.
 
-        Exactly reciprocal: exchanging light and view changes the BRDF by nothing but rounding.
+        The BRDF is reciprocal: exchanging light and view changes it by rounding errors only.
         """
         l_dot_v = l_dot_v.expand_as(n_dot_l)
         brdf = torch.empty_like(n_dot_l)
         at_once = _AT_ONCE_CPU if n_dot_l.device.type == "cpu" else _AT_ONCE_ELSEWHERE
-        # A pixel's gathered layers weigh as much as some twenty directions.
+        # The layers of a pixel take as much memory as about twenty directions.
         step = max(1, at_once // (n_dot_l.shape[1] + 20))
         for first in range(0, len(n_dot_l), step):
             some = slice(first, first + step)
@@ -97,17 +108,21 @@ class MeasuredMaterial:
         return math.pi * brdf * n_dot_l.clamp(min=0)
 
     def albedo(self) -> Tensor:
-        """Share of light from everywhere that is thrown back (P, 1)."""
+        """Return the reflected share of diffuse light, (P, 1)."""
         return (self.weights * self.library.albedos[self.index]).sum(dim=1, keepdim=True)
 
 
 def half_and_difference(n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
-    """What the networks read (P, 6, D): half vector (sin, 1, cos) and difference vector, from cosines (P, D).
+    """Return the input of the networks (P, 6, D): the half vector (sin, 1, cos) and the difference vector.
 
-    The half vector's azimuth is zero, so its y is unused and holds the 1 that multiplies the biases. The
-    difference vector is the light's, turned so that the half vector is on the z axis. An isotropic, reciprocal
-    BRDF does not know light from view nor left from right, so x <= 0 <= y: of the two directions, the less
-    grazing one counts as the light, since in training errors weighed as the light's cosine.
+    The azimuth of the half vector is 0. Its y is not needed and is set to 1, the factor of the biases. The difference
+    vector is the light direction after the rotation that brings the half vector to the z axis. An isotropic,
+    reciprocal BRDF does not change when light and view, or left and right, are exchanged. So x <= 0 <= y is chosen:
+    the less grazing direction is taken as the light, because the training of the networks weighted errors by the
+    light's cosine.
+
+    Args:
+        n_dot_l, n_dot_v, l_dot_v: cosines between normal, light and view, (P, D).
     """
     l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
     n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
@@ -121,7 +136,7 @@ def half_and_difference(n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Te
 
 
 def evaluate(layers: Sequence[Tensor], vectors: Tensor) -> Tensor:
-    """The BRDF's channels (P, 3, D), 1 / sr, from layers (P, out, in) and vectors (P, 6, D)."""
+    """Return the channels of the BRDF (P, 3, D), in 1 / sr, from layers (P, out, in) and vectors (P, 6, D)."""
     first, second, last = layers
     hidden = torch.bmm(first, vectors).relu_()
     hidden = torch.bmm(second, hidden).relu_()

@@ -1,4 +1,4 @@
-"""Files of measured materials: read, checked in form, and cleared of the materials that cannot be real."""
+"""Read files of measured materials, check them, and leave out materials that are not plausible."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import Tensor
 from splinecli.errors import InputError
 from splinecli.synthesis.measured import MeasuredLibrary, evaluate, half_and_difference
 
-# A fitted network may be slightly off; more is a failed fit. Of the MERL networks, those that pass are well
-# within: some are up to 0.89 bright at 88 degrees, 4 % from reciprocal, and black nowhere.
+# Limits that a fitted network may exceed only if its fit failed. The MERL networks that pass stay well below: they
+# reflect at most 89 % (at 88 degrees), differ from reciprocity by at most 4 %, and are black nowhere.
 BRIGHTEST = 1.1
 MOST_ASYMMETRIC = 0.05
 MOST_BLACK = 0.01
@@ -27,15 +27,17 @@ _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
 
 
 def read_measured(path: str | Path, device: torch.device | str = "cpu") -> MeasuredLibrary:
-    """The plausible materials of a file (docs/files-and-frames.md), in float32 on `device`.
+    """Read the plausible materials of a file (docs/files-and-frames.md), in float32 on `device`.
 
-    A material is dropped, its name and the reason kept in `dropped`, where
-    - light from one direction is thrown back by more than BRIGHTEST, or a value is not finite;
-    - exchanging light and view changes the BRDF, |a - b| / (a + b), by more than MOST_ASYMMETRIC in the median
-      over directions drawn by projected area;
-    - more than MOST_BLACK of these directions, all of them lit, are black.
+    A material is left out, and named in `dropped`, if one of these holds:
 
-    Raises InputError for a file that is missing, damaged or of another form, or has no plausible material.
+    - It reflects more than BRIGHTEST of the light from one direction, or a value is not finite.
+    - Exchanging light and view changes the BRDF, |a - b| / (a + b), by more than MOST_ASYMMETRIC. This is the median
+      over pairs of directions, uniform by projected area.
+    - The BRDF is zero for more than MOST_BLACK of these pairs.
+
+    Raises:
+        InputError: the file is missing, damaged or of another form, or has no plausible material.
     """
     path = Path(path)
     arrays = _read_arrays(path)
@@ -60,17 +62,17 @@ def read_measured(path: str | Path, device: torch.device | str = "cpu") -> Measu
 
 
 def directional_albedos(layers: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """Share thrown back of the light from each of 16 directions (M, 16, 3), spread uniformly by projected area.
+    """Return the reflected share of the light from each of 16 directions, (M, 16, 3).
 
-    By reciprocity these are seen from the view, so that a plain mean over the directions is the albedo under
-    light from everywhere. Integrated over half vectors, densely near the normal, where highlights are narrow:
-    d omega_l = 4 (l.h) d omega_h.
+    The directions are uniform by projected area, so that their plain mean is the albedo under diffuse light. By
+    reciprocity, each direction is used as the view, and the light is integrated. The integral is over half vectors,
+    d omega_l = 4 (l.h) d omega_h, and denser near the normal, where highlights are narrow.
     """
     cosine_v = (1 - (torch.arange(_VIEWS) + 0.5) / _VIEWS).sqrt()[:, None]
     root = (torch.arange(_HALF_TILTS) + 0.5) / _HALF_TILTS
     tilt = root.square() * math.pi / 2
     azimuth = (torch.arange(_HALF_AZIMUTHS) + 0.5) / _HALF_AZIMUTHS * math.pi
-    # Half of the azimuths stand for all.
+    # Azimuths from 0 to 180 degrees suffice, by symmetry.
     area = tilt.sin() * root * math.pi / _HALF_TILTS * 2 * math.pi / _HALF_AZIMUTHS
     area = area[:, None].expand(-1, _HALF_AZIMUTHS).reshape(1, -1)
     cosine_h = tilt.cos()[:, None].expand(-1, _HALF_AZIMUTHS).reshape(1, -1)
@@ -86,11 +88,11 @@ def directional_albedos(layers: tuple[Tensor, Tensor, Tensor]) -> Tensor:
 
 
 def _faults(layers: tuple[Tensor, Tensor, Tensor], reflected: Tensor) -> list[str]:
-    """What is wrong with each of the materials; empty where nothing is."""
-    # The sequence begins with zeros, where light, view and normal are one.
+    """Return why each of the materials is not plausible, an empty text for a plausible one."""
+    # The sequence begins with zeros, where light, view and normal coincide.
     engine = torch.quasirandom.SobolEngine(3)  # type: ignore[no-untyped-call]
     spread = engine.draw(_PAIRS + 1)[1:]
-    # Uniform by projected area up to 85 degrees: so a sphere's pixels show their light and their view.
+    # Uniform by projected area up to 85 degrees, as the pixels of a sphere see lights and view.
     squared = spread[:, :2] * math.sin(math.radians(85)) ** 2
     n_dot_l, n_dot_v = (1 - squared).sqrt().T
     l_dot_v = squared.prod(dim=1).sqrt() * (math.pi * spread[:, 2]).cos() + n_dot_l * n_dot_v
@@ -101,13 +103,13 @@ def _faults(layers: tuple[Tensor, Tensor, Tensor], reflected: Tensor) -> list[st
     brightest = reflected.mean(dim=2).amax(dim=1)
     faults = []
     for bright, dark, uneven in zip(brightest.tolist(), black.tolist(), asymmetry.tolist(), strict=True):
-        # Written so that a value that is no number is a fault.
+        # The comparisons are negated so that NaN counts as a fault.
         if not bright <= BRIGHTEST:
-            faults.append(f"too bright: it throws back {bright:.2f} of the light")
+            faults.append(f"too bright: it reflects {100 * bright:.0f} % of the light")
         elif not dark <= MOST_BLACK:
-            faults.append(f"black under {dark:.0%} of the directions that light it")
+            faults.append(f"black under {100 * dark:.0f} % of the lights above the surface")
         elif not uneven <= MOST_ASYMMETRIC:
-            faults.append(f"not reciprocal: {uneven:.0%} between light and view exchanged")
+            faults.append(f"not reciprocal: exchanging light and view changes it by {100 * uneven:.0f} %")
         else:
             faults.append("")
     return faults
@@ -121,12 +123,14 @@ def _evaluate_all(
     *,
     exchanged: bool = False,
 ) -> Tensor:
-    """The BRDFs (M, 3, N) of all materials for cosines of N elements in any shape."""
+    """Return the BRDFs (M, 3, N) of all materials for cosines of N elements in any shape.
+
+    `exchanged` takes the other direction as the light, which a reciprocal BRDF does not notice.
+    """
     vectors = half_and_difference(*(cosine.reshape(1, -1) for cosine in (n_dot_l, n_dot_v, l_dot_v)))
     if exchanged:
-        # The other direction counts as the light.
         vectors[:, 3] *= -1
-    # One by one: over all at once the hidden layers of a hundred materials would fill gigabytes.
+    # One material at a time, because the hidden layers of a hundred materials would fill gigabytes.
     return torch.cat(
         [evaluate([layer[m : m + 1] for layer in layers], vectors) for m in range(len(layers[0]))]
     )
@@ -140,12 +144,16 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise InputError("the file does not exist", path=path) from None
     except IsADirectoryError:
         raise InputError("found a folder, expected an .npz file of measured materials", path=path) from None
-    except Exception:  # archives and headers of arrays fail in a dozen ways
+    except Exception:  # damaged archives and array headers raise many kinds of errors
         raise InputError("not an .npz file of plain arrays, or damaged", path=path) from None
 
 
 def _check_form(arrays: dict[str, NDArray[Any]], path: Path) -> list[str]:
-    """The materials' names. Raises InputError for arrays that are missing, no numbers, or do not fit together."""
+    """Return the names of the materials.
+
+    Raises:
+        InputError: an array is missing, is not of real numbers, or does not fit the others.
+    """
     for key in ("names", *_LAYERS):
         if key not in arrays:
             raise InputError(
@@ -154,7 +162,7 @@ def _check_form(arrays: dict[str, NDArray[Any]], path: Path) -> list[str]:
     names = arrays["names"]
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names) or len(set(names.tolist())) < len(names):
         raise InputError(
-            f"found names of type {names.dtype} and shape {names.shape}, expected a list of different texts",
+            f"found names of type {names.dtype} and shape {names.shape}, expected a list of distinct texts",
             path=path,
         )
     first = arrays["b1"].shape[-1] if arrays["b1"].ndim else 0
@@ -168,15 +176,15 @@ def _check_form(arrays: dict[str, NDArray[Any]], path: Path) -> list[str]:
                 path=path,
             )
         if not np.isfinite(array).all():
-            raise InputError(f"{key} holds values that are not finite", path=path)
+            raise InputError(f"{key} has values that are not finite", path=path)
     return [str(name) for name in names]
 
 
 def _fold_biases(arrays: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """The layers as MeasuredLibrary holds them, (M, out, in), from W1 (M, in, out), b1 (M, out) and so on."""
+    """Return the layers of MeasuredLibrary, (M, out, in), from W1 (M, in, out), b1 (M, out) and so on."""
     w1, b1, w2, b2, w3, b3 = arrays
     first = w1.transpose(1, 2).clone()
-    # The half vector's y is zero in the file's convention, and 1 in half_and_difference.
+    # In the file the half vector's y is 0. In half_and_difference it is 1, the factor of the biases.
     first[:, :, 1] = b1
     always = torch.zeros(len(w1), 1, 6)
     always[:, :, 1] = 1
