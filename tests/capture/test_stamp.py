@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from splinecli.capture import RadiometricCalibration, open_capture
 from splinecli.capture.stamp import digest, stamp_capture
 from splinecli.errors import InputError
-from splinecli.pixel_sets.preparation import add_capture
-from splinecli.pixel_sets.store import PixelSetWriter
+from splinecli.pixel_sets.captures import add_capture
+from splinecli.pixel_sets.writer import PixelSetWriter
 
 WriteImage = Callable[..., Path]
 

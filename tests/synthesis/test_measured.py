@@ -344,7 +344,9 @@ def test_implausible_materials_are_dropped_with_a_reason(tmp_path: Path) -> None
 
     arrays["b3"][0] = -1.0
     arrays["W1"][2, 3] = 20.0
-    with pytest.raises(InputError, match="none of its 3 materials is plausible; 'first' is black under 100%"):
+    with pytest.raises(
+        InputError, match="none of its 3 materials is plausible; 'first' is black under 100 %"
+    ):
         read_measured(write(tmp_path, arrays))
     arrays["b3"][0] = small_networks()["b3"][0]
     assert read_measured(write(tmp_path, arrays)).dropped["third"].startswith("not reciprocal: ")

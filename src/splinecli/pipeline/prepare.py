@@ -9,12 +9,12 @@ from typing import Any
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.files import check_writable, held_folder, write_bytes
 from splinecli.pictures.contact_sheet import contact_sheet
+from splinecli.pictures.png import encode_png
 from splinecli.pipeline.observer import SILENT, Advance, Observer
 from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
 from splinecli.pixel_sets.rendered import ScenePlan, add_scene
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
-from splinecli.pictures.png import encode_png
 
 CONTACT_SHEET = "contact_sheet.png"
 
