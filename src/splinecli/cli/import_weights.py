@@ -20,17 +20,9 @@ def import_weights(
     ],
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.safetensors",
-            help="The weight file to write.",
-            rich_help_panel="Output",
-        ),
+        typer.Option("--output", "-o", metavar="FILE.safetensors", help="The weight file to write."),
     ],
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing file.", rich_help_panel="Output")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.

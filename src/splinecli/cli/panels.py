@@ -62,7 +62,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Speed": ("--jobs", *SPEED),
     },
     "prepare": {
-        "Input": ("--as-stored", "--white-level"),
+        "Input": ("--as-stored", "--update", "--white-level"),
         "Scenes": ("--scenes", "--mesh", "--size", "--lights", "--measured", "--measured-share", "--seed"),
         "Output": ("--output", *REPEAT),
     },

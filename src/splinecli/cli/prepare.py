@@ -16,15 +16,11 @@ from splinecli.errors import UsageError
 if TYPE_CHECKING:
     from splinecli.pixel_sets.rendered import ScenePlan
 
-RENDERING = "Rendered scenes"
-
 
 def prepare(
     output: Annotated[
         Path,
-        typer.Option(
-            "--output", "-o", metavar="SET", help="Folder of the pixel set.", rich_help_panel="Output"
-        ),
+        typer.Option("--output", "-o", metavar="SET", help="Folder of the pixel set."),
     ],
     sources: Annotated[
         list[Path] | None,
@@ -32,50 +28,26 @@ def prepare(
     ] = None,
     as_stored: AsStoredOption = False,
     update: UpdateOption = False,
-    scenes: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Render N random scenes.", rich_help_panel=RENDERING)
-    ] = 0,
+    scenes: Annotated[int, typer.Option(metavar="N", min=0, help="Render N random scenes.")] = 0,
     mesh: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Render a scene of this mesh (PLY, OBJ, STL, ...). Repeatable.",
-            rich_help_panel=RENDERING,
-        ),
+        typer.Option(metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...). Repeatable."),
     ] = None,
     size: Annotated[
         int | None,
-        typer.Option(
-            metavar="PIXELS",
-            min=8,
-            help="Width and height of the rendered images. [default: 128]",
-            rich_help_panel=RENDERING,
-        ),
+        typer.Option(metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"),
     ] = None,
     lights: Annotated[
         int | None,
-        typer.Option(
-            metavar="F",
-            min=16,
-            help="Number of lights of a rendered scene. [default: 500]",
-            rich_help_panel=RENDERING,
-        ),
+        typer.Option(metavar="F", min=16, help="Number of lights of a rendered scene. [default: 500]"),
     ] = None,
     measured: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Also use these measured materials (.npz).", rich_help_panel=RENDERING
-        ),
+        typer.Option(metavar="FILE", help="Also use these measured materials (.npz)."),
     ] = None,
     measured_share: Annotated[
         float,
-        typer.Option(
-            metavar="SHARE",
-            min=0,
-            max=1,
-            help="Share of the materials that are measured.",
-            rich_help_panel=RENDERING,
-        ),
+        typer.Option(metavar="SHARE", min=0, max=1, help="Share of the materials that are measured."),
     ] = 0.5,
     seed: SeedOption = 0,
     as_json: JsonOption = False,

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from splinecli.training.loop import Trainer
     from splinecli.training.run_log import Metrics
 
-INPUT, LENGTH, SETTINGS, OUTPUT = "Input", "Length", "Settings", "Output"
-
 
 def train(
     output: Annotated[
@@ -35,7 +33,6 @@ def train(
             "-o",
             metavar="RUN",
             help=f"Folder of the run. Its files are renewed every {CHECKPOINT_SECONDS} seconds.",
-            rich_help_panel=OUTPUT,
         ),
     ],
     sets: Annotated[
@@ -47,24 +44,15 @@ def train(
             metavar="NAME",
             help=f"Settings to begin with: {', '.join(PRESET_NAMES)}. [default: {DEFAULT_PRESET}]",
             autocompletion=lambda: list(PRESET_NAMES),
-            rich_help_panel=SETTINGS,
         ),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Settings from a TOML file or a run's config.json.",
-            rich_help_panel=SETTINGS,
-        ),
+        typer.Option(metavar="FILE", help="Settings from a TOML file or a run's config.json."),
     ] = None,
     param: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="One setting, such as pixels.wall_share=0.3. Repeatable.",
-            rich_help_panel=SETTINGS,
-        ),
+        typer.Option(metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. Repeatable."),
     ] = None,
     start_from: Annotated[
         str | None,
@@ -72,7 +60,6 @@ def train(
             metavar="NAME|FILE",
             help="Begin with these weights instead of random ones.",
             autocompletion=complete_weights,
-            rich_help_panel=INPUT,
         ),
     ] = None,
     generator_weight: Annotated[
@@ -81,44 +68,25 @@ def train(
             metavar="W",
             min=0,
             help="Weight of generated pixels, where each SET has weight 1. [default: 0; 1 without SET]",
-            rich_help_panel=INPUT,
         ),
     ] = None,
     n_lights: Annotated[
         str | None,
-        typer.Option(
-            metavar="K|MIN-MAX",
-            help="Number of lights of each pixel. [default: the preset's]",
-            rich_help_panel=INPUT,
-        ),
+        typer.Option(metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]"),
     ] = None,
-    steps: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Train for N steps.", rich_help_panel=LENGTH)
-    ] = None,
+    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Train for N steps.")] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="M", min=0.01, help="Train for M minutes.", rich_help_panel=LENGTH),
+        typer.Option(metavar="M", min=0.01, help="Train for M minutes."),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the run's checkpoint.", rich_help_panel=LENGTH)
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the run's checkpoint.")] = False,
     seed: Annotated[
         int | None,
-        typer.Option(
-            metavar="S",
-            min=0,
-            max=2**32 - 1,
-            help="Seed of the run. [default: 0]",
-            rich_help_panel=SETTINGS,
-        ),
+        typer.Option(metavar="S", min=0, max=2**32 - 1, help="Seed of the run. [default: 0]"),
     ] = None,
     tensorboard: Annotated[
         bool,
-        typer.Option(
-            "--tensorboard",
-            help="Also write RUN/tensorboard (needs the extra 'tensorboard').",
-            rich_help_panel=OUTPUT,
-        ),
+        typer.Option("--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard')."),
     ] = False,
     device: DeviceOption = Device.auto,
     quiet: QuietOption = False,

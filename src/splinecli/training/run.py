@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from splinecli.devices import choose_device
+from splinecli.devices import choose_device, use_available_cores
 from splinecli.files import check_writable, held_folder
 from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import TrainingConfig
@@ -59,6 +59,7 @@ def open_run(
         OutputError: the folder cannot be written, or has a run in it and `resume` is not set.
     """
     check_writable(folder)
+    use_available_cores()
     workers, device = join_workers(choose_device(device_name))
     with ExitStack() as stack:
         stack.callback(leave_workers)
