@@ -58,7 +58,7 @@ def capture_from_arrays(
 
     def pixels() -> Iterator[StoredPixels]:
         for index, image in enumerate(stack):
-            values = image[inside].reshape(np.count_nonzero(inside), -1)
+            values = (image if image.ndim == 3 else image[..., None])[inside]
             path = Path(f"images[{index}]")
             yield StoredPixels(path, values, to_linear(values, path), intensities[index])
 
