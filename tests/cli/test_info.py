@@ -95,7 +95,7 @@ def test_quiet_prints_nothing_but_errors(run, capture):
     assert result.err.startswith("splinecli: nowhere: ")
 
 
-def clip_at_12_bits(capture: Path, times: float = 2) -> None:
+def clip_at_12_bits(capture: Path, times: float = 1.2) -> None:
     """Turn the images into 12-bit data in 16-bit files, `times` overexposed."""
     for path in capture.glob("image*.png"):
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)

@@ -134,8 +134,10 @@ def _by_white_level(
     summaries = []
     for image, share in zip(images, shares, strict=True):
         bright = image.bright
-        if level is not None and image.dtype.startswith("uint"):
-            bright *= np.iinfo(image.dtype).max / level.value
+        full_scale = np.iinfo(image.dtype).max if image.dtype.startswith("uint") else 0
+        # The white level of 16-bit images does not apply to 8-bit images among them.
+        if level is not None and full_scale >= level.value:
+            bright *= full_scale / level.value
         fits = image.shape[:2] == mask.shape
         summaries.append(replace(image, bright=bright, saturated=float(share) if fits else image.saturated))
     return level, tuple(summaries)
