@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all."""
+"""Output files that appear complete or not at all, and checks of output folders."""
 
 from __future__ import annotations
 
@@ -13,17 +13,23 @@ from typing import IO
 from splinecli.errors import OutputError
 
 LOCK = ".lock"
-"""A file in a folder that one process at a time writes into."""
+"""The lock file in a folder that only one process at a time may write into."""
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal digits."""
+    """Return the SHA-256 of a file's content in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file by renaming a finished temporary one beside it. Raises OutputError."""
+    """Write a file so that it appears complete or not at all.
+
+    The content goes to a temporary file in the same folder, which is then renamed. Folders are made as needed.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     temporary: Path | None = None
     with refusals_as_output_errors(path):
         try:
@@ -35,14 +41,14 @@ def write_bytes(path: Path, content: bytes) -> None:
             temporary.chmod(0o666 & ~current_umask())
             temporary.replace(path)
         finally:
-            # Also on Ctrl-C: nothing half-written stays behind.
+            # This also runs on Ctrl-C, so no partial file is left.
             if temporary is not None:
                 temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
-    """Raise OutputError, naming the path, where the system refuses what is done inside."""
+    """Turn an OSError inside the context into an OutputError that names the path."""
     try:
         yield
     except OSError as error:
@@ -52,7 +58,11 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise OutputError where `folder` is no folder, or could not be made or written into."""
+    """Check that a folder exists or can be made, and that files can be written into it.
+
+    Raises:
+        OutputError: the path is a file, or permissions do not allow it.
+    """
     place = folder
     try:
         while not place.exists():
@@ -61,27 +71,38 @@ def check_writable(folder: Path) -> None:
         raise OutputError(f"cannot be a folder ({error.strerror})", path=folder) from error
     if not place.is_dir():
         raise OutputError(
-            "is a file; the results need a folder", path=place, hint="Choose another place with -o"
+            "found a file, expected a folder for the results", path=place, hint="Choose another place with -o"
         )
     if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError("may not be written into", path=place, hint="Choose another place with -o")
+        raise OutputError(
+            "no permission to write into this folder", path=place, hint="Choose another place with -o"
+        )
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Raise OutputError where the folder holds one of the names and may not lose it, or could not be written into."""
+    """Check that a folder can be written into and has none of the named files, unless they may be replaced.
+
+    Raises:
+        OutputError: one of the files exists and `overwrite` is False, or check_writable fails.
+    """
     check_writable(folder)
     for name in () if overwrite else names:
         if (folder / name).exists():
             raise OutputError(
-                f"holds {name} already", path=folder, hint="Add --overwrite, or choose another place with -o"
+                f"{name} already exists in this folder",
+                path=folder,
+                hint="Add --overwrite, or choose another place with -o",
             )
 
 
 @contextmanager
 def held_folder(folder: Path) -> Iterator[None]:
-    """Make the folder and keep other processes of splinecli from writing into it. Raises OutputError.
+    """Make a folder and lock it, so that no other process of splinecli writes into it.
 
-    A folder that was made for what then failed, and is still empty, goes again.
+    If the context fails, a folder that was made here and is still empty is removed.
+
+    Raises:
+        OutputError: the folder cannot be made, or another process has locked it.
     """
     made = not folder.exists()
     with refusals_as_output_errors(folder):
@@ -96,30 +117,32 @@ def held_folder(folder: Path) -> Iterator[None]:
             folder.rmdir()
         raise
     finally:
-        # Otherwise the file stays: without it two processes could hold locks on two files of one name.
+        # The lock file stays. If it were removed, two processes could lock two files of the same name.
         lock.close()
 
 
 def _lock(file: IO[str], folder: Path) -> None:
     try:
         import fcntl
-    except ImportError:  # no such locks on this system
+    except ImportError:  # this system has no such locks
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         raise OutputError(
-            "another splinecli is writing into it", path=folder, hint="Wait for it, or choose another -o"
+            "another splinecli process is writing into this folder",
+            path=folder,
+            hint="Wait for it to end, or choose another -o",
         ) from error
 
 
 def write_text(path: Path, content: str) -> None:
-    """write_bytes of UTF-8 text; what of a file's name is no text comes as escapes."""
+    """Write UTF-8 text as write_bytes does. Characters of file names that are not valid text become escapes."""
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
 def current_umask() -> int:
-    """The permissions that new files of this process do not get."""
+    """Return the file mode creation mask of this process."""
     current = os.umask(0)
     os.umask(current)
     return current

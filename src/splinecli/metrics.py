@@ -12,10 +12,11 @@ from splinecli.normals import angle_between_deg
 
 @dataclass(frozen=True)
 class AngularErrors:
-    """Over the pixels that have a ground truth.
+    """Statistics of the angular error over the pixels that have a ground truth.
 
-    mean (MAE), median, p90 (90th percentile): degrees; under_5, under_10: shares of the pixels, 0 to 1,
-    with an error under 5 and 10 degrees.
+    Args:
+        mean, median, p90: mean (MAE), median and 90th percentile, in degrees.
+        under_5, under_10: shares of the pixels, 0 to 1, with an error below 5 and below 10 degrees.
     """
 
     mean: float
@@ -28,20 +29,21 @@ class AngularErrors:
 def angular_error_map_deg(
     normals: NDArray[np.floating], ground_truth: NDArray[np.floating], mask: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Errors (H, W) of normal maps (H, W, 3) in the mask; NaN elsewhere and where the ground truth is zero.
+    """Return the angular errors (H, W) of a normal map (H, W, 3) in degrees.
 
-    Signed directions count: a normal that points the wrong way is 180 degrees off, not 0.
+    They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a normal counts: one
+    that points the opposite way has an error of 180 degrees, not 0.
     """
     scored = mask & ground_truth.any(axis=-1)
     errors = np.full(mask.shape, np.nan, np.float32)
-    # Row by row: in float64, all at once, a map of many megapixels would need several gigabytes.
+    # Row by row, because a map of many megapixels in float64 would need several gigabytes.
     for row, row_scored, row_normals, row_truth in zip(errors, scored, normals, ground_truth, strict=True):
         row[row_scored] = angle_between_deg(row_normals[row_scored], row_truth[row_scored])
     return errors
 
 
 def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
-    """Summary of an error map or list, NaN left out; None where nothing is left."""
+    """Return the statistics of angular errors in degrees of any shape, without NaN; None if all are NaN."""
     errors = errors_deg[np.isfinite(errors_deg)].astype(np.float64)
     if not errors.size:
         return None

@@ -1,4 +1,4 @@
-"""Unit normals: length, angles, and the pictures they are stored in.
+"""Unit normals: length, angles, and their encoding as RGB images.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
@@ -12,23 +12,24 @@ from numpy.typing import NDArray
 
 Convention = Literal["opengl", "directx"]
 
-# A picture's background may be gray, the code of the zero vector: a real normal is never so short.
+# The background of an encoded image may be gray, which stands for the zero vector. No real normal is this short.
 SHORTEST_IN_PICTURE = 0.5
 
 _Float = TypeVar("_Float", bound=np.floating)
 
 
 def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
-    """Scale vectors (..., 3) to unit length; zero vectors stay zero."""
+    """Scale vectors (..., 3) to unit length. Zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     scaled: NDArray[_Float] = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
     return scaled
 
 
 def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Angles in degrees between unit vectors a and b (..., 3), float64.
+    """Return the angles (...) in degrees between unit vectors a and b (..., 3), float64.
 
-    By atan2 of the cross and the dot product: exact near 0 and 180 degrees, where acos loses half its digits.
+    Uses atan2 of the cross and the dot product, which is accurate near 0 and 180 degrees, where acos loses half its
+    digits.
     """
     a64, b64 = np.asarray(a, np.float64), np.asarray(b, np.float64)
     sine = np.linalg.norm(np.cross(a64, b64), axis=-1)
@@ -44,21 +45,24 @@ def encode_picture(
     bits: int = 16,
     convention: Convention = "opengl",
 ) -> NDArray[np.unsignedinteger]:
-    """A normal map (H, W, 3) as an RGB picture, (n + 1) / 2 in 8 or 16 bits; black outside the mask (H, W).
+    """Encode a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
 
-    "opengl" keeps green for y up; "directx" flips it.
+    A component n becomes (n + 1) / 2 of full scale. Green points up with "opengl" and down with "directx".
     """
     signs = np.array([1.0, 1.0 if convention == "opengl" else -1.0, 1.0])
     top = 2**bits - 1
     picture = np.empty(normals.shape, np.uint8 if bits == 8 else np.uint16)
-    # Row by row: a picture of many megapixels must not need several copies in float64.
+    # Row by row, so that an image of many megapixels does not need several copies in float64.
     for row, row_normals, row_mask in zip(picture, normals, mask, strict=True):
         row[:] = np.rint((row_normals * signs + 1) / 2 * top) * row_mask[:, None]
     return picture
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
-    """Unit normals (..., 3) from an 8- or 16-bit RGB picture (y up); black and mid-gray become zero vectors."""
+    """Decode an RGB image (..., 3) of 8 or 16 bits, green up, to unit normals.
+
+    Black and middle gray become zero vectors.
+    """
     vectors = picture.astype(np.float64) * 2 / np.iinfo(picture.dtype).max - 1
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     is_normal = picture.any(axis=-1, keepdims=True) & (length > SHORTEST_IN_PICTURE)

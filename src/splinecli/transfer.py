@@ -1,4 +1,4 @@
-"""Between linear values and what is stored for a screen: sRGB's transfer curve (IEC 61966-2-1), and gamma curves."""
+"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1) and gamma curves."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
 
-_LINEAR_BELOW = 0.0031308
+_LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
 
 def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Linear values, cut off at 0 and 1, as 8-bit sRGB."""
+    """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
     values = np.clip(linear, 0, 1)
     power = 1.055 * np.maximum(values, _LINEAR_BELOW) ** (1 / 2.4) - 0.055
     encoded: NDArray[np.uint8] = np.rint(
@@ -23,7 +23,11 @@ def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def parse_transfer(text: str) -> float | None:
-    """The gamma of "gamma:G", 1 for "linear", None for "srgb". Raises UsageError."""
+    """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear", None for "srgb".
+
+    Raises:
+        UsageError: the name is unknown, or G is not between 0.1 and 10.
+    """
     named: dict[str, float | None] = {"linear": 1.0, "srgb": None}
     if text in named:
         return named[text]
@@ -38,7 +42,7 @@ def parse_transfer(text: str) -> float | None:
 
 
 def decode_transfer(stored: NDArray[np.float32], gamma: float | None) -> NDArray[np.float32]:
-    """Linear values of stored ones, both 0 to 1: stored^gamma, or by sRGB's curve for None."""
+    """Decode stored values, 0 to 1, to linear ones: stored^gamma, or the curve of sRGB where gamma is None."""
     if gamma == 1:
         return stored
     if gamma is not None:
