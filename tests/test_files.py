@@ -72,7 +72,7 @@ def test_a_folder_is_written_into_by_one_at_a_time(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with held_folder(folder):
         with (
-            pytest.raises(OutputError, match=r"run: another splinecli process is writing into this folder\. Wait for it"),
+            pytest.raises(OutputError, match=r"run: another splinecli process is writing into this folder"),
             held_folder(folder),
         ):
             pytest.fail("two at once")
