@@ -8,7 +8,7 @@ VOID = {"meta", "link", "img", "input", "br", "hr"}
 
 
 class HtmlPage(HTMLParser):
-    """Attributes by tag and text by the tag around it; fails where an end tag closes nothing or another tag."""
+    """The tags with their attributes, and the text by tag. An end tag that does not match its start tag fails."""
 
     def __init__(self, html: str) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The report parses, stands alone, says what it was given, and takes names for text."""
+"""The report is valid HTML, loads nothing, shows what it was given, and escapes names."""
 
 from __future__ import annotations
 

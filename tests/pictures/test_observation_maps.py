@@ -1,4 +1,4 @@
-"""A cell's colour stands where the cell is, and the rest is gray."""
+"""A cell has its colour at its place in the figure; empty cells are gray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The albedo of a coloured sphere with highlights and cast shadows, whose albedo is known."""
+"""Albedo maps of a coloured sphere with highlights and cast shadows, compared with its known albedo."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.capture import open_capture
+from splinecli.capture import Capture, open_capture
 from splinecli.errors import InputError
 from splinecli.results.albedo import albedo_map
 
 SIZE = 40
-STRENGTHS = np.array(
+INTENSITIES = np.array(
     [(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)]
 )
 LIGHTS = np.array([(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)])
@@ -22,7 +22,7 @@ LIGHTS = np.array([(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, 
 
 @pytest.fixture
 def scene(tmp_path: Path):
-    """A capture's folder, true normals and true albedo; some pixels shine or lie in shadow under one light each."""
+    """Folder, true normals and true albedo of a capture; some pixels have a highlight or a shadow under one light."""
     lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
     y, x = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
     nx, ny = x / (SIZE / 2), -y / (SIZE / 2)
@@ -31,20 +31,20 @@ def scene(tmp_path: Path):
     normals = np.where(inside[..., None], np.stack((nx, ny, nz), axis=-1), 0).astype(np.float32)
     rng = np.random.default_rng(0)
     albedo = np.where(inside[..., None], rng.uniform(0.1, 0.6, (SIZE, SIZE, 3)), 0)
-    for number, (light, strength) in enumerate(zip(lights, STRENGTHS, strict=True)):
+    for number, (light, intensity) in enumerate(zip(lights, INTENSITIES, strict=True)):
         image = albedo * (normals @ light).clip(0)[..., None]
         image[number::12] *= 0.1  # cast shadow on every twelfth row
         image[:, number::12] += 0.2  # highlights on every twelfth column
-        stored = np.rint((image * strength).clip(0, 1) * 65535).astype(np.uint16)
+        stored = np.rint((image * intensity).clip(0, 1) * 65535).astype(np.uint16)
         cv2.imwrite(str(tmp_path / f"{number}.png"), stored[..., ::-1])
     np.savetxt(tmp_path / "lights.txt", lights)
-    np.savetxt(tmp_path / "light_intensities.txt", STRENGTHS)
+    np.savetxt(tmp_path / "light_intensities.txt", INTENSITIES)
     cv2.imwrite(str(tmp_path / "mask.png"), inside.astype(np.uint8) * 255)
     return tmp_path, normals, albedo
 
 
 def test_restored_pixels_do_not_spoil_it(scene):
-    """Overexposed, stored colours are too dark; the others tell the albedo."""
+    """The stored colours of overexposed pixels are too dark, so their other observations give the albedo."""
     folder, normals, albedo = scene
     for path in folder.glob("[0-9].png"):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
@@ -56,12 +56,32 @@ def test_restored_pixels_do_not_spoil_it(scene):
     found = albedo_map(source, capture, normals)[inside] / (2.5 * albedo[inside])
     touched = (capture.observations > stored).any(axis=1)
     assert 0.2 < touched.mean() < 0.9
-    # Highlights and shadows are in it, as below.
+    # This includes highlights and shadows, as below.
     assert np.median(found[touched]) == pytest.approx(1, abs=0.02)
     assert np.quantile(found, 0.99) < 1.5
 
 
-def test_strengths_that_were_estimated_count(scene):
+def test_the_capture_names_its_restored_observations(scene):
+    """Their colours have next to no weight, even if they differ from the restored values by 0.5 % only."""
+    folder, normals, albedo = scene
+    source = open_capture(folder)
+    capture = source.read()
+    first = folder / "0.png"
+    picture = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(first), np.rint(picture * 0.995).astype(np.uint16))
+    restored = np.zeros(capture.observations.shape, bool)
+    restored[:, 0] = True
+    inside = normals.any(axis=2)
+
+    def error(capture: Capture) -> float:
+        found = albedo_map(source, capture, normals)
+        return float(np.median(np.abs(found / np.where(albedo > 0, albedo, 1) - 1)[inside]))
+
+    assert error(replace(capture, restored=restored)) < 1e-4
+    assert error(capture) > 5e-4
+
+
+def test_colours_are_divided_by_estimated_intensities(scene):
     folder, normals, _ = scene
     source = open_capture(folder)
     capture = source.read()
@@ -83,10 +103,10 @@ def test_albedo_in_colour(scene):
     inside = normals.any(axis=2)
     assert not found[~inside].any()
     error = np.abs(found - albedo)[inside] / albedo[inside]
-    # A highlight that is weaker than 30 % of the albedo under its light passes for matte.
+    # A highlight weaker than 30 % of the albedo under its light counts as matte.
     assert np.median(error) < 1e-3
     assert np.quantile(error, 0.99) < 0.12
-    # The plain mean over the lights, to see that the others matter here.
+    # The plain mean over the lights is wrong here, so the choice of observations matters.
     capture = source.read()
     plain = (capture.observations / (normals[inside] @ capture.light_directions.T).clip(0.15)).mean(axis=1)
     assert np.quantile(np.abs(plain / albedo[inside].mean(axis=1) - 1), 0.9) > 0.2
