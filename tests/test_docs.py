@@ -148,6 +148,26 @@ def test_exit_codes():
         assert word in codes[str(error.exit_code)]
 
 
+def test_python_page(tmp_path, monkeypatch):
+    """Its code runs, from top to bottom; here with least squares, which takes no time."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(REPOSITORY / "examples")
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text_of("docs/python.md"), re.DOTALL))
+    for before, after in (
+        ("light_intensities=light_intensities", 'light_intensities=light_intensities, method="ls"'),
+        ('make_estimator("spline-net")', 'make_estimator("ls")'),
+        ("InferOptions(", 'InferOptions(method="ls", '),
+    ):
+        assert code.count(before) == 1
+        code = code.replace(before, after)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert names["heights"].shape == names["capture"].mask.shape
+    assert names["estimate"].errors.mean < 7
+    assert names["report"]["capture"] == "medallion"
+    assert (tmp_path / "results/medallion/albedo.png").is_file()
+
+
 def test_fields_of_the_report():
     """The table of report.json names each of its fields, and no other."""
     golden = text_of("tests/golden/report_ls.json")
