@@ -1,0 +1,56 @@
+"""The options of `info`, and the lines of its report."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError
+from pathlib import Path
+
+import pytest
+
+from splinecli.pipeline.info import ORIGINS, InfoOptions, summary_lines
+
+REPORT = {
+    "capture": "cat",
+    "layout": "plain folder",
+    "images": 2,
+    "image_kinds": [{"size": [30, 20], "channels": 3, "type": "uint8"}],
+    "n_pixels": 600,
+    "light_directions": "cat/lights.txt",
+    "light_intensities": None,
+    "mask": None,
+    "ground_truth": None,
+    "elevation_deg": [31.4, 88.6],
+    "white_level": {"value": 255.0, "origin": "full scale"},
+    "exposure": {"bright": [0.25, 0.5], "saturated": 0.0123},
+    "expect": {"memory_mib": 701, "seconds": 3},
+    "warnings": [],
+}
+
+
+def test_options_are_frozen() -> None:
+    options = InfoOptions(capture=Path("cat"))
+    with pytest.raises(FrozenInstanceError):
+        options.white_level = 4095  # type: ignore[misc]
+
+
+def test_lines_of_a_report() -> None:
+    assert summary_lines(REPORT) == [
+        "capture      cat (plain folder)",
+        "images       2: 30 x 20, RGB, 8 bits",
+        "lights       cat/lights.txt, 31 to 89 degrees above the image plane",
+        "intensities  none: equal, or estimated where equal ones do not fit",
+        "mask         none: all pixels (600 pixels)",
+        "ground truth none",
+        "white level  255, the full scale of the files",
+        "exposure     brightest 1 % from 25 to 50 % of the white level, at most 1.2 % of an image saturated",
+        "expect       701 MiB, about 3 s on a laptop",
+    ]
+    assert "white level  none: floating-point" in summary_lines({**REPORT, "white_level": None})
+
+
+def test_every_origin_of_a_white_level_has_words() -> None:
+    from typing import get_args
+
+    from splinecli.capture.restore.white_level import Origin
+
+    assert ORIGINS.keys() == set(get_args(Origin))
