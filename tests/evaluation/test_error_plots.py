@@ -13,7 +13,7 @@ from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
 from splinecli.evaluation.outcome import Evaluation, Result
 from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import method_names
-from splinecli.pictures.plotting import method_looks
+from splinecli.pictures.plotting import method_styles
 
 METHODS = ("ls", "spline-net")
 
@@ -59,21 +59,21 @@ def test_a_panel_for_each_capture_and_the_average(captures: list[str], across: i
 
 
 def test_each_method_has_its_colour_in_both_plots() -> None:
-    looks = method_looks(METHODS)
+    styles = method_styles(METHODS)
     for png in (
         lights_curves([evaluation_of(["ball"], k) for k in (4, 10, 32)]),
         light_noise_curves([evaluation_of(["ball"], 10, noise) for noise in (0, 2, 4)]),
     ):
         for method in METHODS:
-            assert share_of(looks[method].colour, decode(png)) > 0.002  # a line 3 pixels thick
+            assert share_of(styles[method].colour, decode(png)) > 0.002  # a line 3 pixels thick
 
 
-def test_looks_are_fixed_and_all_different() -> None:
-    everyone = method_looks(method_names())
-    assert len({look.colour for look in everyone.values()}) == len(everyone)
-    assert len({look.marker for look in everyone.values()}) == len(everyone)
-    assert method_looks(["ls"])["ls"] == everyone["ls"]
-    assert method_looks(["new", "ls"])["ls"] == everyone["ls"]
+def test_styles_are_fixed_and_all_different() -> None:
+    everyone = method_styles(method_names())
+    assert len({style.colour for style in everyone.values()}) == len(everyone)
+    assert len({style.marker for style in everyone.values()}) == len(everyone)
+    assert method_styles(["ls"])["ls"] == everyone["ls"]
+    assert method_styles(["new", "ls"])["ls"] == everyone["ls"]
 
 
 def test_captures_that_not_all_have_are_left_out() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from splinecli.pictures.plotting import Look, method_looks, png_bytes
+from splinecli.pictures.plotting import MethodStyle, method_styles, png_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +63,7 @@ def error_curves(panels: Sequence[Panel], *, label: str, logarithmic: bool = Fal
 
     methods = list(dict.fromkeys(method for method, _ in panels[0].curves))
     series = list(dict.fromkeys(name for _, name in panels[0].curves))
-    looks = method_looks(methods)
+    styles = method_styles(methods)
     dashes = {name: _DASHES[i % len(_DASHES)] for i, name in enumerate(series)}
     across = 2 if len(panels) == 4 else min(len(panels), _MOST_ACROSS)
     down = math.ceil(len(panels) / across)
@@ -74,30 +74,30 @@ def error_curves(panels: Sequence[Panel], *, label: str, logarithmic: bool = Fal
         axes.set_axis_off()
     for panel, axes in zip(panels, places, strict=False):
         for (method, name), points in panel.curves.items():
-            _draw_curve(axes, points, looks[method], dashes[name])
+            _draw_curve(axes, points, styles[method], dashes[name])
         _set_x_axis(axes, panel.ticks, logarithmic=logarithmic)
         _finish(axes, panel.title, label)
-    _add_legend(figure, looks, dashes, across)
+    _add_legend(figure, styles, dashes, across)
     return png_bytes(figure, _DPI)
 
 
-def _draw_curve(axes: Axes, points: Sequence[Point], look: Look, dashes: _Dashes) -> None:
+def _draw_curve(axes: Axes, points: Sequence[Point], style: MethodStyle, dashes: _Dashes) -> None:
     x, mae_deg, std_deg = np.array(points).T
     axes.plot(
-        x, mae_deg, color=look.colour, marker=look.marker, markersize=4, linewidth=1.2, linestyle=dashes
+        x, mae_deg, color=style.colour, marker=style.marker, markersize=4, linewidth=1.2, linestyle=dashes
     )
     if std_deg.any():
-        axes.fill_between(x, mae_deg - std_deg, mae_deg + std_deg, color=look.colour, alpha=0.2, linewidth=0)
+        axes.fill_between(x, mae_deg - std_deg, mae_deg + std_deg, color=style.colour, alpha=0.2, linewidth=0)
 
 
 def _add_legend(
-    figure: Figure, looks: Mapping[str, Look], dashes: Mapping[str, _Dashes], across: int
+    figure: Figure, styles: Mapping[str, MethodStyle], dashes: Mapping[str, _Dashes], across: int
 ) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=look.colour, marker=look.marker, markersize=4, label=_plain(method))
-        for method, look in looks.items()
+        Line2D([], [], color=style.colour, marker=style.marker, markersize=4, label=_plain(method))
+        for method, style in styles.items()
     ]
     if len(dashes) > 1:
         handles += [

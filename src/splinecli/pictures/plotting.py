@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Look(NamedTuple):
+class MethodStyle(NamedTuple):
     """The style of a line: matplotlib's names of a colour and a marker."""
 
     colour: str
@@ -22,8 +22,8 @@ class Look(NamedTuple):
 
 # The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can distinguish. Gray
 # replaces their yellow, which is too light for a line on white. The markers help in prints without colour.
-_LOOKS = tuple(
-    Look(colour, marker)
+_STYLES = tuple(
+    MethodStyle(colour, marker)
     for colour, marker in zip(
         ("#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080"),
         "osD^vXP*",
@@ -32,14 +32,14 @@ _LOOKS = tuple(
 )
 
 
-def method_looks(methods: Sequence[str]) -> dict[str, Look]:
+def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
     """Return the style of each method. It depends on the registry's order, so it is the same in every plot.
 
     Names that are not in the registry follow in their order.
     """
     known = method_names()
     places = known + [name for name in methods if name not in known]
-    return {name: _LOOKS[places.index(name) % len(_LOOKS)] for name in methods}
+    return {name: _STYLES[places.index(name) % len(_STYLES)] for name in methods}
 
 
 def png_bytes(figure: Figure, dpi: int) -> bytes:
