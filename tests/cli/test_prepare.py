@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -175,6 +176,26 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     refused = run("prepare", capture, "-o", "raw")
     assert refused.code == 5
     assert "was made with reading = 'as stored', not 'restored'" in refused.err
+
+
+def test_a_white_level_is_used_and_named(run, capture):
+    for index in range(8):
+        path = capture / f"image{index + 1}.png"
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 16
+        cv2.imwrite(str(path), picture)
+    assert run("prepare", capture, "-o", "set", "--white-level", 3500, "--quiet").code == 0
+    assert run("prepare", capture, "-o", "set", "--white-level", 3500, "--quiet").code == 0
+    refused = run("prepare", capture, "-o", "set")
+    assert refused.code == 5
+    assert "was made with white_level = 3500.0, not None" in refused.err
+
+
+def test_a_missing_extra_is_named_before_captures_are_read(run, capture, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    result = run("prepare", capture, "--scenes", 1, "-o", "set")
+    assert (result.code, result.out) == (2, "")
+    assert "splinecli[render]" in result.err
+    assert not Path("set").exists()
 
 
 def test_the_help_gives_the_defaults_of_rendered_scenes(run):

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import AsStoredOption, JsonOption, QuietOption, SeedOption, UpdateOption
+from splinecli.cli.options import (
+    AsStoredOption,
+    JsonOption,
+    QuietOption,
+    SeedOption,
+    UpdateOption,
+    WhiteLevelOption,
+)
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -27,6 +34,7 @@ def prepare(
         typer.Argument(metavar="SOURCE", help="Captures with ground truth, folders of them, CyclesPS trees."),
     ] = None,
     as_stored: AsStoredOption = False,
+    white_level: WhiteLevelOption = None,
     update: UpdateOption = False,
     scenes: Annotated[int, typer.Option(metavar="N", min=0, help="Render N random scenes.")] = 0,
     mesh: Annotated[
@@ -72,6 +80,7 @@ def prepare(
         captures=tuple(folder for source in sources or [] for folder in find_captures(source)),
         scenes=_plan(scenes, mesh or [], seed, size, lights, measured, measured_share),
         as_stored=as_stored,
+        white_level=white_level,
         update=update,
     )
     summary = prepare_pixel_set(options, Messages(quiet=quiet))

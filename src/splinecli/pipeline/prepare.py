@@ -28,6 +28,7 @@ class PrepareOptions:
         captures: folders of captures with ground truth.
         scenes: the scenes to render.
         as_stored: use the stored values of captures alone, see add_capture.
+        white_level: stored value from which a pixel of a capture counts as saturated; None to find it.
         update: read captures again that changed since they were added.
 
     Raises:
@@ -38,6 +39,7 @@ class PrepareOptions:
     captures: tuple[Path, ...]
     scenes: ScenePlan
     as_stored: bool = False
+    white_level: float | None = None
     update: bool = False
 
     def __post_init__(self) -> None:
@@ -101,7 +103,14 @@ def _add_capture(
 ) -> SplinecliError | None:
     """Add a capture, or return why it cannot be used. Raises OutputError if the set cannot be written."""
     try:
-        add_capture(writer, name, folder, as_stored=options.as_stored, update=options.update)
+        add_capture(
+            writer,
+            name,
+            folder,
+            as_stored=options.as_stored,
+            white_level=options.white_level,
+            update=options.update,
+        )
     except (InputError, CaptureChangedError) as error:
         return error
     except OSError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,7 +54,13 @@ def free_name(name: str, is_taken: Callable[[str], bool]) -> str:
 
 
 def add_capture(
-    writer: PixelSetWriter, name: str, folder: Path, *, as_stored: bool = False, update: bool = False
+    writer: PixelSetWriter,
+    name: str,
+    folder: Path,
+    *,
+    as_stored: bool = False,
+    white_level: float | None = None,
+    update: bool = False,
 ) -> None:
     """Read a capture and write its pixels with ground truth, unless the set has them.
 
@@ -67,6 +73,7 @@ def add_capture(
         folder: the capture.
         as_stored: use the stored values alone. By default, saturated observations are restored and unknown light
             intensities are estimated, as `infer` does.
+        white_level: stored value from which a pixel counts as saturated; None to find it in the images.
         update: replace an entry whose capture changed.
 
     Raises:
@@ -74,11 +81,13 @@ def add_capture(
         CaptureChangedError: the capture changed since its entry was made, and `update` is not set.
         OutputError: the entry cannot be written.
     """
-    source = open_capture(folder)
-    recipe = {
+    source = open_capture(folder, white_level=white_level)
+    recipe: dict[str, Any] = {
         "source": str(folder.resolve()),
-        "files": digest(stamp_capture(source)),
         "reading": AS_STORED if as_stored else RESTORED,
+        "white_level": white_level,
+        # The stamp depends on the white level too, so it is compared last.
+        "files": digest(stamp_capture(source)),
     }
     if name in writer:
         difference = writer.difference(name, recipe)

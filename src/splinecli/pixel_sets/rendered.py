@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from splinecli.errors import InputError, OutputError
+from splinecli.extras import import_extra
 from splinecli.files import file_sha256
 from splinecli.pixel_sets.captures import free_name
 from splinecli.pixel_sets.store import Pixels
@@ -77,7 +78,15 @@ class ScenePlan:
         return None if self.measured_materials is None else file_sha256(self.measured_materials)
 
     def check_inputs(self) -> None:
-        """Read every mesh and the measured materials. Raises InputError if one cannot be used."""
+        """Check what rendering needs, before anything is rendered.
+
+        Raises:
+            InputError: a mesh or the file of measured materials cannot be used.
+            UsageError: there are scenes and the packages of the extra `render` are not installed.
+        """
+        if self.names:
+            for package in ("embreex.rtcore_scene", "trimesh", "skimage.measure"):
+                import_extra(package, "render")
         for path in self.meshes:
             read_mesh(path)
         _ = self.library
