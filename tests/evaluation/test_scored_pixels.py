@@ -31,7 +31,7 @@ def test_pixels_without_ground_truth_go(capture: Capture) -> None:
     wanted[:, 3:5] = False
     rows = scored_rows(capture)
     np.testing.assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
-    kept = StoredCapture(capture, None, knows_intensities=True).choose_pixels(rows).capture
+    kept = StoredCapture(capture, None, intensities_known=True).choose_pixels(rows).capture
     np.testing.assert_array_equal(kept.mask, wanted)
     np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
     assert kept.light_indices == (4, 7, 9)
