@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
-
-import torch
+from typing import TYPE_CHECKING, Literal
 
 from splinecli.errors import UsageError
+
+if TYPE_CHECKING:
+    import torch
 
 _CGROUPS = Path("/sys/fs/cgroup")
 
@@ -21,6 +22,8 @@ def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
     """
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
+    import torch
+
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise UsageError("no CUDA device was found", hint="Use --device cpu or auto")
@@ -33,6 +36,8 @@ def choose_precision(
     """Return the number format of this name; "auto" is bfloat16 where the device computes natively in it."""
     if name != "auto":
         return name
+    import torch
+
     if device.type == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     # A CPU without the instructions emulates bfloat16, which is slower than float32.
@@ -46,6 +51,8 @@ def use_available_cores() -> int:
     may use only some of them. The threads then take turns, and each step waits for the last one. The number is only
     ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep their effect.
     """
+    import torch
+
     threads = min(torch.get_num_threads(), count_available_cores())
     if threads < torch.get_num_threads():
         torch.set_num_threads(threads)
@@ -113,5 +120,7 @@ def _read_fields(path: Path) -> list[str]:
 
 
 def _cpu_has_bfloat16() -> bool:
+    import torch
+
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16") or capabilities.get("bf16"))

@@ -278,3 +278,61 @@ def test_all_methods_by_one_word(dataset, run):
     from splinecli.methods import method_names
 
     assert [result["method"] for result in document["results"]] == method_names()
+
+
+def test_the_white_level_is_used_and_named(overexposed, run):
+    """A level below the image values makes the values above it saturated, so they are restored."""
+    arguments = ["evaluate", overexposed, "--method", "ls", "--n-lights", "all", "--json"]
+    plain = json.loads(run(*arguments).out)
+    lower = json.loads(run(*arguments, "--white-level", 50_000).out)
+    assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
+    assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
+    assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--pixel", "3,4"],
+        ["--skip-first", "cow=3"],
+        ["--draws", "draws.txt"],
+        ["--light-noise-deg", 40],
+        ["--white-level", 0],
+        ["--n-lights", 9],
+        ["--weights", "spline-net"],
+        ["--method", "cnn-ps", "--weights", "spline-net"],
+    ],
+)
+def test_arguments_are_checked_before_any_image_is_read(dataset, run, monkeypatch, arguments):
+    from splinecli.capture import CaptureSource
+
+    def fail(*_, **__):
+        raise AssertionError("an image was read")
+
+    monkeypatch.setattr(CaptureSource, "read_stored", fail)
+    Path("draws.txt").write_text("1 2 two\n")
+    method = [] if "--method" in arguments else ["--method", "ls"]
+    result = run("evaluate", dataset, *method, *arguments)
+    assert result.code in (2, 3, 4)
+    assert "AssertionError" not in result.err
+    assert not Path("evaluation").exists()
+
+
+def test_an_unreadable_file_skips_its_capture(dataset, run, monkeypatch):
+    """Permissions do not stop the superuser, so the refusal is simulated."""
+    from splinecli.capture import source
+
+    decode = source.decode_image
+
+    def refuse(path, *arguments):
+        if path.parent.name == "matte":
+            raise PermissionError(13, "Permission denied", str(path))
+        return decode(path, *arguments)
+
+    monkeypatch.setattr(source, "decode_image", refuse)
+    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")
+    assert result.code == 3
+    document = json.loads(result.out)
+    assert [entry["capture"] for entry in document["skipped"]] == ["matte"]
+    assert ".png: cannot be read (Permission denied)" in document["skipped"][0]["reason"]
+    assert [entry["capture"] for entry in document["results"]] == ["shaded"]

@@ -117,7 +117,8 @@ JSON = """\
   "light_noise_deg": 0.0,
   "max_pixels": 500,
   "skip_first": {},
-  "as_stored": false
+  "as_stored": false,
+  "white_level": null
  },
  "methods": {},
  "results": [

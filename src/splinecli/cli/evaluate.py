@@ -22,6 +22,7 @@ from splinecli.cli.options import (
     RotationsOption,
     SeedOption,
     WeightsOption,
+    WhiteLevelOption,
     complete_methods,
     parse_indices,
 )
@@ -69,6 +70,7 @@ def evaluate(
         ),
     ] = None,
     as_stored: AsStoredOption = False,
+    white_level: WhiteLevelOption = None,
     max_pixels: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Score N random pixels of each capture.")
     ] = None,
@@ -134,6 +136,7 @@ def evaluate(
         max_pixels=max_pixels,
         skip_first=dict(_skip(text) for text in skip_first or []),
         as_stored=as_stored,
+        white_level=white_level,
         jobs=jobs,
         figures=figures,
         pixels=tuple(_pixel(text) for text in pixel or []),

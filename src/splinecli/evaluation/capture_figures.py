@@ -60,7 +60,7 @@ def capture_figures(
         InputError: the capture cannot be read or scored.
         UsageError: a pixel has no ground truth.
     """
-    source = open_capture(folder)
+    source = open_capture(folder, white_level=protocol.white_level)
     trial = first_trial(source, name, protocol)
     lights = range(protocol.skipped_lights(name), source.n_lights)
     advance = on_progress or (lambda share: None)

@@ -96,6 +96,7 @@ def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
         "max_pixels": first.max_pixels,
         "skip_first": dict(first.skip_first),
         "as_stored": first.as_stored,
+        "white_level": first.white_level,
     }
 
 

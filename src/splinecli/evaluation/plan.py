@@ -91,7 +91,7 @@ class CaptureJob:
     ) -> CaptureJob | None:
         """Return the job of a capture. Returns None where no protocol can score it; the tasks then hold the reasons."""
         try:
-            source = open_capture(folder)
+            source = open_capture(folder, white_level=tasks[0].protocol.white_level)
             stamp = stamp_capture(source)
         except (InputError, UsageError, OSError) as error:
             for task in tasks:

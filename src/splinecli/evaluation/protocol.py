@@ -30,6 +30,7 @@ class Protocol:
             first 20 images of DiLiGenT's Bear are damaged.
         as_stored: score the stored values alone, as the published tables do. By default, saturated observations are
             restored and unknown light intensities are estimated, as `infer` does.
+        white_level: stored value from which an observation is saturated; None to find it, see open_capture.
 
     Raises:
         UsageError: a value is out of its range.
@@ -43,6 +44,7 @@ class Protocol:
     max_pixels: int | None = None
     skip_first: Mapping[str, int] = field(default_factory=dict)
     as_stored: bool = False
+    white_level: float | None = None
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
@@ -89,5 +91,7 @@ def protocol_in_words(protocol: Protocol) -> str:
     parts.append(f"seed {protocol.seed}")
     if protocol.max_pixels is not None:
         parts.append(f"at most {protocol.max_pixels} pixels of each capture")
+    if protocol.white_level is not None:
+        parts.append(f"white level {protocol.white_level:g}")
     parts.append("images as stored" if protocol.as_stored else "images restored")
     return ", ".join(parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture import find_captures, open_capture
+from splinecli.devices import count_available_cores
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems
 from splinecli.evaluation.files import TRIALS, make_plots, write_figures, write_results
@@ -38,7 +39,7 @@ class EvaluateOptions:
             DEFAULT_LIGHTS, or for the number in the draws file.
         light_noise_deg: standard deviations of the light noise; one evaluation for each.
         trials: number of random draws; None for DEFAULT_TRIALS.
-        seed, max_pixels, skip_first, as_stored: see Protocol.
+        seed, max_pixels, skip_first, as_stored, white_level: see Protocol.
         draws: path of a draws file, in place of random draws.
         jobs: number of trials at a time; None for the cores, or for 1 on a GPU.
         figures: whether to draw the methods' maps of the first draw of each capture.
@@ -60,6 +61,7 @@ class EvaluateOptions:
     max_pixels: int | None = None
     skip_first: dict[str, int] = field(default_factory=dict)
     as_stored: bool = False
+    white_level: float | None = None
     jobs: int | None = None
     figures: bool = False
     pixels: tuple[tuple[int, int], ...] = ()
@@ -67,6 +69,8 @@ class EvaluateOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        if self.white_level is not None and not 0 < self.white_level < math.inf:
+            raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
         if self.draws is not None and self.n_lights:
             raise UsageError(
                 "--draws and --n-lights exclude each other", hint="The draws say how many lights"
@@ -98,6 +102,7 @@ class EvaluateOptions:
                 self.max_pixels,
                 self.skip_first,
                 self.as_stored,
+                self.white_level,
             )
             for count, noise in product(dict.fromkeys(counts), dict.fromkeys(self.light_noise_deg))
         ]
@@ -184,7 +189,7 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
 def _default_jobs(estimators: Sequence[Estimator]) -> int:
     if any(estimator.device.startswith("cuda") for estimator in estimators):
         return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return count_available_cores()
 
 
 def _follow(advance: Callable[..., None]) -> Callable[[float, int, str], None]:
