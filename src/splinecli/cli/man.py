@@ -78,7 +78,7 @@ EXAMPLES = (
     ("splinecli calibrate chrome/ -o lights", "Light directions from photographs of a mirror ball."),
     (
         "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights",
-        "With the outline given, and with the lights' strengths.",
+        "With a given outline of the ball, and with light intensities.",
     ),
     ("splinecli integrate results/cat", "Depth and mesh of a normal map that infer wrote."),
     (
