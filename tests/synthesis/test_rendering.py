@@ -11,10 +11,11 @@ from torch import Tensor
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
+from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import Tracer
-from splinecli.synthesis.rendering import SOFTEST, look, render_direct, render_indirect, soften
+from splinecli.synthesis.rendering import SOFTEST, render_direct, render_indirect, soften
 
 
 @dataclass(frozen=True)
@@ -68,18 +69,18 @@ def directions(*vectors: tuple[float, float, float]) -> np.ndarray:
 
 def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
     tracer = Tracer(ball(0.9, polar=90, inward=False))
-    view = look(tracer, 64, 3)
-    centres = pixel_centres(view.mask)
+    visible = find_visible_surface(tracer, 64, 3)
+    centres = pixel_centres(visible.mask)
     assert (np.hypot(*centres.T) < 0.9).all()
     # Four fifths of the radius: the outermost pixels are cut by the outline or seen at a grazing angle.
-    assert view.mask.sum() > 0.8 * np.pi * (0.45 * 64) ** 2
+    assert visible.mask.sum() > 0.8 * np.pi * (0.45 * 64) ** 2
     x, y = (centres / 0.9).T
     normals = np.stack((x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))), axis=1)
     well_inside = normals[:, 2] > 0.4
-    off = np.degrees(np.arccos(np.clip((normals * view.normals).sum(axis=1), -1, 1)))
+    off = np.degrees(np.arccos(np.clip((normals * visible.normals).sum(axis=1), -1, 1)))
     assert off[well_inside].max() < 0.3
     lights = directions((0, 0, 1), (0.5, 0.3, 0.8), (-0.7, 0.6, 0.2))
-    parts = (tracer, view, lights, matte(0.7), np.zeros(len(tracer.mesh.faces), np.int64))
+    parts = (tracer, visible, lights, matte(0.7), np.zeros(len(tracer.mesh.faces), np.int64))
     direct = render_direct(*parts)["matte"].numpy()
     expected = 0.7 * np.maximum(normals @ lights.T, 0)
     # Cells of the terminator are half lit; elsewhere the mean over a pixel is its middle's value, nearly.
@@ -102,11 +103,11 @@ def floor_with_wall() -> Mesh:
 
 def test_a_wall_casts_its_shadow() -> None:
     tracer = Tracer(floor_with_wall())
-    view = look(tracer, 50, 2)
+    visible = find_visible_surface(tracer, 50, 2)
     # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there is none.
     lights = directions((1, 0, 1), (-1, 0, 1))
-    direct = render_direct(tracer, view, lights, matte(1.0), np.zeros(4, np.int64))["matte"].numpy()
-    x = pixel_centres(view.mask)[:, 0]
+    direct = render_direct(tracer, visible, lights, matte(1.0), np.zeros(4, np.int64))["matte"].numpy()
+    x = pixel_centres(visible.mask)[:, 0]
     in_shadow = (x > -0.2 + 0.04) & (x < 0.2 - 0.04)
     in_light = (x < -0.2 - 0.04) | (x > 0.2 + 0.04)
     assert np.abs(direct[in_shadow, 0]).max() == 0
@@ -126,9 +127,9 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
     # what is spread a half meets the bowl again.
     rho, radius = 0.8, 0.9
     tracer = Tracer(ball(radius, polar=90, inward=True))
-    view = look(tracer, 24, 3)
+    visible = find_visible_surface(tracer, 24, 3)
     lights = directions((0, 0, 1))
-    parts = (tracer, view, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
+    parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
     indirect = render_indirect(
         *parts, directions=256, bounces=bounces, generator=torch.Generator().manual_seed(0)
     )["matte"].numpy()[:, 0]
@@ -136,7 +137,7 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
     expected = rho * rho / 4 * (1 - again**bounces) / (1 - again)
     assert indirect.mean() == pytest.approx(expected, rel=0.02)
     # The same at the bottom and near the rim.
-    distance = np.hypot(*pixel_centres(view.mask).T)
+    distance = np.hypot(*pixel_centres(visible.mask).T)
     for part in (distance < 0.4, distance > 0.65):
         assert indirect[part].mean() == pytest.approx(expected, rel=0.05)
 
@@ -145,9 +146,9 @@ def test_slanting_light_in_a_bowl_is_conserved() -> None:
     # The flux through the mouth is pi R^2 cos(angle) whatever part of the wall it meets.
     radius, rho = 0.9, 0.6
     tracer = Tracer(ball(radius, polar=90, inward=True))
-    view = look(tracer, 24, 3)
+    visible = find_visible_surface(tracer, 24, 3)
     lights = directions((0.6, 0, 0.8))
-    parts = (tracer, view, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
+    parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
     indirect = render_indirect(*parts, directions=256, bounces=1, generator=torch.Generator().manual_seed(1))[
         "matte"
     ].numpy()
@@ -156,7 +157,7 @@ def test_slanting_light_in_a_bowl_is_conserved() -> None:
 
 def test_several_materials_share_one_tracing() -> None:
     tracer = Tracer(ball(0.9, polar=90, inward=True))
-    view = look(tracer, 12, 2)
+    visible = find_visible_surface(tracer, 12, 2)
     lights = directions((0, 0, 1), (0.5, 0, 1))
     patches = np.zeros(len(tracer.mesh.faces), np.int64)
     together = {"half": Matte(torch.full((1, 1), 0.5)), "full": Matte(torch.full((1, 1), 1.0))}
@@ -164,7 +165,7 @@ def test_several_materials_share_one_tracing() -> None:
     def indirect(materials: dict[str, Matte]) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(2)
         return render_indirect(
-            tracer, view, lights, materials, patches, directions=32, bounces=1, generator=generator
+            tracer, visible, lights, materials, patches, directions=32, bounces=1, generator=generator
         )
 
     both = indirect(together)
@@ -174,11 +175,11 @@ def test_several_materials_share_one_tracing() -> None:
 
 def test_patches_have_their_own_material() -> None:
     tracer = Tracer(floor_with_wall())
-    view = look(tracer, 20, 2)
+    visible = find_visible_surface(tracer, 20, 2)
     materials = {"matte": Matte(torch.tensor([[0.25], [1.0]]))}
     patch_of_face = np.array([0, 1, 0, 0])  # the floor's triangles meet on its diagonal y = x
-    direct = render_direct(tracer, view, directions((0, 0, 1)), materials, patch_of_face)["matte"][:, 0]
-    x, y = pixel_centres(view.mask).T
+    direct = render_direct(tracer, visible, directions((0, 0, 1)), materials, patch_of_face)["matte"][:, 0]
+    x, y = pixel_centres(visible.mask).T
     below, above = y < x - 0.11, y > x + 0.11
     np.testing.assert_allclose(direct[below], 0.25, rtol=1e-5)
     np.testing.assert_allclose(direct[above], 1.0, rtol=1e-5)
@@ -189,7 +190,7 @@ def test_pixels_on_the_outline_are_left_out() -> None:
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
     square = Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up)
     # Of 10 pixels, 2 .. 7 lie inside; the edge at -0.5 runs through the middle of the third.
-    mask = look(Tracer(square), 10, 2).mask
+    mask = find_visible_surface(Tracer(square), 10, 2).mask
     assert mask.sum() == 16
     assert mask[3:7, 3:7].all()
 

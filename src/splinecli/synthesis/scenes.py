@@ -1,7 +1,7 @@
-"""Scenes for training, after CyclesPS (Ikehata, "CNN-PS", ECCV 2018): one shape, three classes of materials that
-change over its surface, and directional lights all over the upper hemisphere.
+"""Scenes for training, after CyclesPS (Ikehata, "CNN-PS", ECCV 2018).
 
-A scene is a function of (seed, index) alone, so an interrupted set goes on where it stopped.
+A scene has one shape, three classes of materials that vary over its surface, and directional lights over the whole
+upper hemisphere. It depends only on (seed, index), so an interrupted set can be continued.
 """
 
 from __future__ import annotations
@@ -15,28 +15,33 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
+from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.material import Material
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import Tracer
-from splinecli.synthesis.rendering import look, render_direct, render_indirect
+from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
 CLASSES = ("diffuse", "specular", "metallic")
-# Lights stand at least this high, as a cosine with the viewing direction.
+
 MIN_LIGHT_Z = 0.03
+"""Lowest z of a light, the cosine of its angle to the viewing direction."""
 
 DrawMeasured = Callable[[int, torch.Generator], Material]
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How scenes are drawn and rendered.
+    """Settings for drawing and rendering scenes.
 
-    size: width and height in pixels; lights: F; samples: k of the k x k samples of a pixel; directions: paths
-    a pixel for indirect light; bounces: the most surfaces that light meets before the one that is seen, 0 for
-    direct light alone; measured_share: share of a scene's material classes that are drawn from measured
-    reflectances instead, where there are some.
+    Args:
+        size: width and height in pixels.
+        lights: F, the number of lights.
+        samples: k of the k x k samples per pixel.
+        directions: number of paths per pixel for indirect light.
+        bounces: largest number of reflections before the visible surface; 0 for direct light only.
+        measured_share: share of the material classes that are drawn from measured reflectances, if there are any.
 
     Raises:
         UsageError: a number is out of range.
@@ -60,8 +65,15 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is rendered. name: unique in a set; shape: its kind; lights (F, 3): unit directions to the lights;
-    materials: one reflectance for each of the patches in each class; patch_of_face (T,): rows of those.
+    """A scene before rendering.
+
+    name: unique within a set.
+    shape: kind of the shape.
+    mesh: the shape.
+    lights: (F, 3), unit directions towards the lights.
+    materials: by class, with one row per patch of the surface.
+    patch_of_face: (T,), the patch of each face.
+    seed: seed of the paths of indirect light.
     """
 
     name: str
@@ -75,8 +87,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """A scene's images. mask (H, W); normals (P, 3) unit, pixels row-major; light_directions (F, 3);
-    observations (P, F) float32 by class, of which 1 is matte white that faces the light.
+    """The images of a scene.
+
+    name, shape: as in Scene.
+    mask: (H, W).
+    normals: (P, 3), unit; pixels row-major.
+    light_directions: (F, 3).
+    observations: by class, (P, F) float32; 1 is a matte white surface that faces the light.
     """
 
     name: str
@@ -95,9 +112,13 @@ def draw_scene(
     *,
     draw_measured: DrawMeasured | None = None,
 ) -> Scene:
-    """Scene `index` of the set of a seed; of a given mesh, or of a random shape.
+    """Draw scene number `index` of the set with this seed.
 
-    Patches: thousands (1 000 to 6 000) for 70 % of the scenes, 2 to 40 for 20 %, one for 10 %.
+    The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %.
+
+    Args:
+        mesh: the shape. None draws one at random.
+        draw_measured: draws measured reflectances, for `config.measured_share` of the classes.
 
     Raises:
         UsageError: the extra `render` is not installed.
@@ -112,8 +133,8 @@ def draw_scene(
         measured = torch.rand((), generator=generator) < config.measured_share
         drawn = draw_measured(patches, generator) if draw_measured is not None and measured else None
         materials[name] = draw_class(name, patches, generator) if drawn is None else drawn
-    # The shape comes last: what was drawn before does not depend on how much it draws.
-    # Multiples of the golden ratio: even a set of a few scenes has several kinds.
+    # The shape comes last, because the number of random values that it needs varies.
+    # With multiples of the golden ratio, even a small set has several kinds of shapes.
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
     shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng, place)
     patch_of_face = draw_patches(mesh, patches, rng)
@@ -123,35 +144,39 @@ def draw_scene(
 def render_scene(
     scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None
 ) -> RenderedScene:
-    """The scene in all its materials; `progress` hears the share that is done, from 0 to 1.
+    """Render the scene in all its materials.
+
+    Args:
+        progress: called with the finished share, from 0 to 1.
 
     Raises:
         UsageError: the extra `render` is not installed.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     tracer = Tracer(scene.mesh)
-    view = look(tracer, config.size, config.samples)
-    parts = tracer, view, scene.lights, scene.materials, scene.patch_of_face
+    visible = find_visible_surface(tracer, config.size, config.samples)
+    parts = tracer, visible, scene.lights, scene.materials, scene.patch_of_face
     with torch.inference_mode():
-        radiance = render_direct(*parts, progress=lambda share: tell(0.4 * share))
-        if config.bounces and len(view.normals):
+        radiance = render_direct(*parts, progress=lambda share: report(0.4 * share))
+        if config.bounces and len(visible.normals):
             indirect = render_indirect(
                 *parts,
                 directions=config.directions,
                 bounces=config.bounces,
                 generator=torch.Generator().manual_seed(scene.seed),
-                progress=lambda share: tell(0.4 + 0.6 * share),
+                progress=lambda share: report(0.4 + 0.6 * share),
             )
             for name, received in indirect.items():
                 radiance[name] += received
     observations = {name: values.numpy() for name, values in radiance.items()}
-    return RenderedScene(scene.name, scene.shape, view.mask, view.normals, scene.lights, observations)
+    return RenderedScene(scene.name, scene.shape, visible.mask, visible.normals, scene.lights, observations)
 
 
 def draw_lights(count: int, rng: np.random.Generator) -> Floats:
-    """Directions (count, 3), about uniform over the upper hemisphere.
+    """Draw light directions (count, 3), about uniform over the upper hemisphere.
 
-    A Fibonacci spiral (Gonzalez 2010) turned at random, each light moved by a third of the mean distance.
+    They are a Fibonacci spiral (Gonzalez 2010), turned by a random angle. Each light is then moved by a third of the
+    mean distance.
     """
     order = np.arange(count)
     z = 1 - (1 - MIN_LIGHT_Z) * (order + 0.5) / count
@@ -165,7 +190,7 @@ def draw_lights(count: int, rng: np.random.Generator) -> Floats:
 
 
 def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Rows 0 to patches - 1 for the faces (T,): Voronoi cells about random ones of them."""
+    """Draw the patch of each face (T,), 0 to patches - 1: Voronoi cells around random faces."""
     from scipy.spatial import cKDTree
 
     centres = mesh.vertices[mesh.faces].mean(axis=1)
@@ -174,10 +199,10 @@ def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[
 
 
 def draw_class(name: str, patches: int, generator: torch.Generator) -> PrincipledMaterial:
-    """Random materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
+    """Draw materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
 
-    base U(0, 1); metallic 1 for metals, else 0; specular U(0, 4) of the specular class, else U(0, 1); roughness
-    U(0.3, 0.7) of metals, else U(0, 1); sheen U(0, 1) on a fifth of the others.
+    base: U(0, 1). metallic: 1 for metals, else 0. specular: U(0, 4) for the specular class, else U(0, 1). roughness:
+    U(0.3, 0.7) for metals, else U(0, 1). sheen: U(0, 1) for a fifth of the patches that are not metals.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
