@@ -1,4 +1,4 @@
-"""Captures: photographs of one object under known lights, read from folders of files."""
+"""Captures: images of one object under known lights, read from folders of files."""
 
 from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.capture_warnings import CaptureWarning

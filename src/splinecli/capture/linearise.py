@@ -1,4 +1,4 @@
-"""From what a camera stored to light: the transfer curve undone, ambient light taken off, falloff divided out."""
+"""Linear light from stored values: invert the transfer curve, subtract ambient light, divide by the falloff."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splinecli.capture.formats.images import to_linear
 from splinecli.errors import InputError
 from splinecli.transfer import decode_transfer
 
-_DARKEST_FLAT = 0.02  # of a flat field's mean: darker places do not tell the falloff
+_DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class RadiometricCalibration:
     """How stored values become linear light.
 
     Args:
-        gamma: of the images' transfer curve, 1 for linear ones, None for sRGB's.
-        ambient: an image under ambient light alone, taken off all others.
-        flat_field: images of something evenly white, each divided by its mean: one for each light, or one for all.
+        gamma: exponent of the images' transfer curve; 1 for linear images, None for sRGB.
+        ambient: an image under ambient light alone, which is subtracted from all others.
+        flat_field: images of an evenly white surface, one for each light or one for all. Images are divided by them.
     """
 
     gamma: float | None = 1.0
@@ -34,10 +34,11 @@ class RadiometricCalibration:
 
 
 AS_STORED = RadiometricCalibration()
+"""Stored values are linear light."""
 
 
 class Lineariser:
-    """Develops the pixels of a mask (H, W) of one capture; what all its images share is read once."""
+    """Linearise the pixels of a mask (H, W). The images that all of a capture's images share are read once."""
 
     def __init__(self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int) -> None:
         """Raises InputError: the ambient image cannot be read, or the number of flat fields does not fit."""
@@ -53,7 +54,7 @@ class Lineariser:
         self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
 
     def __call__(self, pixels: NDArray[Any], path: Path, index: int) -> NDArray[np.float32]:
-        """Linear light (P, C) of the mask's pixels (P, C) as stored in image `index`. Raises InputError."""
+        """Return linear light (P, C) from the mask's pixels (P, C), as stored in image `index`. Raises InputError."""
         linear = decode_transfer(to_linear(pixels, path), self.radiometry.gamma)
         if self._ambient is not None:
             linear = np.maximum(linear - self._ambient, 0)

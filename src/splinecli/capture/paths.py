@@ -1,4 +1,4 @@
-"""What lies at a path, where the system may also refuse to tell: names too long, loops of links, no permission."""
+"""What is at a path. The system may refuse to answer: names that are too long, loops of links, no permission."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ StrPath = str | os.PathLike[str]
 
 
 def find_mode(path: Path) -> int | None:
-    """The mode (see stat) of what lies at the path, links followed; None for nothing.
+    """Return the mode (see stat) of what is at the path, following links; None for nothing.
 
     Raises:
-        InputError: the system does not tell.
+        InputError: the system refuses to answer.
     """
     try:
         return path.stat().st_mode
@@ -28,20 +28,20 @@ def find_mode(path: Path) -> int | None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file lies there, as far as the system tells."""
+    """Whether there is a file; also false where the system refuses to answer."""
     return stat.S_ISREG(_mode_or_zero(path))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder lies there, as far as the system tells."""
+    """Whether there is a folder; also false where the system refuses to answer."""
     return stat.S_ISDIR(_mode_or_zero(path))
 
 
 def resolve(path: Path) -> Path:
-    """The path without links and "..". Raises InputError where the system does not tell."""
+    """Return the path without links and "..". Raises InputError where the system refuses to answer."""
     try:
         return path.resolve()
-    except RuntimeError:  # Python before 3.13, for a loop
+    except RuntimeError:  # for a loop of links, before Python 3.13
         raise _unreadable(path, os.strerror(errno.ELOOP)) from None
     except OSError as error:
         raise _unreadable(path, error.strerror) from None

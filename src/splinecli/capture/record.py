@@ -1,4 +1,4 @@
-"""The record that everything after reading works on: the mask's pixels under known lights."""
+"""The record that all steps after reading work on: the mask's pixels under known lights."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
 
 MIN_LIGHTS = 3
-"""A normal times an albedo has three unknowns."""
+"""A normal scaled by an albedo has three unknowns."""
 
-FLATTEST_LIGHTS = 1e-3
-"""Smallest singular value of the (F, 3) lights over the largest, below which they count as coplanar."""
+COPLANAR_RATIO = 1e-3
+"""Lights (F, 3) count as coplanar if their smallest singular value is below this share of the largest."""
 
 _UNIT_TOLERANCE = 1e-3
-_BLOCK = 1 << 20  # rows checked at a time: a check must not need a second copy of a large capture
+_BLOCK = 1 << 20  # rows checked at a time, so that a check needs no second copy of a large capture
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One object under F lights, seen by a fixed orthographic camera. Validated once, when it is made.
+    """One object under F lights, seen by a fixed orthographic camera. It is validated when it is made.
 
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
     Args:
-        name: what the outputs are called.
+        name: the name of the outputs.
         observations: (P, F) float32, linear: every channel divided by its light's intensity, then the mean of
             the channels. Only the mask's pixels, in the mask's row-major order.
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
         ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
-        warnings: what a user should read.
+        warnings: what costs accuracy, or was decided for the user.
         estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
             intensities and the images show that they differ; else None.
         restored: (P, F) bool, true where an observation was saturated and an estimate stands in its place; None
@@ -89,7 +89,7 @@ class Capture:
         return len(self.observations)
 
     def choose_lights(self, positions: Sequence[int]) -> Capture:
-        """The same capture under some of its lights, in the order given.
+        """Return the same capture under some of its lights, in the order given.
 
         Args:
             positions: zero-based positions among this record's lights, not indices in the whole capture.
@@ -139,7 +139,7 @@ class Capture:
             )
         if self.estimated_intensities is not None and self.estimated_intensities.shape != (len(lights),):
             raise InputError(
-                f"{self.name}: light strengths of shape {self.estimated_intensities.shape}, expected ({len(lights)},)"
+                f"{self.name}: light intensities of shape {self.estimated_intensities.shape}, expected ({len(lights)},)"
             )
         if not np.isfinite(lights).all():
             raise InputError(f"{self.name}: a light direction is not finite")
@@ -151,8 +151,8 @@ class Capture:
                 f"{self.name}: light {self.light_indices[below]} lies below the horizon (z <= 0)",
                 hint="z points to the camera",
             )
-        strengths = np.linalg.svd(lights, compute_uv=False)
-        if strengths[-1] < FLATTEST_LIGHTS * strengths[0]:
+        singular_values = np.linalg.svd(lights, compute_uv=False)
+        if singular_values[-1] < COPLANAR_RATIO * singular_values[0]:
             raise InputError(
                 f"{self.name}: the {len(lights)} lights lie in one plane,"
                 " so least squares (LS) cannot solve for a normal",
@@ -186,13 +186,13 @@ class Capture:
             )
         for block in _blocks(normals.reshape(-1, 3)):
             length = np.linalg.norm(block, axis=1)
-            # Written so that NaN fails it too.
+            # In this form, NaN fails the check, too.
             if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():
                 raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
 
 
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
-    """The indices as a tuple of ints, in their order, once they can choose among n_lights lights.
+    """Return the indices as a tuple of ints, in their order, after checking that they choose among n_lights lights.
 
     Raises:
         UsageError: an index is out of range, comes twice, or there are fewer than three.

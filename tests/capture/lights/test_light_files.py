@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splinecli.capture import read_light_directions, read_light_intensities
@@ -68,6 +68,7 @@ def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> 
     np.testing.assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
 
 
+@settings(deadline=None)
 @given(
     vectors=st.lists(
         st.tuples(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 10)), min_size=4, max_size=12

@@ -14,7 +14,7 @@ from splinecli.errors import InputError
 FILENAMES = "filenames.txt"
 LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt")
 NAMED_LIGHTS = (".lp", "lights.json")
-"""How the names of light files end that name the image of each light."""
+"""Endings of the names of light files that name the image of each light."""
 LIGHT_FILES = f"{', '.join(LIGHT_DIRECTIONS)}, *.lp or lights.json"
 """The names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
@@ -28,7 +28,7 @@ GROUND_TRUTH = tuple(
 
 NOT_PHOTOGRAPHS = frozenset(
     {Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)}
-    # What splinecli itself writes, should its output folder be the capture's own.
+    # What splinecli writes, for an output folder that is also the capture's.
     | {
         "normals",
         "normals_8bit",
@@ -41,24 +41,24 @@ NOT_PHOTOGRAPHS = frozenset(
         "calibration",
     }
 )
-"""Lower-case stems of pictures in a capture's folder that are no photographs."""
+"""Lower-case stems of pictures in a capture's folder that are not images of the object under one light."""
 
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """The files of one capture; the images in the order of the lights.
+    """The files of one capture, with the images in the order of the lights.
 
     Args:
-        layout: what arrangement of files it is, for people.
-        name: what the capture is called, in most layouts like its folder.
-        folder: the folder that holds the files beside the images.
-        images: one file a light.
-        light_directions: F x 3 text, or one of the files of named_lights.py, which then orders the images.
-        light_intensities: F x 3 text, or None where all lights are equally strong.
+        layout: name of the arrangement of files, for people.
+        name: name of the capture, in most layouts that of its folder.
+        folder: the folder with the files beside the images.
+        images: one file for each light.
+        light_directions: F x 3 text, or a file of named_lights.py, which sets the order of the images.
+        light_intensities: F x 3 text, or None where no file gives them.
         mask: an image, or None where every pixel counts.
-        boundaries: instead of a the mask: images whose pixels above zero together are the object.
+        boundaries: used instead of a mask: images whose pixels above zero together are the object.
         ground_truth: a normal map, or None.
-        ambient: an image without any of the lights, or None.
+        ambient: an image under none of the lights, or None.
     """
 
     layout: str
@@ -75,7 +75,7 @@ class CaptureFiles:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Files named by the user, which go before what the folder holds."""
+    """Files named by the user, which replace those that the folder holds."""
 
     lights: Path | None = None
     intensities: Path | None = None
@@ -83,7 +83,7 @@ class Overrides:
     ground_truth: Path | None = None
 
     def named(self) -> tuple[Path, ...]:
-        """Those that are given. Raises InputError for one that is no file."""
+        """Return the files that are given. Raises InputError for one that is no file."""
         files = tuple(
             f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None
         )
@@ -97,13 +97,13 @@ class Overrides:
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
-    """The first of the names that the folder holds, letter case aside; None for none."""
+    """Return the file with the first of these names that the folder holds, ignoring case; None for none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}
     return next((files[name] for name in names if name in files), None)
 
 
 def find_lights(folder: Path) -> Path | None:
-    """The light file in the folder; None for none. InputError for several that name their images."""
+    """Return the light file in the folder; None for none. Raises InputError for several that name their images."""
     plain = find_named(folder, LIGHT_DIRECTIONS)
     if plain is not None:
         return plain
@@ -112,16 +112,16 @@ def find_lights(folder: Path) -> Path | None:
         raise InputError(
             f"found {len(named)} light files: {', '.join(path.name for path in named)}",
             path=folder,
-            hint="Choose one by --lights FILE",
+            hint="Choose one with --lights FILE",
         )
     return named[0] if named else None
 
 
 def folder_name(folder: Path) -> str:
-    """The folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
+    """Return the folder's own name, also for ".", "..", and paths with a trailing slash; a link keeps its name.
 
     Raises:
-        InputError: the system does not tell what lies at a path with "..".
+        InputError: the system refuses to resolve a path with "..".
     """
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"

@@ -1,7 +1,7 @@
-"""The layout of CyclesPS (Ikehata, ECCV 2018): images_<kind>/ in a folder that holds what all kinds share.
+"""The layout of CyclesPS (Ikehata, ECCV 2018): folders images_<kind>/ beside the files that all kinds share.
 
 As published, PRPS/<object> holds images_specular and images_metallic, PRPS_Diffuse/<object> images_diffuse,
-each with 00000.tif and so on for the lines of the object's light.txt. A capture is one such folder of images.
+each with one image for each line of the object's light.txt: 00000.tif and so on. A capture is one such folder.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ _PREFIX = "images_"
 _LIGHTS = "light.txt"
 _BOUNDARIES = ("inboundary.png", "onboundary.png")
 _MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
-# Two of the four, so that an object is still known where some are missing, and nothing else is taken for one.
+# Two of the four: an object is recognised where some are missing, and nothing else is taken for one.
 _ENOUGH_MARKS = 2
 _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """The capture's files, or None for another layout.
+    """Return the capture's files, or None for another layout.
 
     Args:
         folder: images_<kind> in an object's folder, or an object's folder with one such folder.
 
     Raises:
-        InputError: the object holds no or several folders of images, no light.txt or boundary masks and none
-            are named instead, or other images than its lights promise.
+        InputError: the object has no folder of images or several; or no light.txt or no boundary masks, and none are
+            named instead; or its images do not match its lights.
     """
     images_folder = _images_folder(folder)
     if images_folder is None:
@@ -72,16 +72,16 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
 
 
 def capture_name(folder: Path) -> str | None:
-    """<object>_<kind>, such as "Armadillo_specular"; None for another layout, or where it is not one capture."""
+    """Return <object>_<kind>, such as "Armadillo_specular"; None for another layout or several captures."""
     try:
         images_folder = _images_folder(folder)
-    except InputError:  # reading the capture will say it
+    except InputError:  # reading the capture will raise it again
         return None
     return None if images_folder is None else _name(images_folder)
 
 
 def list_captures(folder: Path) -> list[Path]:
-    """The folders of images that the folder stands for: itself, or those of the object that it is; or none."""
+    """Return the folder if it is a folder of images, the folders of images of an object, or an empty list."""
     if _is_images_folder(folder):
         return [folder]
     return _list_images_folders(folder) if _is_object(folder) else []
@@ -92,7 +92,7 @@ def _name(images_folder: Path) -> str:
 
 
 def _images_folder(folder: Path) -> Path | None:
-    """The folder of images that is meant; None where that is not one, or the layout another."""
+    """Return the only folder of images; None for several, or for another layout."""
     captures = list_captures(folder) if is_folder(folder) else []
     return captures[0] if len(captures) == 1 else None
 
@@ -112,7 +112,7 @@ def _is_object(folder: Path) -> bool:
     no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
     return bool(
         _list_images_folders(folder)
-        # Photographs beside light.txt are a plain folder that is given --lights light.txt.
+        # Images beside light.txt are a plain folder, to be used with --lights light.txt.
         or not list_images(folder, leave_out_stems=no_photographs, leave_out=())
     )
 
@@ -149,7 +149,7 @@ def _not_one_folder(holder: Path) -> InputError:
 
 
 def _find_boundaries(holder: Path) -> tuple[Path, ...]:
-    """Both masks: the object is their union, so that one alone would be a wrong one."""
+    """Return both masks. The object is their union, so one alone would be wrong."""
     found = {name: find_named(holder, [name]) for name in _BOUNDARIES}
     missing = [name for name, path in found.items() if path is None]
     if missing:
@@ -162,14 +162,14 @@ def _find_boundaries(holder: Path) -> tuple[Path, ...]:
 
 
 def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
-    """00000.tif and so on, one for each light."""
+    """Return the images 00000.tif and so on, one for each light."""
     there = {entry.name.lower(): entry for entry in list_folder(folder)}
     wanted = [f"{index:05}.tif" for index in range(n_lights)]
-    promised = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
+    expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
     for name in wanted:
         if name not in there:
-            raise InputError(f"the image does not exist, expected {promised}", path=folder / name)
+            raise InputError(f"the image does not exist, expected {expected}", path=folder / name)
     n_images = sum(bool(_NUMBERED.fullmatch(name)) for name in there)
     if n_images != n_lights:
-        raise InputError(f"found {n_images} images, expected {promised}", path=folder)
+        raise InputError(f"found {n_images} images, expected {expected}", path=folder)
     return tuple(there[name] for name in wanted)

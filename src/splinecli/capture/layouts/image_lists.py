@@ -1,4 +1,4 @@
-"""Which images a folder holds, and in which order."""
+"""The images of a folder, and their order."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from splinecli.errors import InputError
 _DEVELOPED = (".png", ".tif", ".tiff")
 _JPEG = (".jpg", ".jpeg")
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)
-"""Of pictures that need not be photographs, such as masks."""
+"""Suffixes of pictures, such as masks."""
 IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)
-"""Of photographs, by rank: see list_images."""
+"""Suffixes of images of an object."""
 
 _DIGITS = re.compile(r"([0-9]+)")
 
 
 def natural_key(path: Path) -> tuple[list[int | str], str]:
-    """Sort key by name with numbers by value: img2 before img10."""
+    """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so the same places hold the same types.
     parts: list[int | str] = [
         int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(path.name.casefold()))
@@ -32,7 +32,7 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
 
 
 def list_folder(folder: Path) -> list[Path]:
-    """What the folder holds in natural order, without hidden files (macOS leaves "._" companions of images).
+    """Return the folder's content in natural order, without hidden files (macOS writes "._" companions of images).
 
     Raises:
         InputError: the folder is missing, is a file, or cannot be read.
@@ -52,14 +52,14 @@ def list_folder(folder: Path) -> list[Path]:
 def list_images(
     folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
 ) -> tuple[Path, ...]:
-    """The images of the folder in natural order, by their suffixes.
+    """Return the images of the folder in natural order, by their suffixes.
 
-    Where a RAW file and others share a stem, they are one photograph: a PNG or TIFF was developed from the RAW file
-    and counts in its place, and a JPEG is the copy that cameras put beside it and does not count.
+    Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and
+    replaces it. A JPEG is a copy that the camera made, and does not count.
 
     Args:
-        leave_out_stems: lower-case names without suffix that mean something else, such as "mask".
-        leave_out: files that mean something else.
+        leave_out_stems: lower-case names without suffix that have another meaning, such as "mask".
+        leave_out: files that have another meaning.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -83,7 +83,7 @@ def list_images(
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
-    """Raise InputError where there are no images in the folder."""
+    """Raise InputError where the folder holds no images."""
     if not images:
         raise InputError(
             "the folder holds no images", path=folder, hint="PNG, TIFF, JPEG and RAW files count as images"
@@ -91,10 +91,10 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
-    """The images that a filenames.txt names, one a line, relative to its folder.
+    """Return the images that a filenames.txt names, one on each line, relative to its folder.
 
     Raises:
-        InputError: with the line, for an image that does not exist or is named twice; or the list is empty.
+        InputError: with the line, for an image that does not exist or is named twice; also for an empty list.
     """
     images: dict[Path, int] = {}
     for line, text in enumerate(read_lines(path), start=1):

@@ -1,4 +1,4 @@
-"""The layout of PSBox (Y. Xiong): the object's images in Objects/, the light file beside that folder."""
+"""The layout of PSBox (Y. Xiong): the object's images in Objects/, and the light file beside that folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OBJECTS = "Objects"
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """The capture's files, or None for another layout; InputError where Objects/ holds no images."""
+    """Return the capture's files, or None for another layout. Raises InputError where Objects/ holds no images."""
     lights = overrides.lights or find_named(folder, _LIGHT_DIRECTIONS)
     images = list_objects(folder, leave_out=overrides.named(), lights=lights)
     if lights is None or images is None:
@@ -44,10 +44,11 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
 def list_objects(
     folder: Path, *, leave_out: Collection[Path] = (), lights: Path | None = None
 ) -> tuple[Path, ...] | None:
-    """The images of Objects/, without files that mean something else; None for another layout.
+    """Return the images of Objects/; None for another layout.
 
     Args:
-        lights: a file of lights, where one is named; else the folder has to hold one.
+        leave_out: files that have another meaning.
+        lights: a light file named by the user; without it, the folder must hold one.
     """
     objects = folder / _OBJECTS
     if (lights or find_named(folder, _LIGHT_DIRECTIONS)) is None or not is_folder(objects):

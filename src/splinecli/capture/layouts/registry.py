@@ -1,4 +1,4 @@
-"""From a folder to the files of a capture: the one place where the layouts are tried in turn."""
+"""Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in turn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from splinecli.capture.layouts.image_lists import list_folder, list_images
 from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
 
-# Special before general: a plain folder takes whatever holds images.
+# The plain folder comes last, because it takes any folder with images.
 _LAYOUTS = (psbox.find, cyclesps.find, plain_folder.find)
 
 
@@ -31,7 +31,7 @@ def find_capture_files(
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
 ) -> CaptureFiles:
-    """The files of the capture in the folder; files named here go before those that the folder holds.
+    """Return the files of the capture in the folder; files named here replace those that the folder holds.
 
     Raises:
         InputError: the folder is missing, is a file or holds no images; filenames.txt names an image that
@@ -45,24 +45,24 @@ def find_capture_files(
         files = find(Path(folder), overrides)
         if files is not None:
             return files
-    raise AssertionError("the plain folder takes every folder or raises")  # pragma: no cover
+    raise AssertionError("the plain folder takes every folder, or raises")  # pragma: no cover
 
 
 def capture_name(folder: StrPath) -> str:
-    """What the capture in the folder is called: like the folder, but in CyclesPS <object>_<kind>.
+    """Return the name of the capture in the folder: that of the folder, but in CyclesPS <object>_<kind>.
 
     Raises:
-        InputError: the system does not tell what lies there.
+        InputError: the system refuses to say what is there.
     """
     return cyclesps.capture_name(Path(folder)) or folder_name(Path(folder))
 
 
 def find_captures(folder: StrPath) -> list[Path]:
-    """The captures of a dataset's folder in natural order, or the folder alone where it is a capture itself.
+    """Return the captures of a dataset's folder in natural order; the folder alone where it is a capture itself.
 
-    A capture is a folder with a light file beside its images, or beside the folder Objects that holds them
-    (PSBox), or one of the folders of images that a CyclesPS object holds; of CyclesPS, an object and the
-    published tree are datasets too. Whether a capture can be read shows when it is read.
+    A capture is a folder with a light file beside its images, or beside the folder Objects that holds them (PSBox), or
+    a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
+    captures are found by names of files; reading one may still fail.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no capture.
@@ -85,12 +85,12 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _captures_in(folder: Path) -> list[Path]:
-    """The folder, where it is a capture, or the captures of the object that it is."""
+    """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     return [folder] if _looks_like_capture(folder) else cyclesps.list_captures(folder)
 
 
 def _captures_below(folder: Path) -> list[Path]:
-    """Those in the folder, and in its subfolders where it is a part of CyclesPS's tree."""
+    """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
     if folder.name in cyclesps.TREES:
         return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
     return _captures_in(folder)

@@ -1,4 +1,4 @@
-"""Draws of lights: which of a capture's lights a trial sees. Random ones by seed, or those of a file."""
+"""Draws of lights: the lights of a capture that a trial uses, drawn by a seed or read from a file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import read_lines
-from splinecli.capture.record import FLATTEST_LIGHTS, MIN_LIGHTS
+from splinecli.capture.record import COPLANAR_RATIO, MIN_LIGHTS
 from splinecli.errors import InputError, UsageError
 
 Draw = tuple[int, ...]
 """Zero-based indices of lights in the whole capture."""
 
 DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
-"""First words of the seeds, so that draws, light noise and choice of pixels share no random numbers."""
+"""First numbers of the seeds, so that draws, light noise and the choice of pixels are independent."""
 
 _REDRAWS = 1000
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -27,20 +27,19 @@ _INDEX = re.compile(r"[0-9]{1,9}")
 def draw_lights(
     light_directions: NDArray[np.float64], n_lights: int | None, *, trials: int = 1, seed: int = 0
 ) -> list[Draw]:
-    """Random draws of lights without replacement, each in rising order.
+    """Return random draws of lights without replacement, each in rising order.
 
-    Trial t depends on the seed, the number of lights, `n_lights` and t alone: captures with equally many
-    lights get the same draws, and more trials continue the same list. Only a draw whose lights lie in one
-    plane, which no method could solve, is drawn again. All lights together are one draw, however many trials
-    are asked for.
+    Trial t depends only on the seed, the number of lights, `n_lights` and t. So captures with equally many lights get
+    the same draws, and more trials continue the same list. A draw is repeated only if its lights lie in one plane,
+    because no method can solve it. All lights together are one draw, whatever the number of trials.
 
     Args:
         light_directions: (F, 3) unit.
-        n_lights: lights a draw, or None for all of them.
+        n_lights: the number of lights in a draw; None for all of them.
 
     Raises:
         UsageError: fewer than three lights, more than there are, no trials, or a negative seed.
-        InputError: no draw was found whose lights do not lie in one plane.
+        InputError: every draw had its lights in one plane.
     """
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
@@ -55,7 +54,7 @@ def draw_lights(
 
 
 def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
-    """Raise UsageError where no capture could be drawn from like this."""
+    """Raise UsageError for settings that fit no capture."""
     if n_lights is not None and n_lights < MIN_LIGHTS:
         raise UsageError(f"{n_lights} lights wanted, expected at least {MIN_LIGHTS}")
     if trials < 1:
@@ -66,12 +65,12 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
 
 @dataclass(frozen=True)
 class DrawsFile:
-    """The draws of a file, all of the same number of lights.
+    """The draws of a file, all with the same number of lights.
 
     Args:
         path: the file.
         draws: at least one, in the file's order.
-        lines: the one-based line of each.
+        lines: the one-based line of each draw.
     """
 
     path: Path
@@ -83,9 +82,10 @@ class DrawsFile:
         return len(self.draws[0])
 
     def check_against(self, light_directions: NDArray[np.float64], *, skipped: int = 0) -> None:
-        """Raise InputError, with the line, where a draw does not fit a capture under these lights (F, 3).
+        """Raise InputError, with the line, for a draw that does not fit a capture under these lights (F, 3).
 
-        skipped: lights at the start that no draw may name.
+        Args:
+            skipped: number of lights at the start that no draw may name.
         """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
@@ -111,13 +111,13 @@ class DrawsFile:
 
 
 def read_draws(path: Path) -> DrawsFile:
-    """Read a text file with a draw a line: light indices from 0, separated by spaces or commas.
+    """Return the draws of a text file. Each line is one draw: light indices from 0, separated by spaces or commas.
 
     "#" comments and blank lines are skipped.
 
     Raises:
-        InputError: with the line, for a word that is no light index, an index that comes twice, fewer than
-            three lights, or another number of lights than in the first draw; also for a file without draws.
+        InputError: with the line, for a word that is no light index, a repeated index, fewer than three lights,
+            or a number of lights that differs from the first draw; also for a file without draws.
     """
     draws: list[Draw] = []
     lines: list[int] = []
@@ -137,7 +137,7 @@ def read_draws(path: Path) -> DrawsFile:
 def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
     for _ in range(_REDRAWS):
-        # By uniform numbers, not Generator.choice: numpy is likelier to keep that stream over its versions.
+        # Uniform numbers, not Generator.choice: NumPy is more likely to keep this stream in later versions.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
@@ -148,9 +148,9 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
 
 
 def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
-    """Whether Capture would refuse these lights (F, 3)."""
-    strengths = np.linalg.svd(light_directions, compute_uv=False)
-    return bool(strengths[-1] < FLATTEST_LIGHTS * strengths[0])
+    """Whether lights (F, 3) lie in one plane, so that Capture refuses them."""
+    singular_values = np.linalg.svd(light_directions, compute_uv=False)
+    return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
 
 
 def _light_index(word: str, path: Path, line: int) -> int:

@@ -1,4 +1,4 @@
-"""A mask from the photographs alone: what is brighter than the background, its largest part."""
+"""A mask made from the images: the largest area that is brighter than the background."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError
 
 _SMALLEST, _LARGEST = 0.005, 0.98
-"""Shares of the picture; a mask beyond them has found no object."""
+"""Smallest and largest share of the picture that an object can cover."""
 
 
 def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The mask (H, W) of what stands out from a darker background.
+    """Return the mask (H, W) of an object before a darker background.
 
-    Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) on lightness, the cube root, by
-    which dark parts of an object are nearer to its bright ones than to the background; then the largest connected
-    part, its holes filled. It cannot tell an object from a background that is as bright.
+    Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of lightness, the cube
+    root of brightness, in which dark parts of an object are closer to its bright parts than to the background. The mask
+    is the largest connected area above it, with its holes filled. A background as bright as the object defeats this.
 
     Args:
         brightness: (H, W), linear: the mean over all lights.
 
     Raises:
-        InputError: next to nothing stands out, or nearly everything does.
+        InputError: nearly nothing is brighter than the background, or nearly everything is.
     """
     import cv2
 
@@ -41,7 +41,7 @@ def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
     share = float(mask.mean())
     if not largest or not _SMALLEST <= share <= _LARGEST:
         raise InputError(
-            f"no mask was found: what is brighter than the background covers {100 * share:.1f} % of the picture",
-            hint="Paint a mask, white on the object, and give it by --mask",
+            f"no mask was found: the area brighter than the background covers {100 * share:.1f} % of the picture",
+            hint="Paint a mask, white on the object, and pass it with --mask FILE",
         )
     return np.asarray(mask)

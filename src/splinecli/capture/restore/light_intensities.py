@@ -1,8 +1,8 @@
-"""How strong the lights were, from the photographs of the object itself, where that is plain to see.
+"""Light intensities, estimated from the images of the object.
 
-Under known directions, the pixels of a surface that is mostly matte and turns many ways tell the lights' strengths up
-to one factor: D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric stereo", TPAMI 2018. Here the
-alternation (normals, then strengths) is robust: least absolute deviations and medians.
+Under known directions, a mostly matte surface with many orientations determines the intensities up to one factor:
+D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric stereo", TPAMI 2018. The alternation here
+(normals, then intensities) is robust: it uses least absolute deviations and medians.
 """
 
 from __future__ import annotations
@@ -15,101 +15,124 @@ from splinecli.normals import unit
 
 Array = NDArray[np.float64]
 
-FEWEST_LIGHTS = 6
-"""Each light is an unknown more: four follow any strengths, and with five as many draws are mistaken as told."""
+MIN_LIGHTS = 6
+"""Each light adds an unknown. Four observations fit any intensities, and with five lights half of the estimates are
+wrong."""
 
-FLATTEST = 0.25
-"""Smallest spread of the normals, the second largest standard deviation: where all look one way, as on a coin or a
-painting, strengths and normals stand in for each other."""
+MIN_NORMAL_SPREAD = 0.25
+"""Smallest accepted spread of the normals (their second largest standard deviation). Where all normals are alike, as
+on a coin or a painting, an error of the intensities looks like one of the normals."""
 
-PLAIN = 0.35
-"""Strengths are believed where they leave at most this share of the residual that equal ones do..."""
+MAX_ERROR_RATIO = 0.35
+"""Largest accepted residual, as a share of the residual under equal intensities."""
 
-WORST_FIT = 0.018
-"""... and at most this, as a share of a pixel's brightest observation, in the median: flat shiny things fit some
-strengths, too, but not so well..."""
+MAX_ERROR = 0.018
+"""Largest accepted residual: the median, as a share of a pixel's brightest observation. Flat shiny objects also fit
+some intensities, but not so well."""
 
-MISFIT = 0.02
-"""... and equal ones leave more than this.
+MIN_EQUAL_ERROR = 0.02
+"""Smallest residual under equal intensities for which others are estimated, in the unit of MAX_ERROR.
 
-With six lights of DiLiGenT's Ball and Cat, their measured strengths withheld, of PSBox's cat and of the medallion, 45
-of 48 draws are told to be unequal, with eight or ten all of 85; of uw's sphere and horse and of path-traced objects,
-metals and bowls among them, none of 180. Ten strengths are off by 1.6 % on Ball and 2.9 % on Cat, six by 4 and 7 %,
-where equal ones would be by 46 %.
+These limits were tried on DiLiGenT's Ball and Cat without their measured intensities, PSBox's cat and the medallion.
+With six lights, 45 of 48 draws are recognised as unequal; with eight or ten lights, all 85 are. Of 180 draws from uw's
+sphere and horse and from path-traced objects, with metals and bowls among them, none is. The error of ten intensities
+is 1.6 % on Ball and 2.9 % on Cat; of six intensities, it is 4 and 7 %. Equal intensities would have an error of 46 %.
 """
 
-_ROUNDS, _FITS = 200, 5
-_OBSERVATIONS, _FEWEST_PIXELS, _MOST_PIXELS = 100_000, 100, 2000
-_DARK = 0.1  # of the brightest hundredth of the pixels
-_LIT = 0.3  # of a pixel's brightest prediction; darker ones may be shadows
-_STEP = 1.5  # beyond what each round finds, which saves a third of them
+_MAX_ROUNDS, _FITS_PER_ROUND = 200, 5
+_MAX_OBSERVATIONS, _MIN_PIXELS, _MAX_PIXELS = 100_000, 100, 2000
+_MIN_PIXELS_PER_LIGHT = 10
+_DARK_SHARE = 0.1  # of the brightest hundredth of the pixels
+_LIT_SHARE = 0.3  # of a pixel's brightest prediction; darker observations may be shadows
+_STEP = 1.5  # exponent of each round's change; beyond 1 it saves a third of the rounds
+_CONVERGED = 1e-4  # change of the logarithms
 
 
 def estimate_light_intensities(
     observations: NDArray[np.float32], missing: NDArray[np.bool_] | None, light_directions: Array
 ) -> Array | None:
-    """Strengths (F,) with a mean of 1, or None where the lights may well be equally strong, or nothing tells.
+    """Return light intensities (F,) with a mean of 1, or None where equal ones fit or the images do not determine them.
 
     Args:
-        observations: (P, F), each light's share of its strength not taken out.
+        observations: (P, F), not divided by intensities.
         missing: (P, F), observations that do not count, such as saturated ones.
         light_directions: (F, 3), unit.
     """
-    n_lights = len(light_directions)
-    if n_lights < FEWEST_LIGHTS:
+    chosen = _choose_pixels(observations, missing)
+    if chosen is None:
         return None
-    brightest = observations.max(axis=1)
-    # Not the dark background of a capture without a mask.
-    lit = np.flatnonzero(brightest > _DARK * np.quantile(brightest, 0.99))
-    number = min(len(lit), _MOST_PIXELS, _OBSERVATIONS // n_lights)
-    chosen = lit[np.linspace(0, len(lit) - 1, number).astype(int)] if len(lit) else lit
-    known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
-    told = known.sum(axis=1) >= FEWEST_LIGHTS
-    known, values = known[told], observations[chosen[told]].astype(np.float64)
-    if len(values) < _FEWEST_PIXELS:
+    values, known = chosen
+    equal = np.ones(len(light_directions))
+    equal_error = _error(values, _predict(values, known, equal, light_directions), known)
+    if equal_error <= MIN_EQUAL_ERROR:
         return None
-    values /= values.max(axis=1, keepdims=True)
-    equal = np.ones(n_lights)
-    before = _residual(values, _fit(values, known, equal, light_directions), known)
-    if before <= MISFIT:
+    intensities = _alternate(values, known, light_directions)
+    if intensities is None:
         return None
-    strengths = equal
-    for _ in range(_ROUNDS):
-        predicted = _fit(values, known, strengths, light_directions)
-        counts = known & (predicted > _LIT * predicted.max(axis=1, keepdims=True))
-        if (counts.sum(axis=0) < 10).any():
-            return None
-        ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
-        found: Array = np.nanmedian(ratios, axis=0)
-        if not (found > 0).all():
-            return None
-        change = found / strengths
-        strengths = strengths * change**_STEP
-        strengths /= strengths.mean()
-        if np.abs(np.log(change)).max() < 1e-4:
-            break
-    predicted = _fit(values, known, strengths, light_directions)
+    predicted = _predict(values, known, intensities, light_directions)
     normals = unit(predicted @ np.linalg.pinv(light_directions).T)
     spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
-    plain = _residual(values / strengths, predicted, known) < min(PLAIN * before, WORST_FIT)
-    return strengths if plain and spread >= FLATTEST else None
+    error = _error(values / intensities, predicted, known)
+    fits = error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR)
+    return intensities if fits and spread >= MIN_NORMAL_SPREAD else None
 
 
-def _fit(values: Array, known: NDArray[np.bool_], strengths: Array, lights: Array) -> Array:
-    """What matte pixels of these values over strengths show under lights of strength 1."""
-    observed = values / strengths
+def _choose_pixels(
+    observations: NDArray[np.float32], missing: NDArray[np.bool_] | None
+) -> tuple[Array, NDArray[np.bool_]] | None:
+    """Return observations (p, F) of lit pixels, each scaled to 1, and which of them count; None for too few."""
+    n_lights = observations.shape[1]
+    if n_lights < MIN_LIGHTS:
+        return None
+    brightest = observations.max(axis=1)
+    # Leaves out the dark background of a capture without a mask.
+    lit = np.flatnonzero(brightest > _DARK_SHARE * np.quantile(brightest, 0.99))
+    number = min(len(lit), _MAX_PIXELS, _MAX_OBSERVATIONS // n_lights)
+    chosen = lit[np.linspace(0, len(lit) - 1, number).astype(int)] if len(lit) else lit
+    known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
+    enough = known.sum(axis=1) >= MIN_LIGHTS
+    known, values = known[enough], observations[chosen[enough]].astype(np.float64)
+    if len(values) < _MIN_PIXELS:
+        return None
+    values /= values.max(axis=1, keepdims=True)
+    return values, known
+
+
+def _alternate(values: Array, known: NDArray[np.bool_], light_directions: Array) -> Array | None:
+    """Return the intensities (F,) at which fits and medians agree; None where a light reaches too few pixels."""
+    intensities = np.ones(len(light_directions))
+    for _ in range(_MAX_ROUNDS):
+        predicted = _predict(values, known, intensities, light_directions)
+        counts = known & (predicted > _LIT_SHARE * predicted.max(axis=1, keepdims=True))
+        if (counts.sum(axis=0) < _MIN_PIXELS_PER_LIGHT).any():
+            return None
+        ratios = np.divide(values, predicted, out=np.full_like(values, np.nan), where=counts)
+        medians: Array = np.nanmedian(ratios, axis=0)
+        if not (medians > 0).all():
+            return None
+        change = medians / intensities
+        intensities = intensities * change**_STEP
+        intensities /= intensities.mean()
+        if np.abs(np.log(change)).max() < _CONVERGED:
+            break
+    return intensities
+
+
+def _predict(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Array) -> Array:
+    """Return what matte pixels with these observations would show under lights of intensity 1."""
+    observed = values / intensities
     largest = observed.max(axis=1, keepdims=True)
     observed = observed / largest
     lit = shadow_weights(observed) * known
     weights = lit
-    for _ in range(_FITS):
+    for _ in range(_FITS_PER_ROUND):
         predicted = predict(observed, weights, lights)
         weights = lit * absolute_weights(observed - predicted)
     fitted: Array = predicted * largest
     return fitted
 
 
-def _residual(observed: Array, predicted: Array, known: NDArray[np.bool_]) -> float:
-    """The median of |observed - predicted|, each pixel's brightest prediction 1."""
+def _error(observed: Array, predicted: Array, known: NDArray[np.bool_]) -> float:
+    """Return the median of |observed - predicted|, as a share of each pixel's brightest prediction."""
     shares = np.abs(observed - predicted) / np.maximum(predicted.max(axis=1, keepdims=True), 1e-12)
     return float(np.median(shares[known]))

@@ -1,4 +1,4 @@
-"""Lambertian predictions of observations by weighted least squares: what saturation and light strengths are told by."""
+"""Lambertian predictions by weighted least squares, from which saturation and light intensities are estimated."""
 
 from __future__ import annotations
 
@@ -8,22 +8,26 @@ from numpy.typing import NDArray
 from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
 
 SHADOW_SHARE = 0.05
-"""Of a pixel's largest observation: what is darker is taken for shadow."""
+"""Observations below this share of a pixel's largest one count as shadow."""
 
-_PRIOR = 1e-6  # towards a black pixel, so that one without three lit lights is solvable
-_EVEN = 0.02
-"""Residuals, as shares of a pixel's largest observation, far below which all weigh alike."""
+_PRIOR = 1e-6  # pulls towards a black pixel, so that a pixel without three lit observations has a solution
+_EQUAL_WEIGHT_BELOW = 0.02
+"""Residuals far below this share of a pixel's largest observation have nearly equal weights."""
 
 Array = NDArray[np.floating]
 
 
 def shadow_weights(observations: Array) -> Array:
-    """1 for lit observations (P, F), next to nothing for shadows; each pixel is scaled to a largest value of 1."""
+    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows.
+
+    Args:
+        observations: (P, F), each pixel scaled to a largest value of 1.
+    """
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
 def predict(observations: Array, weights: Array, light_directions: Array) -> Array:
-    """What the best matte pixels show: I = l . b with b of weighted least squares, (P, F)."""
+    """Return what matte pixels would show (P, F): I = l . b, where b minimises the weighted squared residuals."""
     x, y, z = light_directions.T
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
     xx, yy, zz, xy, xz, yz = (weights @ products).T
@@ -35,6 +39,6 @@ def predict(observations: Array, weights: Array, light_directions: Array) -> Arr
 
 
 def absolute_weights(residuals: Array) -> Array:
-    """Weights by which the next least squares are least absolute deviations, nearly."""
-    weights: Array = 1 / (np.abs(residuals) + _EVEN)
+    """Return weights with which the next weighted least squares approximates least absolute deviations."""
+    weights: Array = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
     return weights

@@ -1,4 +1,4 @@
-"""Saturated observations: told by the stored values, and put back as bright as the pixel's others say they were."""
+"""Saturated observations: find them, and replace them by estimates from the pixel's other observations."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from splinecli.capture.restore.robust_fit import absolute_weights, predict, shad
 
 ITERATIONS = 100
 STEP = 1.6
-"""Restored values go this share of the way to the fit's at each iteration: beyond it, which saves half of them."""
+"""Share of the way from the value to its prediction in each iteration. Beyond 1 it saves half of the iterations."""
 
-BRIGHTEST = 8.0
-"""No observation is restored to more than this many times the pixel's brightest as stored."""
+MAX_BRIGHTENING = 8.0
+"""No observation is restored to more than this many times the pixel's brightest stored one."""
 
 _TILE_PIXELS = 8192
 
 
 def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which stored pixels (P, C) have a channel at full scale, (P,); of floating-point ones none."""
+    """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels have none."""
     if pixels.dtype.kind != "u":
         return np.zeros(len(pixels), np.bool_)
     full: NDArray[np.bool_] = (pixels == np.iinfo(pixels.dtype).max).any(axis=1)
@@ -30,13 +30,13 @@ def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
 def restore_saturated(
     observations: NDArray[np.float32], saturated: NDArray[np.bool_], light_directions: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
-    """Put estimates in the place of saturated observations (P, F), in the array itself.
+    """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or None.
 
-    What a saturated observation was is not known, but that it was at least so bright is: each becomes the prediction
-    of a robust Lambertian fit to the pixel (least absolute deviations by reweighting) or its stored value, whichever is
-    brighter; the fit is made of the restored values in turn, so that a saturated one pulls at it from below alone.
-    Leaving them out would leave a pixel with its darkest observations, and taking them as they are would bend its
-    normal to the lights' middle: docs/measurements.md has figures. Pixels that are saturated under every light stay.
+    A saturated observation was at least as bright as stored. Its estimate is the prediction of a robust Lambertian fit
+    to the pixel (least absolute deviations by reweighting) or the stored value, whichever is brighter. The fit is
+    repeated on the restored values, so a saturated observation can only raise it. Without this, a pixel would either
+    lose its brightest observations, or its normal would tilt towards the mean of the lights (figures in
+    docs/measurements.md). Pixels that are saturated under every light stay as they are.
 
     Args:
         saturated: (P, F).
@@ -62,9 +62,9 @@ def _restored(
     weights = lit
     for _ in range(ITERATIONS):
         predicted = predict(values, weights, lights)
-        further = np.clip(values + np.float32(STEP) * (predicted - values), lowest, BRIGHTEST)
+        further = np.clip(values + np.float32(STEP) * (predicted - values), lowest, MAX_BRIGHTENING)
         values = np.where(saturated, further, lowest)
         weights = lit * absolute_weights(predicted - values)
-    # Not below what is stored, by a rounding either.
+    # Rounding must not make a value darker than stored.
     restored: NDArray[np.float32] = np.where(saturated, np.maximum(values * scale, stored), stored)
     return restored
