@@ -138,7 +138,7 @@ def test_several_light_counts_and_all(dataset, run, golden):
     golden("evaluate_several.txt", result.out)
 
 
-def test_a_capture_without_ground_truth_is_passed_over(dataset, run, golden):
+def test_a_capture_without_ground_truth_is_skipped(dataset, run, golden):
     (dataset / "matte/normals_gt.npy").unlink()
     result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")
     assert result.code == 3

@@ -32,7 +32,7 @@ def dome_normals() -> NDArray[np.float64]:
 
 @pytest.fixture
 def write_dome(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a capture folder below tmp_path: 16-bit photographs, mask, lights, and ground truth unless told."""
+    """Write a capture folder below tmp_path: 16-bit images, mask, lights, and ground truth by default."""
 
     def write(
         name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0

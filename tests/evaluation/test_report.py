@@ -86,7 +86,7 @@ def test_several_evaluations_begin_with_their_averages() -> None:
     assert page.text["li"].count(": bear: no images.") == 1
 
 
-def test_images_left_out_are_told() -> None:
+def test_images_left_out_are_named() -> None:
     evaluation = evaluation_of(["ls"], ["bear", "cat"])
     protocol = replace(evaluation.protocol, skip_first={"bear": 20, "*": 1})
     page = Page(html_report([replace(evaluation, protocol=protocol)], [], []))

@@ -20,6 +20,7 @@ from splinecli.capture.lights.draws import draw_lights
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate, evaluate_all
+from splinecli.evaluation.trial_capture import TrialSource
 from splinecli.evaluation.trials import TrialStore
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
@@ -292,6 +293,17 @@ def test_trials_at_a_time_change_nothing(write_dome: WriteDome, jobs: int) -> No
         np.testing.assert_allclose(
             [r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5
         )
+
+
+def test_the_methods_of_a_draw_share_its_capture(
+    write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    see = TrialSource.see
+    monkeypatch.setattr(TrialSource, "see", lambda self, trial: made.append(trial.number) or see(self, trial))
+    estimators = [make_estimator("ls"), make_estimator("iw12")]
+    evaluate_all([write_dome()], estimators, [Protocol(4, trials=3)], jobs=2)
+    assert sorted(made) == [0, 1, 2]
 
 
 def test_an_error_in_one_of_several_trials_ends_the_evaluation(write_dome: WriteDome) -> None:
