@@ -1,4 +1,4 @@
-"""Pixel sets made by hand, for the tests that read them."""
+"""Small pixel sets for tests."""
 
 from __future__ import annotations
 

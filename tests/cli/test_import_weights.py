@@ -1,4 +1,4 @@
-"""`splinecli import-weights`: the file it writes can be used, and its refusals."""
+"""`splinecli import-weights`: the written file works, and refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from splinecli.networks.li_net import PaperLINet
 from splinecli.networks.ne_net import PaperNENet
 
-# Our modules' names and theirs; what the networks compute is the business of tests/networks/test_official.py.
+# Our module names and theirs. tests/networks/test_official.py checks what the networks compute.
 NE_NET = {
     "stem.": "conv1.",
     "dense1.first.": "denseblock1_1.1.",
@@ -88,7 +88,7 @@ def test_refusals(run, golden):
     assert Path("there.safetensors").read_bytes() == b""
 
 
-def test_a_checkpoint_for_weights_is_told_the_way(run, make_capture):
+def test_a_checkpoint_in_place_of_weights_gets_a_hint(run, make_capture):
     result = run("infer", make_capture("sphere"), "--weights", "9-G.ckpt")
     assert result.code == 4
     assert "splinecli import-weights" in result.err

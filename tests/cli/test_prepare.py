@@ -1,4 +1,4 @@
-"""`splinecli prepare`: captures and CyclesPS trees into pixel sets, going on, and its refusals."""
+"""`splinecli prepare`: captures, CyclesPS trees and rendered scenes, continuation, and refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import tifffile
 
 @pytest.fixture
 def cycles_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The published layout: one object, 7 x 10 pixels, three kinds, four lights; values that tell where they are."""
+    """The published layout: one object, 7 x 10 pixels, three kinds, four lights; each value identifies its pixel."""
     monkeypatch.chdir(tmp_path)
     for tree, kinds in (("PRPS", ("specular", "metallic")), ("PRPS_Diffuse", ("diffuse",))):
         folder = tmp_path / "cycles" / tree / "Turtle"
@@ -66,7 +66,7 @@ def test_a_cycles_tree_reads_to_the_values_put_in(run, cycles_tree):
     expected = np.stack([image[1:6, 2:9].ravel() + 1000 * light for light in range(4)], axis=1) / 65535
     np.testing.assert_allclose(whole["observations"], expected, rtol=1e-6)
     np.testing.assert_allclose(whole["normals"][:7, 0], np.linspace(-0.5, 0.5, 10)[2:9], atol=2e-5)  # 16 bits
-    # Of PRPS, rows 2 and 4 and columns 2, 4, 6, 8, as the training of CNN-PS has it.
+    # PRPS gives rows 2 and 4 and columns 2, 4, 6 and 8, as in the training of CNN-PS.
     inner = expected.reshape(5, 7, 4)[1::2, ::2].reshape(8, 4)
     np.testing.assert_allclose(half["observations"], inner, rtol=1e-6)
     assert half["mask"].shape == (4, 5)
@@ -85,11 +85,11 @@ def test_the_sheet_shows_normals_and_images(run, cycles_tree):
     assert abs(middle[1] - 128) < 3  # green is y, and y is 0 here
 
 
-def test_given_again_it_goes_on(run, make_capture):
+def test_the_same_command_continues(run, make_capture):
     one, two = make_capture("one"), make_capture("two")
     shutil.move(two / "image3.png", "hidden.png")
     result = run("prepare", one, two, "-o", "set")
-    # The good one is there; the bad one is named.
+    # The good capture is in the set, and the bad one is named.
     assert result.code == 3
     assert result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
     assert "two" in result.err
@@ -108,7 +108,7 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     shutil.copytree(capture, "b/a")
     assert run("prepare", capture, "b", capture, "-o", "set", "--quiet").code == 0
     assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
-    # In another order they keep their names.
+    # They keep their names in another order.
     before = [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")]
     assert run("prepare", "b", capture, "-o", "set", "--quiet").code == 0
     assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
@@ -154,7 +154,7 @@ def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture
 
 
 def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
-    # One image is exposed four times as long, so that some of its pixels are clipped at 65535.
+    # One light is 1.4 times as bright, so that some pixels of its image are clipped at 65535.
     picture = cv2.imread(str(capture / "image2.png"), cv2.IMREAD_UNCHANGED).astype(np.float64)
     cv2.imwrite(str(capture / "image2.png"), (1.4 * picture).clip(0, 65535).astype(np.uint16))
     np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
@@ -242,7 +242,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
     normals[found["mask"]] = found["normals"]
     assert normals[7, 7, 2] > 0.9
     before = Path("set/scene0000-diffuse/observations.npy").read_bytes()
-    # More scenes join the set, and those that are there stay.
+    # A larger N adds scenes and keeps the others.
     assert run(*arguments, "--scenes", 2, "--quiet").code == 0
     assert Path("set/scene0000-diffuse/observations.npy").read_bytes() == before
     assert Path("set/scene0001-diffuse").is_dir()
@@ -266,7 +266,7 @@ def test_a_scene_does_not_depend_on_those_before_it(run, cube):
     common = ("prepare", "--size", 16, "--lights", 20, "--quiet")
     run(*common, "--scenes", 2, "-o", "set")
     shutil.move("set", "first")
-    # As after an interruption: the second scene is rendered in a process of its own.
+    # After an interruption, the second scene is rendered without the first.
     manifest = json.loads(Path("first/manifest.json").read_text())
     shutil.copytree("first", "set")
     manifest["entries"] = manifest["entries"][:3]

@@ -1,4 +1,4 @@
-"""`splinecli train`: a short run, its files, going on, and its refusals."""
+"""`splinecli train`: a short run, its files, continuation, and refusals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def small_runs(tmp_path, monkeypatch):
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(loop, "VALIDATION_PIXELS", 32)
     monkeypatch.chdir(tmp_path)
-    # More threads only wait for one another in networks as small as these.
+    # More threads only wait for each other in networks this small.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -87,7 +87,7 @@ def test_a_run_and_its_continuation(run):
     assert [row["step"] for row in rows()] == ["3"]
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet") == type(result)(0, "", "")
     assert [row["step"] for row in rows()] == ["3", "5"]
-    # The settings may be given again as long as they are the run's.
+    # Settings may be repeated if they are those of the run.
     again = ["--resume", "--steps", 6, "--preset", "compact", "--seed", 0, "--quiet"]
     assert run("train", "-o", "run", *again).code == 0
     assert [row["step"] for row in rows()] == ["3", "5", "6"]
@@ -109,7 +109,7 @@ def test_a_run_on_pixel_sets(run, make_capture):
     assert result.code == 0, result.err
     assert {path.name for path in Path("run").iterdir()} == FILES
     values = settings()
-    # A run can be taken up from another folder.
+    # A run continues from another working folder.
     assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
@@ -117,7 +117,7 @@ def test_a_run_on_pixel_sets(run, make_capture):
         run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
     )
     assert report["angular_error_deg"]["mean"] < 10
-    # As it was begun; then from elsewhere.
+    # First from the same folder, then from another.
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet").code == 0
     Path("elsewhere").mkdir()
     os.chdir("elsewhere")
@@ -149,7 +149,7 @@ def test_settings_come_from_preset_file_and_options(run, no_pictures):
     assert (values["seed"], values["batch_size"], values["steps"]) == (4, 4, 1)
     assert (values["pixels"]["wall_share"], values["pixels"]["ambient_share"]) == (0.25, 0)
     assert (values["pixels"]["min_lights"], values["pixels"]["max_lights"]) == (12, 12)
-    # The configuration of one run makes another.
+    # The configuration of one run starts another.
     assert run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
     assert json.loads(Path("other/config.json").read_text()) == values | {"seed": 9}
 
@@ -185,12 +185,12 @@ def test_processes_that_cannot_share_a_batch(run, monkeypatch):
     assert not Path("run").exists()
 
 
-def test_a_restarted_worker_goes_on_by_itself(run, no_pictures, monkeypatch):
+def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
     assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
     monkeypatch.setattr("splinecli.training.run.restarts_are_allowed", lambda: True)
     assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
     assert [row["step"] for row in rows()] == ["3", "5"]
-    # Where there is no checkpoint yet, it begins.
+    # Without a checkpoint, a run starts.
     assert run("train", "-o", "other", "--steps", 1, "--quiet").code == 0
 
 
@@ -244,7 +244,7 @@ def test_refusals(run, golden, no_pictures):
 
 
 def test_another_preset_is_refused_by_its_network(run, no_pictures):
-    # The compact network of these tests is smaller, but its size by name is what is told.
+    # The compact network of these tests is smaller, but the message gives the name of its size.
     run("train", "-o", "run", "--steps", 1)
     result = run("train", "-o", "run", "--resume", "--steps", 2, "--preset", "paper")
     assert (result.code, result.out) == (4, "")

@@ -1,4 +1,4 @@
-"""Weight files: what goes in comes out, and nothing else is taken for one."""
+"""Weight files are read as they were written, and other files are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pixel sets made by hand."""
+"""Fixtures of small pixel sets."""
 
 from small_pixel_sets import _matte_pixels, make_set
 

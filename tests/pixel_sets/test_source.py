@@ -68,7 +68,7 @@ def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtyp
     assert seen == {"a", "b", "c"}
 
 
-def test_pixels_are_alike_likely(make_set: MakeSet) -> None:
+def test_all_pixels_have_the_same_probability(make_set: MakeSet) -> None:
     pixel_set = make_set()
     normals = source_of(pixel_set).draw(9000).scene.normals.numpy()
     of_b = (normals[:, None] == pixel_set.load(pixel_set.entries[1]).normals).all(axis=2)
@@ -98,12 +98,12 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeS
 
 
 def test_lights_lie_within_a_random_angle_and_then_closest_to_it(make_set: MakeSet) -> None:
-    # One pixel's lights: none of those left out beyond the angle is nearer the axis than one taken beyond it.
+    # Beyond the cone, no light that is left out is closer to the axis than one that is used.
     pixel_set = make_set(entries=[("a", "one", 50, 200)])
     config = replace(FAULTLESS, min_lights=10, max_lights=10, usual_lights=10)
     batch = source_of(pixel_set, config).draw(600)
     largest = batch.light_directions[..., 2].acos().rad2deg().amax(dim=1)
-    # Of all 200 lights, 10 reach out to 70 or so nearly always; of a random cone only sometimes.
+    # Ten of all 200 lights nearly always reach beyond 50 degrees. Ten lights of a random cone often do not.
     assert 0.15 < (largest < 50).float().mean() < 0.6
     zeniths = np.sort(np.degrees(np.arccos(pixel_set.load(pixel_set.entries[0]).light_directions[:, 2])))
     assert largest.min() >= zeniths[9] - 0.01  # ten lights reach at least as far as the ten innermost
@@ -205,7 +205,7 @@ def test_gaps_are_filled_between_lights_and_not_beside_them() -> None:
     for row, column, value in ((16, 10, 0.2), (16, 12, 0.6), (5, 20, 0.9)):
         known[0, 0, row, column], values[0, 0, row, column] = 1, value
     dense = fill_gaps(values, known, inside)
-    # One gap lies between two lights, half way. A light alone says nothing of its neighbours.
+    # One gap is halfway between two lights. A single light fills none of its neighbours.
     assert dense.filled.sum() == 4
     assert dense.values[0, 0, 16, 11].item() == pytest.approx(0.4)
     assert torch.equal(dense.known, known)
@@ -237,7 +237,7 @@ def test_arrays_are_let_go_without_changing_what_is_drawn(
     expected = [kept.draw(50) for _ in range(6)]
     assert set(kept._observations) == {0, 1, 2}
     assert kept._bytes_read > 300 * 65_536
-    # After 60 pixels, of what is mapped around each row.
+    # The limit is reached after 60 pixels, each with the read-ahead around its row.
     monkeypatch.setattr(source, "_MAPPED_BYTES", 60 * 65_536)
     freed = source_of(pixel_set)
     open_after = []

@@ -1,4 +1,4 @@
-"""Pixel sets: what is written is what is read, whole or refused."""
+"""Pixel sets are read as they were written, and damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -79,17 +79,17 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", MANIFEST]
     assert "b" not in writer
     assert [entry["name"] for entry in read_manifest(tmp_path)["entries"]] == ["a"]
-    # And with room again it goes on.
+    # With space on the disk again, the entry can be written.
     monkeypatch.setattr(np, "save", save)
     writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
     writer.finish()
     assert [entry.name for entry in open_pixel_set(tmp_path).entries] == ["a", "b"]
 
 
-def test_an_entry_is_named_only_once_it_is_there(
+def test_the_manifest_names_an_entry_only_after_it_is_written(
     tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Killed between the entry's renaming and the manifest's: the next run puts the entry there again.
+    # The process is killed after the entry has its name and before the manifest has it. The next one writes it again.
     writer = PixelSetWriter(tmp_path)
     monkeypatch.setattr(
         writer, "_write_manifest", lambda *, complete: (_ for _ in ()).throw(KeyboardInterrupt)
@@ -105,7 +105,7 @@ def test_an_entry_is_named_only_once_it_is_there(
     assert finished.entries[0].n_pixels == 7
 
 
-def test_going_on_keeps_what_is_there(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
+def test_continuing_keeps_existing_entries(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()}
     again = PixelSetWriter(tmp_path)
@@ -113,7 +113,7 @@ def test_going_on_keeps_what_is_there(tmp_path: Path, matte_pixels: Callable[...
     again.add("b", "b", "a test", RECIPE, matte_pixels(3, 5))
     assert again.finish() == open_pixel_set(tmp_path)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()} == before
-    # A finished set can be added to, and is not to be trained on until that is done.
+    # Entries may be added to a finished set. Until that is finished, training refuses the set.
     more = PixelSetWriter(tmp_path)
     assert len(open_pixel_set(tmp_path).entries) == 2
     more.add("c", "c", "a test", RECIPE, matte_pixels(3, 5))
@@ -122,9 +122,7 @@ def test_going_on_keeps_what_is_there(tmp_path: Path, matte_pixels: Callable[...
     assert len(more.finish().entries) == 3
 
 
-def test_an_entry_made_in_another_way_is_not_taken_for_this_one(
-    tmp_path: Path, matte_pixels: Callable[..., Any]
-) -> None:
+def test_recipes_are_compared(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     writer = PixelSetWriter(tmp_path)
     assert writer.difference("a", dict(reversed(RECIPE.items()))) is None

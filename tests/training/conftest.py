@@ -1,4 +1,4 @@
-"""A training run that takes a second, and no pictures where none are looked at."""
+"""Fixtures of a training run that takes a second."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["_matte_pixels", "make_set"]
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> Iterator[None]:
-    """More threads only wait for one another in networks as small as these."""
+    """Use one thread, because more threads only wait for each other in networks this small."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -33,7 +33,7 @@ def small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Saving without drawing, which takes longer than all of such a run."""
+    """Save without drawing the figures, which takes longer than the run itself."""
     monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints: whole, or refused."""
+"""Checkpoints restore a run completely, and damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_no_changed_byte_goes_unnoticed(trainer: Trainer, tmp_path: Path) -> Non
 def test_settings_of_a_later_splinecli(trainer: Trainer, tmp_path: Path) -> None:
     path = tmp_path / CHECKPOINT
     whole = path.read_bytes()
-    # Inside the header, which no checksum covers; same length, so that the header still ends where it says.
+    # The checksum does not cover the header. The new text has the same length, so that the header stays valid.
     assert whole.count(b"batch_size") == 1
     path.write_bytes(whole.replace(b"batch_size", b"batch_sise"))
     with pytest.raises(ModelError, match="unknown training setting 'batch_sise'"):
@@ -84,7 +84,7 @@ def test_a_file_of_an_earlier_format_is_refused_by_name(trainer: Trainer, tmp_pa
 
 
 def test_the_state_of_either_network_alone_is_kept(tiny: TrainingConfig, tmp_path: Path) -> None:
-    # In alternation, LI-Net has no moments yet after the first steps.
+    # With alternating updates, LI-Net has no moments of AdamW yet after the first steps.
     config = replace(tiny, updates="alternating")
     begun = Trainer(config, tmp_path, CPU)
     begun.step()

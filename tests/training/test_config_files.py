@@ -1,4 +1,4 @@
-"""Configurations from files and the command line."""
+"""Training configurations from presets, files and options."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_another_run_is_refused_by_the_name_of_the_setting(
 
 
 def test_another_preset_is_refused_by_its_network(tmp_path: Path) -> None:
-    # Of the many settings that differ, the one that says most.
+    # The message names the most telling of the settings that differ.
     for given in ({"preset_name": "paper"}, {"file": write(tmp_path / "a.toml", 'preset = "paper"')}):
         with pytest.raises(ModelError, match=r"network\.size = 'compact', not 'paper'"):
             configure_resumed(preset("compact"), tmp_path, **given)
@@ -185,7 +185,7 @@ def test_a_setting_that_is_not_given_stays_as_it_was(tmp_path: Path) -> None:
     started = preset("compact", seed=5, batch_size=32)
     assert configure_resumed(started, tmp_path) == started
     assert configure_resumed(started, tmp_path, changes=[{"batch_size": 32}]) == started
-    # A preset stands for all its settings.
+    # A preset gives all settings.
     with pytest.raises(ModelError, match="batch_size = 32, not 256"):
         configure_resumed(started, tmp_path, "compact", changes=[{"seed": 5}])
 

@@ -1,4 +1,4 @@
-"""What the command line says of training is what training does, and it says so without loading PyTorch."""
+"""The names and intervals in the help of `train` are those of the code, and load without PyTorch."""
 
 from __future__ import annotations
 

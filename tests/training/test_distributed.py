@@ -1,4 +1,4 @@
-"""Several processes: the losses of one, whatever the update; and a run that outlives one of them."""
+"""Several processes have the losses of one process, and a run survives the failure of a process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The losses, at values that are known and against independent evaluations."""
+"""The losses have known values, and agree with independent computations."""
 
 from __future__ import annotations
 

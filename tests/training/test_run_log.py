@@ -1,4 +1,4 @@
-"""What a run leaves to be watched."""
+"""The log files of a run: metrics.csv, the figures and TensorBoard's events."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_line_cut_short_is_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "step\n50\n", "step,loss\n50,1.0\n"])
-def test_a_file_of_another_version_is_begun_anew(tmp_path: Path, text: str) -> None:
+def test_a_file_of_another_version_is_replaced(tmp_path: Path, text: str) -> None:
     (tmp_path / METRICS).write_text(text)
     RunLog(tmp_path, 50).append(ROWS[0])
     assert read_metrics(tmp_path / METRICS) == ROWS[:1]
@@ -92,7 +92,7 @@ def test_pictures_are_written_and_renewed(tmp_path: Path) -> None:
     log.draw(sample(1))
     curves, maps = read_png(tmp_path / CURVES), read_png(tmp_path / MAPS)
     assert len(np.unique(curves.reshape(-1, 3), axis=0)) > 10
-    # The colours of 8 x 8 random cells, thrice.
+    # Three maps of 8 x 8 random cells.
     assert len(np.unique(maps.reshape(-1, 3), axis=0)) > 100
     log.append(ROWS[2])
     log.draw(sample(2))
@@ -110,7 +110,7 @@ def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     assert read_png(tmp_path / MAPS).std() > 20
 
 
-def test_a_full_disk_is_said_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = RunLog(tmp_path, 0)
     log.append(ROWS[0])
 

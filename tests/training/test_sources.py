@@ -31,7 +31,7 @@ def assert_same(one: PixelBatch, other: PixelBatch) -> None:
 
 
 class Constant:
-    """Pixels whose exposure says where they are from."""
+    """A source whose pixels have an exposure that identifies it."""
 
     def __init__(self, number: float, lights: int) -> None:
         self.number, self.lights = number, lights
@@ -53,7 +53,7 @@ def test_a_mixture_keeps_its_weights() -> None:
         found = (batch.exposure == number).sum().item()
         # Four standard deviations of the binomial.
         assert found == pytest.approx(8000 * share, abs=4 * np.sqrt(8000 * share * (1 - share)))
-    # Those with fewer lights have further ones that are not valid.
+    # Pixels with fewer lights are padded with lights that are not valid.
     assert torch.equal(batch.valid.sum(dim=1), torch.tensor([0, 3, 5, 4])[batch.exposure[:, 0].long()])
     assert not batch.observations[~batch.valid].any()
 
@@ -75,7 +75,7 @@ def entries_of(*scenes: str) -> list[Entry]:
 
 
 @pytest.mark.parametrize(
-    ("scenes", "share", "held_scenes"),
+    ("scenes", "share", "n_validation"),
     [
         (("a", "a", "b", "b", "c", "c"), 0.1, 1),
         (("a", "b", "a", "b"), 0.1, 1),
@@ -85,26 +85,28 @@ def entries_of(*scenes: str) -> list[Entry]:
         (("a", "b", "c"), 0.0, 0),
     ],
 )
-def test_scenes_are_held_back_whole_and_never_all(
-    scenes: tuple[str, ...], share: float, held_scenes: int
+def test_validation_takes_whole_scenes_and_never_all(
+    scenes: tuple[str, ...], share: float, n_validation: int
 ) -> None:
     entries = entries_of(*scenes)
     training, validation = split_scenes(entries, share)
-    held = {entry.scene for entry in validation}
-    assert len(held) == held_scenes
-    assert {entry.scene for entry in training} == set(scenes) - held
+    for_validation = {entry.scene for entry in validation}
+    assert len(for_validation) == n_validation
+    assert {entry.scene for entry in training} == set(scenes) - for_validation
     assert sorted(entry.name for entry in training + validation) == sorted(entry.name for entry in entries)
-    # Neither the order nor further scenes, at the same share, let a held one into the training.
+    # The order of the entries does not matter.
     again = split_scenes(entries[::-1], share)[1]
-    assert {entry.scene for entry in again} == held
+    assert {entry.scene for entry in again} == for_validation
 
 
-def test_a_held_scene_stays_held_when_a_set_grows() -> None:
-    held = {entry.scene for entry in split_scenes(entries_of(*(f"s{i}" for i in range(40))), 0.25)[1]}
+def test_validation_scenes_stay_the_same_when_a_set_grows() -> None:
+    for_validation = {
+        entry.scene for entry in split_scenes(entries_of(*(f"s{i}" for i in range(40))), 0.25)[1]
+    }
     grown = {entry.scene for entry in split_scenes(entries_of(*(f"s{i}" for i in range(80))), 0.25)[1]}
-    assert len(held) == 10
-    # Where it falls out, it does so at the edge of the share: by the hash, two halves of a set are alike.
-    assert len(held & grown) >= 7
+    assert len(for_validation) == 10
+    # Only scenes at the edge of the share may change, because the hashes are uniform.
+    assert len(for_validation & grown) >= 7
 
 
 def rows_of(pixel_set: PixelSet, *names: str) -> set[tuple[float, ...]]:
@@ -120,14 +122,14 @@ def normals_of(batch: PixelBatch) -> set[tuple[float, ...]]:
     return {tuple(normal) for normal in batch.scene.normals.tolist()}
 
 
-def test_validation_sees_held_scenes_and_training_never_does(make_set: MakeSet, tiny: TrainingConfig) -> None:
+def test_training_never_draws_from_validation_scenes(make_set: MakeSet, tiny: TrainingConfig) -> None:
     pixel_set = make_set(entries=[("a1", "a", 20, 20), ("b1", "b", 20, 20), ("b2", "b", 20, 20)])
     opened = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}), seeded(1), seeded(2))
     training, validation = opened.training.draw(500), opened.validation.draw(300)
-    held = {entry.name for entry in split_scenes(pixel_set.entries, tiny.held_share)[1]}
-    assert held in ({"a1"}, {"b1", "b2"})
-    assert normals_of(training) == rows_of(pixel_set, *({"a1", "b1", "b2"} - held))
-    assert normals_of(validation) == rows_of(pixel_set, *held)
+    for_validation = {entry.name for entry in split_scenes(pixel_set.entries, tiny.held_share)[1]}
+    assert for_validation in ({"a1"}, {"b1", "b2"})
+    assert normals_of(training) == rows_of(pixel_set, *({"a1", "b1", "b2"} - for_validation))
+    assert normals_of(validation) == rows_of(pixel_set, *for_validation)
     assert (validation.valid.sum(dim=1) == tiny.pixels.usual_lights).all()
     assert len(set(training.valid.sum(dim=1).tolist())) > 3
 
@@ -150,28 +152,28 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     assert_same(training, again[0])
     assert_same(validation, again[1])
     assert not torch.equal(draw(6)[0].scene.normals, training.scene.normals)
-    held = {entry.name for entry in split_scenes(pixel_set.entries, config.held_share)[1]}
-    stored = rows_of(pixel_set, *({"a", "b", "c"} - held))
+    for_validation = {entry.name for entry in split_scenes(pixel_set.entries, config.held_share)[1]}
+    stored = rows_of(pixel_set, *({"a", "b", "c"} - for_validation))
     from_set = sum(tuple(normal) in stored for normal in training.scene.normals.tolist())
     assert from_set == pytest.approx(500, abs=4 * np.sqrt(2000 * 0.25 * 0.75))
-    assert normals_of(validation) & rows_of(pixel_set, "a", "b", "c") <= rows_of(pixel_set, *held)
-    # The truth of both kinds goes through the same frame.
+    assert normals_of(validation) & rows_of(pixel_set, "a", "b", "c") <= rows_of(pixel_set, *for_validation)
+    # Both kinds of truth give maps of one shape.
     assert training.scene.dense_truth(32).values.shape == (2000, 1, 32, 32)
 
 
-def test_a_shape_held_in_one_set_is_not_trained_on_in_another(
+def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
     make_set: MakeSet, tiny: TrainingConfig
 ) -> None:
-    # The same three shapes under other names: what either set holds back, the other must not train on.
+    # Both sets have the same three shapes under other names.
     one = make_set("one", entries=[("a", "a", 20, 20), ("b", "b", 20, 20), ("c", "c", 20, 20)])
     other = make_set("other", entries=[("x", "x", 20, 20), ("y", "y", 20, 20), ("z", "z", 20, 20)])
     sources = {str(one.folder): 1.0, str(other.folder): 1.0}
     opened = open_sources(replace(tiny, sources=sources), seeded(1), seeded(2))
     assert not normals_of(opened.training.draw(600)) & normals_of(opened.validation.draw(600))
     assert set(opened.sets) == set(sources)
-    # Where nothing is left, it says so: here the only scene is held by the other set.
-    held_first = "p" if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else "q"
-    order = ("p", "q") if held_first == "p" else ("q", "p")
+    # The only scene of "alone" is a validation scene of the other set, so nothing is left for training.
+    validation_scene = "p" if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else "q"
+    order = ("p", "q") if validation_scene == "p" else ("q", "p")
     rest = make_set("rest", entries=[(name, name, 20, 20) for name in order])
     alone = make_set("alone", entries=[("a", "a", 20, 20)])
     with pytest.raises(InputError, match="all scenes of the set are used for validation"):

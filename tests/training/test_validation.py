@@ -1,4 +1,4 @@
-"""Checks on held pixels, and the maps that are shown of them."""
+"""The validation error, and the sample maps of maps.png."""
 
 from __future__ import annotations
 
