@@ -169,7 +169,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="has files in it but is not a pixel set"):
         PixelSetWriter(tmp_path)
     assert everything(tmp_path) == {"thesis.tex": b"\\begin"}
-    with pytest.raises(OutputError, match="is a file"):
+    with pytest.raises(OutputError, match="found a file, expected a folder"):
         PixelSetWriter(tmp_path / "thesis.tex")
 
 
