@@ -1,4 +1,4 @@
-"""The one family of errors that splinecli raises on purpose. Each carries its exit code and its remedy."""
+"""The errors that splinecli raises on purpose. Each has an exit code, and a hint that says what to do."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 
 class SplinecliError(Exception):
-    """A failure with one clear message.
+    """A failure that one message explains: "PATH:LINE: PROBLEM. HINT.".
 
     Args:
-        problem: what was found and what was expected, one sentence without a final full stop.
-        path: the file or folder at fault, where there is one.
-        line: the one-based line of that file, where there is one.
-        hint: the way out, one sentence without a final full stop.
+        problem: what was found and what was expected, as one sentence without the final full stop.
+        path: the file or folder that causes the failure, if there is one.
+        line: the line of that file, counted from 1, if there is one.
+        hint: what the user can do, as one sentence without the final full stop.
     """
 
     exit_code = 1
@@ -34,13 +34,13 @@ class SplinecliError(Exception):
 
 
 class UsageError(SplinecliError):
-    """The command line or an API call cannot be meant this way (exit code 2)."""
+    """The options or arguments are not valid or contradict each other (exit code 2)."""
 
     exit_code = 2
 
 
 class InputError(SplinecliError):
-    """The input data are missing, damaged or do not fit together (exit code 3)."""
+    """The input data are missing, damaged or inconsistent (exit code 3)."""
 
     exit_code = 3
 

@@ -1,12 +1,13 @@
-"""Observation maps: what one pixel shows under each light, laid out by light direction.
+"""Observation maps: the observations of one pixel as an image, placed by the directions of their lights.
 
-A map is a square of `size` x `size` cells over the plane (x, y) of the light directions' orthographic
-projection, [-1, 1] x [-1, 1]. Column 0 is x = -1; row 0 is y = +1, so that a map shown as a picture is the
-sky as the object sees it, y up. All cells are equally wide (2 / size) and the view axis runs through the
-corner shared by the four middle cells: rotations by 90 degrees and mirror images are exact permutations of
-cells. CNN-PS (Ikehata, ECCV 2018) and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2),
-whose last cell is a single point. On average that is half a cell, nearly two degrees, off ours, so networks
-trained on such maps need them: the "cnn-ps" grid.
+A map is a square of `size` x `size` cells over the plane (x, y): the light directions' orthographic projection, from
+-1 to 1 in both axes. Column 0 is x = -1 and row 0 is y = +1, so y points up in a picture of the map. All cells have
+the same width, 2 / size, and the view axis passes through the common corner of the four middle cells. Rotations by 90
+degrees and mirror images are therefore exact permutations of cells.
+
+CNN-PS (Ikehata, ECCV 2018) and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) / 2), whose last cell
+is a single point. It differs from ours by half a cell on average, nearly two degrees. Networks that were trained on
+such maps need the same grid: "cnn-ps".
 """
 
 from __future__ import annotations
@@ -20,18 +21,18 @@ from torch import Tensor
 MAP_SIZE = 32
 
 Grid = Literal["even", "cnn-ps"]
-"""How lights fall on cells: ours, or as the authors of CNN-PS and SPLINE-Net have it. Row 0 is y = +1 in both."""
+"""The rule that assigns lights to cells: ours, or that of CNN-PS and SPLINE-Net. Row 0 is y = +1 in both."""
 
 
 class SparseMap(NamedTuple):
-    """values (P, C, size, size), zero where no light fell; holds (P, 1, size, size), one where one did."""
+    """values: (P, C, size, size), zero in empty cells. holds: (P, 1, size, size), one in cells with an observation."""
 
     values: Tensor
     holds: Tensor
 
 
 def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
-    """Flat cell index row * size + column (...) of unit light directions (..., 3), int64."""
+    """Return the flat cell index row * size + column (...), int64, of unit light directions (..., 3)."""
     if grid == "cnn-ps":
         column, rising = (
             ((light_directions[..., axis] + 1) * ((size - 1) / 2)).long().clamp(0, size - 1)
@@ -45,9 +46,10 @@ def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "ev
 
 @lru_cache(maxsize=8)
 def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
-    """Light directions at the cells' centres (size, size, 3), and which are in the unit disc (size, size).
+    """Return the light directions at the centres of the cells (size, size, 3), and a mask of the unit disc (size,
+    size).
 
-    Cells outside the disc hold no possible light; their direction is a zero vector.
+    No light can be in a cell outside the disc. Its direction is a zero vector.
     """
     centre = (torch.arange(size, dtype=torch.float64) + 0.5) * (2 / size) - 1
     y, x = torch.meshgrid(-centre, centre, indexing="ij")
@@ -58,10 +60,10 @@ def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
 
 
 def unit_disc(size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
-    """Which cells (size, size) belong to the unit disc, bool: those whose centres do.
+    """Return the mask (size, size) of the cells whose centres are in the unit disc.
 
-    The authors' networks count a cell where its index, scaled to [-1, 1], lies in the disc: a slightly smaller
-    one, made of 740 cells in place of 812 at size 32.
+    The "cnn-ps" grid takes the cells whose index, scaled to [-1, 1], is in the disc. These are slightly fewer: 740
+    instead of 812 at size 32.
     """
     if grid == "even":
         return cell_directions(size)[1]
@@ -77,11 +79,11 @@ def sparse_map(
     size: int = MAP_SIZE,
     grid: Grid = "even",
 ) -> SparseMap:
-    """Scatter values (P, F) or (P, F, C) onto their lights' cells; lights that share a cell are averaged.
+    """Return the sparse maps of values (P, F) or (P, F, C). Values of lights in the same cell are averaged.
 
     Args:
-        light_directions: (F, 3), or (P, F, 3) where each pixel has lights of its own.
-        valid: (P, F) bool; observations that are false are left out. All count by default.
+        light_directions: (F, 3), or (P, F, 3) if each pixel has its own lights.
+        valid: (P, F) bool, false for observations to leave out. None takes all.
     """
     if values.ndim == 2:
         values = values[..., None]
@@ -98,7 +100,7 @@ def sparse_map(
 
 
 def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:
-    """The largest valid observation of each pixel (P, 1), which divides its maps; 1 for an all-zero pixel."""
+    """Return the largest valid observation of each pixel (P, 1), the divisor of its maps; 1 for an all-zero pixel."""
     if valid is not None:
         observations = observations * valid
     largest = observations.amax(dim=1, keepdim=True)
@@ -106,13 +108,13 @@ def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:
 
 
 def rotate_about_view_axis(vectors: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-    """Turn vectors (..., 3) counterclockwise about +z; cosine and sine of the angle broadcast over (...)."""
+    """Rotate vectors (..., 3) counterclockwise about +z. Cosine and sine of the angle broadcast over (...)."""
     x, y, z = vectors.unbind(-1)
     return torch.stack((cosine * x - sine * y, sine * x + cosine * y, z), dim=-1)
 
 
 def dot(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Products (P, D) of a vector for each pixel (P, K) with directions (D, K) or (P, D, K)."""
+    """Return the dot products (P, D) of a vector for each pixel (P, K) with directions (D, K) or (P, D, K)."""
     if directions.ndim == 2:
         return vectors @ directions.T
     return (directions @ vectors[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""L1: the normal that minimises the sum of absolute residuals, less misled by shadows and highlights than LS."""
+"""L1: minimise the sum of absolute residuals, which shadows and highlights affect less than the sum of squares."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from splinecli.fits.weighted_least_squares import weighted_least_squares
 
 ITERATIONS = 50
 SMALLEST_RESIDUAL = 1e-7
-"""Where the largest intensity is 1: from there on weights stop growing."""
+"""Weights stop growing below this residual, for a largest observation of 1."""
 
 
 def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
-    """Scaled normals b (P, 3) that minimise sum_j |I_j - l_j . b|.
+    """Return scaled normals b (P, 3) that minimise sum_j |I_j - l_j . b|.
 
-    By iteratively reweighted least squares, which comes near; an optimum leaves three residuals zero, so the b
-    that the three smallest ones give is taken where it is better.
+    Iteratively reweighted least squares comes close to the minimum. There, three residuals are zero. So the b of the
+    three smallest residuals is used where it is better.
 
     Args:
         observations: (P, F) float64, the largest of each pixel 1.

@@ -1,4 +1,4 @@
-"""Many small convex quadratic programmes at once, with variables that are not negative."""
+"""Solution of many small convex quadratic programmes at once, with non-negative variables."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ __all__ = ["minimise_nonnegative"]
 
 
 def minimise_nonnegative(hessian: Tensor, linear: Tensor, *, iterations: int = 100) -> Tensor:
-    """The x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for P programmes with a hessian H and a linear term q each.
+    """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for P programmes with a hessian H and a linear term q
+    each.
 
     Block principal pivoting (Júdice and Pires 1994; the backup rule as in Kim and Park 2011, SIAM J. Sci. Comput.,
     algorithm 2): guess which variables are free, solve for them with the others at zero, and exchange those that
-    break x >= 0 or the gradient's sign. Without rounding it ends at the optimum.
+    violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum.
 
     Args:
-        hessian: (P, K, K), symmetric and positive definite.
-        linear: (P, K).
-        iterations: a limit in case rounding makes it cycle, as it may when a hessian is nearly singular; the
-            result is then feasible, and close to the optimum.
+        hessian: (P, K, K), symmetric and positive definite. linear: (P, K). iterations: a limit, because rounding
+        errors may cause cycles if a hessian is nearly singular. The result is then
+            feasible and close to the optimum.
     """
     count, size = linear.shape
     eye = torch.eye(size, dtype=hessian.dtype, device=hessian.device)
@@ -43,7 +43,8 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor, *, iterations: int = 1
         fewer = wrong_count < fewest_wrong
         fewest_wrong = torch.where(fewer, wrong_count, fewest_wrong)
         patience = torch.where(fewer, 3, patience - 1)
-        # Exchanging all may cycle. After three exchanges without gain, the last wrong one alone: that cannot.
+        # Exchanging all at once may cycle. After three exchanges without gain, exchange only the last one,
+        # which cannot.
         last = torch.where(wrong, position, -1).amax(dim=1, keepdim=True)
         free = free ^ torch.where(patience[:, None] < 0, wrong & (position == last), wrong)
     return torch.where(free, x, 0).clamp(min=0)

@@ -1,4 +1,4 @@
-"""Which observations are lit: the rule that IW12, ST14, IA14 and trimmed LS share, each with a threshold of its own."""
+"""Detection of shadows. IW12, ST14, IA14 and trimmed LS use the same rule, each with its own threshold."""
 
 from __future__ import annotations
 
@@ -6,24 +6,26 @@ import torch
 from torch import Tensor
 
 UNSHADED = 0.6
-"""Quantile of a pixel's intensities that its shadows are told by: half of them may be shadows, nearly half highlights.
-The largest would not do: beside a metal's highlight all else is dark."""
+"""The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
+observations may be shadows, and more than a third highlights. The largest observation is no good reference: beside the
+highlight of a metal, everything else is dark."""
 
 FEWEST_LIT = 3
-"""The brightest observations that never count as shadows: a normal needs three."""
+"""Number of brightest observations that never count as shadows, because a normal needs three."""
 
 
 def lit_observations(
     observations: Tensor, share: float, valid: Tensor | None = None, *, fewest: int = FEWEST_LIT
 ) -> Tensor:
-    """Which observations (P, F) reach `share` of their pixel's quantile UNSHADED, or are among its `fewest` largest.
+    """Return which observations (P, F) reach `share` of the pixel's quantile UNSHADED or are among its `fewest`
+    largest.
 
     Args:
         observations: (P, F), not negative.
-        share: 0 for all.
-        valid: (P, F) bool, all by default; others are not lit.
+        share: the threshold; 0 takes all observations.
+        valid: (P, F) bool; false ones are not lit. None means all are valid.
     """
-    if not len(observations):  # of nothing there is no quantile
+    if not len(observations):  # an empty batch has no quantile
         return observations.bool()
     known = observations if valid is None else observations.masked_fill(~valid, torch.nan)
     floor = share * known.nanquantile(UNSHADED, dim=1, keepdim=True)

@@ -4,14 +4,14 @@ B. Shi, P. Tan, Y. Matsushita, K. Ikeuchi, "Bi-polynomial modeling of low-freque
 
     I_j = rho(n.h_j, l_j.h_j) n.l_j,    rho a polynomial of order 2 in each argument,
 
-h_j the bisector of light l_j and view v = (0, 0, 1). Highlights live in the high intensities; what is left of a
-reflectance in the low ones varies slowly. For a given normal the coefficients are linear, so only the normal is
-searched (variable projection).
+with h_j the bisector of light l_j and view v = (0, 0, 1). Highlights affect only the high intensities. The rest of the
+reflectance varies slowly. For a given normal the coefficients are linear, so only the normal is searched (variable
+projection).
 
-The lowest intensities alone do not determine nine coefficients well. This departs from the paper in two ways:
-coefficients are left out where few observations are kept (coefficient_count), and all but the constant have a
-Gaussian prior around zero, that is around Lambert's law. The noise it is weighed against is estimated with the fit
-(D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992), so exact data are fitted exactly.
+The lowest intensities alone do not determine nine coefficients well. This module therefore differs from the paper in
+two ways. Coefficients are left out where few observations are kept (coefficient_count). All but the constant one have a
+Gaussian prior around zero, that is, around Lambert's law. The fit also estimates the noise that the prior is weighed
+against (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992), so exact data are fitted exactly.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from splinecli.fits.shadows import lit_observations
 VIEW = (0.0, 0.0, 1.0)
 
 FEWEST_LIT = 4
-"""The brightest observations that never count as shadows: three fix a normal, one more tells noise."""
+"""Number of brightest observations that never count as shadows: three for the normal, one for the noise."""
 
 RANGE = 0.25
-"""What 1 - n.h and 1 - l.h are divided by: about their range where a surface is lit and seen."""
+"""Divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible."""
 
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
-"""Order in which the coefficients of (1 - n.h)^a (1 - l.h)^b, at 3 a + b, enter the model: by degree, a first."""
+"""Order in which coefficients enter the model: that of (1 - n.h)^a (1 - l.h)^b is at 3 a + b. By degree, a first."""
 
 FIRST_NOISE = 1e-3
-"""Standard deviation that the estimate of the noise starts from, relative to the brightest kept observation."""
+"""Initial standard deviation of the noise, relative to the brightest kept observation."""
 
 TURNED_AWAY = 10.0
 """Cost, for each unit of cosine, of a normal that faces away from the view or from a light that reaches it."""
@@ -53,26 +53,26 @@ def solve(
     rounds: int = 5,
     steps: int = 4,
 ) -> Tensor:
-    """Normals (P, 3) from observations (P, F) under lights (F, 3); zero where all is dark.
+    """Return normals (P, 3) from observations (P, F) under lights (F, 3); zero for dark pixels.
 
     Args:
-        shadow: observations below this part of the pixel's quantile UNSHADED are shadows.
-        share, fewest: how many of the others are kept, see kept_count. share is the paper's T_low.
+        shadow: observations below this share of the pixel's quantile UNSHADED are shadows.
+        share, fewest: how many of the others are kept; see kept_count. share is T_low in the paper.
         spread: standard deviation of the prior on the two linear coefficients, relative to the brightest kept
-            observation; half of it for each degree more.
-        rounds, steps: estimates of the noise, and Levenberg-Marquardt steps with each.
+            observation. It halves with each further degree.
+        rounds, steps: number of estimates of the noise, and of Levenberg-Marquardt steps for each.
     """
     lights = light_directions.double()
-    # The normal equations square the condition number: single precision would find no exact fit.
-    scene = _select(observations.double(), lights, shadow=shadow, share=share, fewest=fewest, spread=spread)
-    # A coarse search of the whole hemisphere finds lower costs at worse normals; least squares starts near enough.
+    # The normal equations square the condition number, so single precision would not be exact enough.
+    problem = _select(observations.double(), lights, shadow=shadow, share=share, fewest=fewest, spread=spread)
+    # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse normals.
     normals = normalize(observations.double() @ torch.linalg.pinv(lights).mT, dim=1)
     noise = torch.full_like(normals[:, 0], FIRST_NOISE**2)
     damping = torch.full_like(noise, 1e-2)
     for _ in range(rounds):
-        fit = _fit(scene, normals, noise)
+        fit = _fit(problem, normals, noise)
         for _ in range(steps):
-            trial = _fit(scene, fit.step(damping), noise)
+            trial = _fit(problem, fit.step(damping), noise)
             better = trial.cost < fit.cost
             damping = torch.where(better, damping * 0.2, damping * 5).clamp(1e-7, 1e4)
             fit = fit.replaced(trial, better)
@@ -81,22 +81,22 @@ def solve(
 
 
 def kept_count(lit: Tensor, *, share: float, fewest: int) -> Tensor:
-    """How many of so many observations above the shadows are kept: the share, but `fewest` at least, or all of them."""
+    """Return how many of `lit` observations are kept: the share, but at least `fewest`, or all if there are fewer."""
     return torch.maximum((share * lit).ceil().long(), lit.clamp(max=fewest))
 
 
 def coefficient_count(kept: Tensor) -> Tensor:
-    """How many coefficients, 1 to 9, so many observations may have: two observations for each and for each of the
-    normal's two angles."""
+    """Return the number of coefficients, 1 to 9, for `kept` observations: two observations for each coefficient and for
+    each of the two angles of the normal."""
     return (kept // 2 - 2).clamp(1, len(PLACE))
 
 
-class _Scene(NamedTuple):
-    """What a batch of pixels keeps, K observations or fewer each, and the prior.
+class _Problem(NamedTuple):
+    """The kept observations of a batch of pixels, at most K each, and the prior.
 
-    intensities (P, K), the largest of a pixel 1; lights and bisectors (P, K, 3); light_powers (P, K, 3) of 1 - l.h;
-    precision (9,) of the prior; ridge (P, 9), which takes coefficients out of the model; facing (P, F + 1, 3), the
-    directions that the normal has to face.
+    intensities: (P, K), the largest of a pixel 1. lights, bisectors: (P, K, 3). light_powers: (P, K, 3), powers of 1 -
+    l.h. precision: (9,), of the prior. ridge: (P, 9), which removes coefficients from the model. facing: (P, F + 1, 3),
+    the directions that the normal has to face.
     """
 
     intensities: Tensor
@@ -109,10 +109,11 @@ class _Scene(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """The best reflectance for given normals, and where to go from there.
+    """The best reflectance for given normals, and the derivatives of its cost.
 
-    normals (P, 3); cost (P,); noise (P,), the variance estimated from the residual; tangents (P, 3, 2), the directions
-    in which the normal can move; gradient (P, 2) and curvature (P, 2, 2), half the cost's along them.
+    normals: (P, 3). cost: (P,). noise: (P,), the variance estimated from the residual. tangents: (P, 3, 2), the
+    directions in which the normal can move. gradient, curvature: (P, 2) and (P, 2, 2), half the derivatives of the cost
+    along the tangents.
     """
 
     normals: Tensor
@@ -123,21 +124,21 @@ class _Fit(NamedTuple):
     curvature: Tensor
 
     def step(self, damping: Tensor) -> Tensor:
-        """Normals (P, 3) one Levenberg-Marquardt step further, damped by (P,) relative to the mean curvature."""
+        """Return normals (P, 3) after a Levenberg-Marquardt step, damped by (P,) times the mean curvature."""
         size = self.curvature.diagonal(dim1=1, dim2=2).mean(dim=1)
         damped = self.curvature + torch.diag_embed((damping * size + 1e-12)[:, None].expand(-1, 2))
         move, _ = torch.linalg.solve_ex(damped, self.gradient)
         return normalize(self.normals + (self.tangents @ move[..., None])[..., 0], dim=1)
 
     def replaced(self, trial: _Fit, better: Tensor) -> _Fit:
-        """The trial where it is better (P,)."""
+        """Return this fit, with the trial in place of the pixels where it is better (P,)."""
         pairs = zip(trial, self, strict=True)
         return _Fit(*(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs))
 
 
 def _select(
     observations: Tensor, lights: Tensor, *, shadow: float, share: float, fewest: int, spread: float
-) -> _Scene:
+) -> _Problem:
     count = len(lights)
     view = lights.new_tensor(VIEW)
     ordered, index = observations.sort(dim=1)
@@ -145,7 +146,7 @@ def _select(
     lit = is_lit.sum(dim=1)
     kept = kept_count(lit, share=share, fewest=fewest)
 
-    # As many places as a pixel without shadows fills, so that nothing depends on the other pixels of the batch.
+    # Use as many places as a pixel without shadows needs, so that no pixel depends on the others in its batch.
     most = int(kept_count(torch.tensor(count), share=share, fewest=fewest))
     rank = torch.arange(most, device=lights.device)
     place = (count - lit[:, None] + rank).clamp(max=count - 1)
@@ -158,9 +159,9 @@ def _select(
     order = torch.arange(3, dtype=lights.dtype, device=lights.device)
     degree = (order[:, None] + order).flatten()
     left_out = torch.tensor(PLACE, device=lights.device) >= coefficient_count(kept)[:, None]
-    return _Scene(
+    return _Problem(
         intensities=intensities / torch.where(largest > 0, largest, 1),
-        # A light of length zero adds nothing to any sum below.
+        # A light of length zero does not contribute to any sum below.
         lights=lights[chosen] * is_kept[..., None],
         bisectors=bisectors[chosen],
         light_powers=_powers((lights * bisectors).sum(dim=1))[chosen],
@@ -170,32 +171,33 @@ def _select(
     )
 
 
-def _fit(scene: _Scene, normals: Tensor, noise: Tensor) -> _Fit:
-    """Fit the coefficients for normals (P, 3) under a variance of the noise (P,)."""
-    shading = (scene.lights @ normals[..., None])[..., 0].clamp(min=0)
-    powers = _powers((scene.bisectors @ normals[..., None])[..., 0])
-    design = ((shading[..., None] * powers)[..., None] * scene.light_powers[..., None, :]).flatten(-2)
-    prior = noise[:, None] * scene.precision + scene.ridge
+def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
+    """Fit the coefficients for normals (P, 3) and a variance of the noise (P,)."""
+    shading = (problem.lights @ normals[..., None])[..., 0].clamp(min=0)
+    powers = _powers((problem.bisectors @ normals[..., None])[..., 0])
+    design = ((shading[..., None] * powers)[..., None] * problem.light_powers[..., None, :]).flatten(-2)
+    prior = noise[:, None] * problem.precision + problem.ridge
     factor, _ = torch.linalg.cholesky_ex(design.mT @ design + torch.diag_embed(prior))
-    coefficients = torch.cholesky_solve(design.mT @ scene.intensities[..., None], factor)
-    residual = scene.intensities[..., None] - design @ coefficients
+    coefficients = torch.cholesky_solve(design.mT @ problem.intensities[..., None], factor)
+    residual = problem.intensities[..., None] - design @ coefficients
     squares = residual.square().sum(dim=(1, 2))
 
-    # MacKay's number of well determined parameters; the normal's two angles always count.
+    # The number of well determined parameters (MacKay). The two angles of the normal always count.
     slack = (prior * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2)).sum(dim=1)
-    freedom = (scene.intensities > 0).sum(dim=1) - (2 + len(PLACE) - slack)
+    freedom = (problem.intensities > 0).sum(dim=1) - (2 + len(PLACE) - slack)
 
-    # How the model changes with the normal, less what the coefficients make up for (Kaufman's approximation).
-    by_power = scene.light_powers @ coefficients.view(-1, 3, 3).mT
+    # The derivative of the model by the normal, without the part that the coefficients absorb (Kaufman's
+    # approximation).
+    by_power = problem.light_powers @ coefficients.view(-1, 3, 3).mT
     reflectance = (powers * by_power).sum(dim=-1)
     slope = (by_power[..., 1] + 2 * powers[..., 1] * by_power[..., 2]) / -RANGE
-    change = (slope * shading)[..., None] * scene.bisectors
-    change += (reflectance * (shading > 0))[..., None] * scene.lights
+    change = (slope * shading)[..., None] * problem.bisectors
+    change += (reflectance * (shading > 0))[..., None] * problem.lights
     tangents = _tangents(normals)
     jacobian = change @ tangents
     absorbed = torch.linalg.solve_triangular(factor, design.mT @ jacobian, upper=False)
 
-    away = (-scene.facing @ normals[..., None]).clamp(min=0).sum(dim=(1, 2))
+    away = (-problem.facing @ normals[..., None]).clamp(min=0).sum(dim=(1, 2))
     return _Fit(
         normals=normals,
         cost=squares + (prior * coefficients[..., 0].square()).sum(dim=1) + TURNED_AWAY * away,
@@ -207,13 +209,13 @@ def _fit(scene: _Scene, normals: Tensor, noise: Tensor) -> _Fit:
 
 
 def _tangents(normals: Tensor) -> Tensor:
-    """Two unit vectors (P, 3, 2) across each normal."""
+    """Return two unit vectors (P, 3, 2) orthogonal to each normal."""
     x, _, z = normals.unbind(dim=1)
     first = normalize(torch.stack((z, torch.zeros_like(x), -x), dim=1), dim=1)
     return torch.stack((first, torch.linalg.cross(normals, first)), dim=-1)
 
 
 def _powers(cosine: Tensor) -> Tensor:
-    """Powers 0, 1, 2 (..., 3) of 1 - cosine, scaled: an expansion about where normal, light and view meet."""
+    """Return the powers 0, 1, 2 (..., 3) of (1 - cosine) / RANGE: an expansion about cosine = 1."""
     base = (1 - cosine) / RANGE
     return torch.stack((torch.ones_like(base), base, base.square()), dim=-1)

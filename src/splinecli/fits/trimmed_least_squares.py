@@ -1,4 +1,4 @@
-"""LS with shadows and highlights trimmed: least squares over the observations of middling intensity."""
+"""Trimmed LS: least squares without shadows and without the darkest and brightest observations."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from splinecli.fits.shadows import lit_observations
 from splinecli.fits.weighted_least_squares import weighted_least_squares
 
 TRIMMED_SHARE = 0.2
-"""Of the observations, at either end. With ten lights the two darkest and the two brightest go."""
+"""Share of the observations that is left out at each end: with ten lights, the two darkest and the two brightest."""
 
 SHADOW_SHARE = 0.1
-"""Of the pixel's quantile UNSHADED, as IW12 has it."""
+"""Share of the pixel's quantile UNSHADED, as in IW12. Darker observations are shadows."""
 
 FEWEST = 4
-"""Observations that stay: one more than a normal and an albedo need."""
+"""Smallest number of observations that stay: one more than a normal and an albedo need."""
 
 
 def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
-    """Scaled normals b (P, 3): |I - L b| is minimised without shadows and without the darkest and brightest.
+    """Return scaled normals b (P, 3) that minimise |I - L b| over the remaining observations.
 
-    Equal observations stay or go together, so that the order of the lights does not matter.
+    Equal observations are kept or left out together, so the order of the lights does not matter.
 
     Args:
         observations: (P, F) float64, the largest of each pixel 1.
