@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splinecli.capture import Capture
+from splinecli.capture import Capture, CaptureWarning
 from splinecli.errors import InputError, UsageError
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -35,11 +35,11 @@ def test_fields_get_their_dtypes() -> None:
 
 
 def test_choose_lights_keeps_the_order_given() -> None:
-    chosen = make(warnings=("Read me.",)).choose_lights([3, 0, 2])
+    chosen = make(warnings=(CaptureWarning("code", "Read me."),)).choose_lights([3, 0, 2])
     np.testing.assert_array_equal(chosen.observations, np.arange(16).reshape(4, 4)[:, [3, 0, 2]])
     np.testing.assert_array_equal(chosen.light_directions, LIGHTS[[3, 0, 2]])
     assert chosen.light_indices == (7, 0, 2)
-    assert chosen.warnings == ("Read me.",)
+    assert [str(warning) for warning in chosen.warnings] == ["Read me."]
 
 
 @pytest.mark.parametrize(
@@ -106,3 +106,16 @@ def test_chosen_lights_in_one_plane() -> None:
 def test_fields_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=f"vase: {message}"):
         make(**changes)
+
+
+def test_restored_observations_follow_the_choice() -> None:
+    restored = np.arange(16).reshape(4, 4) % 3 == 0
+    capture = make(restored=restored)
+    np.testing.assert_array_equal(capture.choose_lights([3, 0, 2]).restored, restored[:, [3, 0, 2]])
+    chosen = capture.choose_pixels(np.array([0, 3]))
+    np.testing.assert_array_equal(chosen.restored, restored[[0, 3]])
+    np.testing.assert_array_equal(chosen.observations, capture.observations[[0, 3]])
+    np.testing.assert_array_equal(chosen.mask, [[True, False, False], [False, True, False]])
+    assert make().choose_lights([0, 1, 2]).restored is None
+    with pytest.raises(InputError, match=r"vase: restored flags of shape \(4, 3\), expected .* = \(4, 4\)"):
+        make(restored=restored[:, :3])

@@ -81,6 +81,26 @@ def test_the_capture_names_its_restored_observations(scene):
     assert error(capture) > 5e-4
 
 
+def test_the_record_says_what_is_restored(scene):
+    """Colours of restored observations do not count, however close the observations are to them."""
+    folder, normals, albedo = scene
+    picture = cv2.imread(str(folder / "0.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(folder / "0.png"), (picture * 0.8).astype(np.uint16))
+    source = open_capture(folder)
+    capture = source.read(as_stored=True)
+    restored = np.zeros(capture.observations.shape, bool)
+    restored[:, 0] = True
+    inside = normals.any(axis=2)
+    ratio = {
+        flags is not None: np.median(
+            albedo_map(source, replace(capture, restored=flags), normals)[inside] / albedo[inside]
+        )
+        for flags in (None, restored)
+    }
+    assert ratio[True] == pytest.approx(1, abs=0.01)
+    assert ratio[False] < 0.98
+
+
 def test_colours_are_divided_by_estimated_intensities(scene):
     folder, normals, _ = scene
     source = open_capture(folder)

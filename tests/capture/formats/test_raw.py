@@ -172,10 +172,10 @@ def test_saturated_photosites_are_at_full_scale(tmp_path: Path, white: int, blac
 
 
 def test_full_scale_is_where_the_camera_says() -> None:
-    def full_scale(told: list[int] | None) -> int:
+    def full_scale(stated: list[int] | None) -> int:
         raw: Any = SimpleNamespace(
             white_level=16383,
-            camera_white_level_per_channel=told,
+            camera_white_level_per_channel=stated,
             black_level_per_channel=[510, 512, 511, 512],
         )
         return _full_scale(raw)
@@ -306,12 +306,12 @@ def test_photographs_of_mirror_balls(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("without_rawpy")
 def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
-    told = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
-    assert read_exposure(told) == Exposure(*SHOT)
+    stated = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
+    assert read_exposure(stated) == Exposure(*SHOT)
     assert read_exposure(write_dng(tmp_path / "b.dng", mosaic(ramp()))) is None
     # The header of Olympus.
     assert read_exposure(write_dng(tmp_path / "c.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")) is None
-    assert not is_display_encoded(told)
+    assert not is_display_encoded(stated)
 
 
 @pytest.mark.usefixtures("needs_rawpy")

@@ -97,17 +97,17 @@ def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
         "mask.png",
         "normal_gt.npy",
     )
-    other = fill(tmp_path, "other.txt", "strengths.txt")
+    other = fill(tmp_path, "other.txt", "brightness.txt")
     files = find_capture_files(
         folder,
         lights=other / "other.txt",
-        intensities=other / "strengths.txt",
+        intensities=other / "brightness.txt",
         mask=folder / "outline.png",
         ground_truth=str(folder / "gt.tif"),
     )
     assert [path.name for path in files.images] == ["a.png", "b.png"]
     assert files.light_directions == other / "other.txt"
-    assert files.light_intensities == other / "strengths.txt"
+    assert files.light_intensities == other / "brightness.txt"
     assert files.mask == folder / "outline.png"
     assert files.ground_truth == folder / "gt.tif"
 

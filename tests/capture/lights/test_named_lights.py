@@ -96,12 +96,12 @@ def test_one_capture_in_every_form_gives_the_same_normals(write_folder: WriteFol
         capture = read_capture(folder)
         # Bit for bit, signs of zeros included.
         assert estimate_normals(capture, estimator).normal_map.tobytes() == expected.tobytes(), form
-        told = [str(warning) for warning in capture.warnings if warning.code == "lights_matched"]
-        assert bool(told) == (
+        matched = [str(warning) for warning in capture.warnings if warning.code == "lights_matched"]
+        assert bool(matched) == (
             form in ("other suffix", "lp by order", "json", "json by order", "json with intensities")
         )
-        if told:
-            assert told[0].endswith("by order." if "order" in form else "by name without suffix."), form
+        if matched:
+            assert matched[0].endswith("by order." if "order" in form else "by name without suffix."), form
 
 
 def test_images_that_no_light_names_are_left_out(write_folder: WriteFolder) -> None:
@@ -127,9 +127,9 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(
     folder = write_folder("alice", [f"{number}.png" for number in range(1, 6)])
     (folder / "lights.json").write_text(alice([1, 2, 3, 4, 5], intensity=[2.0, 1.0, 0.5]))
     assert open_capture(folder).light_intensities.tolist() == [[2.0, 1.0, 0.5]] * 5
-    strengths = tmp_path / "strengths.txt"
-    strengths.write_text("3\n3\n3\n3\n3\n")
-    assert open_capture(folder, intensities=strengths).light_intensities.tolist() == [[3.0] * 3] * 5
+    file = tmp_path / "intensities.txt"
+    file.write_text("3\n3\n3\n3\n3\n")
+    assert open_capture(folder, intensities=file).light_intensities.tolist() == [[3.0] * 3] * 5
 
 
 def test_a_folder_with_an_lp_file_is_a_capture(write_folder: WriteFolder) -> None:

@@ -1,4 +1,4 @@
-"""Strengths of lights, from what they lit: against scenes and captures whose strengths are known."""
+"""Light intensities estimated from images, against scenes and captures with known intensities."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splinecli.capture.reader import open_capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.normals import unit
 
-STRENGTHS = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
+INTENSITIES = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
 
 
 def lights(count: int) -> np.ndarray:
@@ -37,13 +37,13 @@ def sphere(directions: np.ndarray, *, shine: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("n_lights", "shine"), [(6, 0.0), (8, 0.0), (8, 0.5)])
-def test_unequal_lights_are_told(n_lights, shine):
-    directions, strengths = lights(n_lights), STRENGTHS[:n_lights]
-    observations = (sphere(directions, shine=shine) * strengths).astype(np.float32)
+def test_unequal_lights_are_estimated(n_lights, shine):
+    directions, intensities = lights(n_lights), INTENSITIES[:n_lights]
+    observations = (sphere(directions, shine=shine) * intensities).astype(np.float32)
     found = estimate_light_intensities(observations, None, directions)
     assert found is not None
     assert found.mean() == pytest.approx(1)
-    np.testing.assert_allclose(found, strengths / strengths.mean(), rtol=0.02)
+    np.testing.assert_allclose(found, intensities / intensities.mean(), rtol=0.02)
 
 
 @pytest.mark.parametrize("shine", [0.0, 0.5, 3.0])
@@ -55,16 +55,18 @@ def test_equal_lights_are_left_alone(shine):
     )
 
 
-def test_where_nothing_tells():
+def test_scenes_that_do_not_determine_intensities():
     directions = lights(4)
     assert (
-        estimate_light_intensities((sphere(directions) * STRENGTHS[:4]).astype(np.float32), None, directions)
+        estimate_light_intensities(
+            (sphere(directions) * INTENSITIES[:4]).astype(np.float32), None, directions
+        )
         is None
     )
-    few = (sphere(lights(8)) * STRENGTHS)[:40].astype(np.float32)
+    few = (sphere(lights(8)) * INTENSITIES)[:40].astype(np.float32)
     assert estimate_light_intensities(few, None, lights(8)) is None
     assert estimate_light_intensities(np.zeros((500, 8), np.float32), None, lights(8)) is None
-    never = (sphere(lights(8)) * STRENGTHS * (np.arange(8) != 3)).astype(
+    never = (sphere(lights(8)) * INTENSITIES * (np.arange(8) != 3)).astype(
         np.float32
     )  # a lamp that did not flash
     assert estimate_light_intensities(never, None, lights(8)) is None
@@ -72,11 +74,11 @@ def test_where_nothing_tells():
 
 def test_saturated_observations_do_not_count():
     directions = lights(8)
-    truth = sphere(directions) * STRENGTHS
+    truth = sphere(directions) * INTENSITIES
     stored = np.minimum(truth, 0.6).astype(np.float32)
     found = estimate_light_intensities(stored, truth >= 0.6, directions)
     assert found is not None
-    np.testing.assert_allclose(found, STRENGTHS / STRENGTHS.mean(), rtol=0.05)
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.05)
 
 
 def test_a_capture_without_a_file_of_intensities(tmp_path):
@@ -85,24 +87,24 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     x, y = np.meshgrid(axis, -axis)
     normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
     for index in range(8):
-        picture = np.maximum(normals @ directions[index], 0) * STRENGTHS[index] * 30_000
+        picture = np.maximum(normals @ directions[index], 0) * INTENSITIES[index] * 30_000
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16))
     np.savetxt(tmp_path / "lights.txt", directions)
     source = open_capture(tmp_path)
-    plain, mended = source.read(as_stored=True), source.read()
+    plain, restored = source.read(as_stored=True), source.read()
     assert plain.estimated_intensities is None
-    assert mended.estimated_intensities is not None
-    low, high = STRENGTHS.min() / STRENGTHS.mean(), STRENGTHS.max() / STRENGTHS.mean()
-    (warning,) = (warning for warning in mended.warnings if warning.code == "estimated_intensities")
-    told = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
-    assert told == pytest.approx([low, high], abs=0.02)
-    np.testing.assert_allclose(mended.estimated_intensities, STRENGTHS / STRENGTHS.mean(), rtol=0.02)
+    assert restored.estimated_intensities is not None
+    low, high = INTENSITIES.min() / INTENSITIES.mean(), INTENSITIES.max() / INTENSITIES.mean()
+    (warning,) = (warning for warning in restored.warnings if warning.code == "estimated_intensities")
+    stated = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
+    assert stated == pytest.approx([low, high], abs=0.02)
+    np.testing.assert_allclose(restored.estimated_intensities, INTENSITIES / INTENSITIES.mean(), rtol=0.02)
     np.testing.assert_allclose(
-        mended.observations, plain.observations / mended.estimated_intensities, rtol=1e-5
+        restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5
     )
-    some = mended.choose_lights([6, 0, 2])
-    np.testing.assert_array_equal(some.estimated_intensities, mended.estimated_intensities[[6, 0, 2]])
-    # Who knows better is believed.
+    some = restored.choose_lights([6, 0, 2])
+    np.testing.assert_array_equal(some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]])
+    # Given intensities replace estimates.
     np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
     assert open_capture(tmp_path).read().estimated_intensities is None
     (tmp_path / "light_intensities.txt").unlink()

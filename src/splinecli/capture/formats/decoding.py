@@ -1,7 +1,7 @@
-"""PNG, JPEG and TIFF files as pixels, exactly as stored, and RAW files; damaged ones are refused, never half read.
+"""Pixels of PNG, JPEG and TIFF files exactly as stored, and of RAW files. Damaged files are refused.
 
-OpenCV fills what is missing of a truncated file with gray and only mutters on stderr, so the container is
-checked before it is decoded, and what the C libraries say is kept off stderr and read instead.
+OpenCV fills the missing part of a truncated file with gray and only prints to stderr. So the container is checked
+before it is decoded, and the messages of the C libraries are caught and searched.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
-# In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill); anything else ends it.
+# In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-# What libpng and libjpeg say of pixels that they could not read.
+# Messages of libpng and libjpeg about pixels that they could not read.
 _DAMAGE = re.compile(
     r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE
 )
@@ -39,11 +39,11 @@ _STDERR_LOCK = threading.Lock()
 
 
 def decode_image(path: Path) -> NDArray[Any]:
-    """The pixels of a PNG, JPEG or TIFF file as stored: (H, W, C), C 1 or 3 (RGB), alpha dropped.
+    """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
 
-    The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). The
-    format is told by content, not by name, but for RAW files, which are developed (see decode_raw). An EXIF
-    orientation is ignored: all images of a capture share one pixel grid.
+    The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
+    and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
+    EXIF orientation is ignored, because all images of a capture share one pixel grid.
 
     Raises:
         InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy.
@@ -52,7 +52,7 @@ def decode_image(path: Path) -> NDArray[Any]:
 
 
 def decode_with_alpha(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """The pixels as decode_image gives them, and the alpha channel (H, W), None where there is none."""
+    """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
     data = _read_bytes(path)
     if data and path.suffix.lower() in RAW_SUFFIXES:
         pixels = decode_raw(data, path, native_stderr)
@@ -95,26 +95,26 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, C), colour in RGB or RGBA order."""
+    """Return pixels (H, W) or (H, W, C), in RGB or RGBA order."""
     import cv2
 
-    with native_stderr() as said:
+    with native_stderr() as messages:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
             pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             pixels = None
-    if pixels is None or _DAMAGE.search("".join(said)):
+    if pixels is None or _DAMAGE.search("".join(messages)):
         raise InputError("the image is damaged and cannot be read", path=path, hint="Copy or export it again")
     if pixels.ndim == 3 and pixels.shape[2] == 3:
-        return pixels[:, :, ::-1]  # BGR becomes RGB: a view, since a copy of a large image is felt
+        return pixels[:, :, ::-1]  # BGR becomes RGB; a view, because copying a large image takes long
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         return pixels[:, :, [2, 1, 0, 3]]
     return pixels
 
 
 def _check_png(data: bytes, path: Path) -> None:
-    """Walk the chunks: each whole with its checksum, the last one IEND."""
+    """Raise InputError unless all chunks up to IEND are complete and have the right checksum."""
     position, view = len(_PNG), memoryview(data)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")
@@ -132,7 +132,7 @@ def _check_png(data: bytes, path: Path) -> None:
 
 
 def _check_jpeg(data: bytes, path: Path) -> None:
-    """Walk the segments to the end-of-image marker; what follows it (a second picture) is left alone."""
+    """Raise InputError unless there is an end-of-image marker; a second picture after it is ignored."""
     position = 2
     while position + 2 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -152,25 +152,25 @@ def _check_jpeg(data: bytes, path: Path) -> None:
 
 @contextmanager
 def native_stderr() -> Iterator[list[str]]:
-    """Keep what C libraries print away from stderr; the list holds it after the block.
+    """Catch what C libraries print to stderr; after the block, the list holds it.
 
-    It swaps file descriptor 2, which belongs to the whole process, so one thread at a time, and only around
-    decoding.
+    This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
+    around decoding.
     """
-    said: list[str] = []
+    messages: list[str] = []
     with _STDERR_LOCK, tempfile.TemporaryFile() as store:
         try:
             if sys.stderr is not None:
                 sys.stderr.flush()
-            kept = os.dup(2)
-        except (OSError, ValueError):  # no stderr at all: nothing to protect
-            yield said
+            original = os.dup(2)
+        except (OSError, ValueError):  # there is no stderr to protect
+            yield messages
             return
         try:
             os.dup2(store.fileno(), 2)
-            yield said
+            yield messages
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(original, 2)
+            os.close(original)
             store.seek(0)
-            said.append(store.read(1 << 16).decode(errors="replace"))
+            messages.append(store.read(1 << 16).decode(errors="replace"))

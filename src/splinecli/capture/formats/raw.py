@@ -1,4 +1,4 @@
-"""Camera RAW files as linear pixels in the camera's own colours, by LibRaw (the extra `raw`)."""
+"""Linear pixels of camera RAW files in the camera's own colours, by LibRaw (the extra `raw`)."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
     ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
 )  # fmt: skip
-"""RAW files are told by name: inside, many look like TIFF."""
+"""RAW files are recognised by name, because the content of many looks like TIFF."""
 
 
 def decode_raw(
     data: bytes, path: Path, quiet: Callable[[], AbstractContextManager[object]]
 ) -> NDArray[np.uint16]:
-    """The pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (without filters).
+    """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
 
-    They are proportional to light, from zero at the sensor's black to 65535 where a photosite is saturated, on the
-    same scale for all files of a camera at one setting. An orientation is ignored, as in all images.
+    They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
+    camera at one setting have the same scale. An orientation is ignored, as in all images.
 
     Args:
-        data: what the file holds.
-        path: its name, for messages.
-        quiet: keeps what LibRaw mutters away; around reading alone, since it stops progress bars, too.
+        data: content of the file.
+        path: the file, for messages.
+        quiet: catches what LibRaw prints. It is used only around reading, because it stops progress bars, too.
 
     Raises:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
@@ -51,16 +51,16 @@ def decode_raw(
                 output_color=rawpy.ColorSpace.raw,
                 output_bps=16,
                 gamma=(1, 1),
-                # The camera's white balance or an automatic one would differ from image to image. LibRaw's for
-                # daylight is fixed, but lifts red and blue: they would be at full scale before they are saturated.
+                # White balance of the camera, or an automatic one, would differ between images. LibRaw's daylight
+                # balance is fixed, but brightens red and blue, which would reach full scale before saturation.
                 user_wb=[1, 1, 1, 1],
                 no_auto_bright=True,
-                user_sat=_full_scale(raw),  # else it is each image's own maximum, where that is near
+                user_sat=_full_scale(raw),  # the default is each image's own maximum, if that is near
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
-                # The others choose where to interpolate by what they see, so differently under each light. Normals of
-                # textured things are two or three times as far off with them (AHD's 1.4 degrees, these 0.5), those
-                # of plain ones closer (0.2 and 0.4).
+                # Other algorithms choose the direction of interpolation by the image, so differently under each light.
+                # For textured objects their normals have two to three times the error (AHD 1.4 degrees, LINEAR 0.5).
+                # For uniform objects their normals are better (0.2 and 0.4 degrees).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
     except (rawpy.LibRawError, OSError):
@@ -69,29 +69,29 @@ def decode_raw(
             path=path,
             hint="Copy it again, or export the photographs as 16-bit linear TIFF",
         ) from None
-    # Sensors of four colours exist. The fourth must not pass for an alpha channel.
+    # Some sensors have four colours. The fourth must not become an alpha channel.
     return np.asarray(pixels[:, :, :3], np.uint16)
 
 
 def read_shot(path: Path) -> tuple[float, float, float]:
-    """Seconds, f-number and ISO sensitivity, zero where the file does not say.
+    """Return exposure time in seconds, f-number and ISO sensitivity, each zero where the file does not state it.
 
-    LibRaw unpacks the pixels for it, so it is for files that nothing else reads. Raises whatever LibRaw raises.
+    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. It raises LibRaw's errors.
     """
     with _import_rawpy(path).imread(io.BytesIO(path.read_bytes())) as raw:
         return raw.other.shutter_speed, raw.other.aperture, raw.other.iso_speed
 
 
 def _full_scale(raw: rawpy.RawPy) -> int:
-    """The value above black from which a photosite counts as saturated."""
+    """Return the value above black from which a photosite counts as saturated."""
     white = raw.white_level
-    # Many sensors saturate below the largest number, which is what LibRaw gives, and some files tell where. What is
-    # far from that number is in another unit.
-    told = raw.camera_white_level_per_channel
-    if told is not None and white / 2 <= min(told) <= white:
-        white = min(told)
-    # The colours' black levels differ a little, and the one with the highest has to reach full scale, too. One less,
-    # because LibRaw cuts off decimals after scaling: else every seventh white level would end at 65534.
+    # LibRaw gives the largest number. Many sensors saturate below it, and some files state the level. A level far from
+    # the largest number is in another unit.
+    stated = raw.camera_white_level_per_channel
+    if stated is not None and white / 2 <= min(stated) <= white:
+        white = min(stated)
+    # The black levels of the colours differ a little, and the colour with the highest must reach full scale, too. It is
+    # one less because LibRaw drops decimals after scaling: otherwise every seventh white level would end at 65534.
     return max(white - max(raw.black_level_per_channel) - 1, 1)
 
 

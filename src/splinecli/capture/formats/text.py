@@ -1,4 +1,4 @@
-"""Text files as people really hand them in: any separator, byte order marks, comments, blank lines."""
+"""Rows of numbers in text files, with any separator, byte order marks, comments and blank lines."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _SEPARATORS = re.compile(r"[\s,;]+")
 
 @dataclass(frozen=True)
 class NumberRows:
-    """The rows of numbers of a text file, not necessarily of one length.
+    """The rows of numbers of a text file, which may differ in length.
 
     Args:
         path: the file.
         rows: the numbers of each row, all finite.
-        lines: the one-based line of the file that each row stands on.
-        texts: those lines as written, without comment.
+        lines: the one-based line of each row in the file.
+        texts: these lines as written, without comments.
     """
 
     path: Path
@@ -31,11 +31,11 @@ class NumberRows:
     texts: tuple[str, ...] = field(repr=False)
 
     def drop_first(self) -> NumberRows:
-        """Without the first row (a count line)."""
+        """Return the rows without the first one (a count line)."""
         return NumberRows(self.path, self.rows[1:], self.lines[1:], self.texts[1:])
 
     def as_array(self) -> NDArray[np.float64]:
-        """The rows as (R, C) float64; raises InputError at the first row that differs in length."""
+        """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
         lengths = [len(row) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
         for row, line in zip(self.rows, self.lines, strict=True):
@@ -49,14 +49,15 @@ class NumberRows:
 
 
 def columns(count: int) -> str:
+    """Return "1 column", "2 columns" and so on."""
     return f"{count} column" + ("" if count == 1 else "s")
 
 
 def read_lines(path: Path, *, else_latin_1: bool = False) -> list[str]:
-    """The lines of a UTF-8 file, with or without a byte order mark; InputError where it cannot be read.
+    """Return the lines of a UTF-8 file, with or without a byte order mark. Raises InputError.
 
     Args:
-        else_latin_1: whether a file that is not UTF-8 is taken for Latin-1, as older programs on Windows write.
+        else_latin_1: whether a file that is not UTF-8 is read as Latin-1, which older programs on Windows write.
     """
     try:
         return path.read_text(encoding="utf-8-sig").split("\n")
@@ -75,10 +76,10 @@ def read_lines(path: Path, *, else_latin_1: bool = False) -> list[str]:
 
 
 def read_number_rows(path: Path) -> NumberRows:
-    """Numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
+    """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
 
     Raises:
-        InputError: with the line, for a word that is no finite number; or the file holds no numbers at all.
+        InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
     rows, lines, texts = [], [], []
     for line, text in enumerate(read_lines(path), start=1):
@@ -94,9 +95,9 @@ def read_number_rows(path: Path) -> NumberRows:
 
 
 def parse_number(word: str, path: Path, line: int) -> float:
-    """A finite number from one word of a text file; InputError, with the line, for any other."""
+    """Return the finite number that a word of a text file holds. Raises InputError with the line."""
     try:
-        # float() would also take Python's own "1_000".
+        # float() also takes Python's notation "1_000".
         value = float(word) if "_" not in word else None
     except ValueError:
         value = None

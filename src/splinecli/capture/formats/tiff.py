@@ -1,4 +1,4 @@
-"""TIFF files as pixels: 8 and 16 bits and floating point, gray or RGB."""
+"""Pixels of TIFF files: 8 and 16 bits and floating point, gray or RGB."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError
 
-# TIFF's PhotometricInterpretation: what a sample means.
+# Values of TIFF's PhotometricInterpretation, the meaning of a sample.
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
 def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """The first picture of a TIFF file as stored, (H, W) or (H, W, samples).
+    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples).
 
-    Values grow with brightness: a file in which zero is white is turned round, as viewers show it.
-    tifffile reads every sample format; OpenCV stands in for compressions that it has no decoder for (LZW).
+    Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
+    every sample format. OpenCV decodes compressions for which tifffile has no decoder (LZW).
 
     Raises:
         InputError: the file is truncated, damaged, or of a kind that holds no linear gray or RGB values.
@@ -44,7 +44,7 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
                 pixels = _decode_page(page)
         except InputError:
             raise
-        except Exception:  # a damaged header causes whatever it causes: struct, key, value, memory errors
+        except Exception:  # a damaged header causes struct, key, value or memory errors
             raise damaged from None
     if pixels is None:
         if photometric == _WHITE_IS_ZERO:
@@ -59,12 +59,12 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
 
 
 def _decode_page(page: Any) -> NDArray[Any] | None:
-    """(H, W) or (H, W, samples), or None where tifffile has no decoder or fails in it."""
+    """Return pixels (H, W) or (H, W, samples); None where tifffile has no decoder or fails."""
     if int(page.photometric) == _YCBCR:
         return None
     try:
         pixels: NDArray[Any] = page.asarray()
-    except Exception:  # a missing codec shows as one of several types, depending on tifffile's version
+    except Exception:  # the type of the error for a missing codec depends on tifffile's version
         return None
     if page.axes == "SYX":
         pixels = np.moveaxis(pixels, 0, -1)
@@ -72,6 +72,7 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
 
 
 def _check_complete(page: Any, path: Path) -> None:
+    """Raise InputError where a part of the pixels lies beyond the end of the file."""
     size = path.stat().st_size
     if any(
         count == 0 or offset + count > size
@@ -82,7 +83,7 @@ def _check_complete(page: Any, path: Path) -> None:
 
 @contextmanager
 def _quiet_tifffile() -> Iterator[None]:
-    """tifffile logs what it dislikes about a file; the errors raised here say all that a user needs."""
+    """Keep tifffile from logging. The errors raised here say what a user needs."""
     logger = logging.getLogger("tifffile")
     before = logger.disabled
     logger.disabled = True

@@ -17,15 +17,15 @@ from splinecli.errors import InputError
 
 
 def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray[np.float64]:
-    """Unit light directions (F, 3) float64 from a text file.
+    """Return unit light directions (F, 3) float64 from a text file.
 
-    A row holds x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of
-    lights is accepted (the University of Washington's lights.txt), and so is 3 x N (PSBox), where N x 3 does
-    not fit; 3 x 3 is read as rows. Vectors need not be unit length.
+    A row holds x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of lights is
+    accepted (the University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is read as
+    rows. Vectors may have any length above zero.
 
     Args:
         path: the file.
-        n_images: how many lights there have to be, where that is known.
+        n_images: the number of lights that is expected, if it is known.
 
     Raises:
         InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
@@ -48,16 +48,19 @@ def unit_directions(
     lines: Sequence[int | None],
     places: Sequence[str],
 ) -> NDArray[np.float64]:
-    """Vectors (F, 3) at unit length.
+    """Return vectors (F, 3) at unit length.
 
     Args:
-        path, lines, places: where each stands in its file: its line, and words that say where on it.
+        vectors: of any length.
+        path: the file, for messages.
+        lines: the line of each vector in the file.
+        places: words for the place of each vector on its line.
 
     Raises:
         InputError: a zero vector, or a light that is not above the horizon.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
-    # Divided by the largest component first: squares of very large or small ones leave float64's range.
+    # First divide by the largest component, because squares of very large or small ones leave float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
     directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
@@ -75,12 +78,12 @@ def unit_directions(
 
 
 def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
-    """Light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
+    """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
-    One number a light counts for all three channels.
+    A single number for each light is used for all three channels.
 
     Raises:
-        InputError: as read_light_directions does, and with the line for an intensity that is not above zero.
+        InputError: as for read_light_directions; also with the line, for an intensity that is not above zero.
     """
     table = _drop_count_line(read_number_rows(Path(path)), n_images)
     names = {3: "R G B", 1: "gray"}
@@ -96,13 +99,13 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
 
 
 def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
-    """The table without a first line that only counts the lights."""
+    """Return the table without a first line that only counts the lights."""
     if len(table.rows[0]) != 1 or len(table.rows) == 1:
         return table
     following = table.drop_first()
     count = table.rows[0][0]
     if all(len(row) == 1 for row in following.rows):
-        # A single column: the first number counts only where that makes the rest fit.
+        # In a single column, the first number is a count only if the rest then fits.
         return following if len(following.rows) == count == n_images else table
     if count in (len(following.rows), len(following.rows[0])):
         return following
@@ -122,10 +125,11 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
 def _one_light_a_row(
     table: NumberRows, names: dict[int, str], what: str, n_images: int | None
 ) -> tuple[NDArray[np.float64], bool]:
-    """The numbers with one light a row, and whether the file has one light a column.
+    """Return the numbers with one light in each row, and whether the file has one light in each column.
 
     Args:
-        names: the numbers a light may have, each with its meaning.
+        names: the possible counts of numbers for a light, each with its meaning.
+        what: what the numbers are, for messages.
     """
     values = table.as_array()
     n_rows, n_columns = values.shape

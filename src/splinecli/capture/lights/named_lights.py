@@ -1,6 +1,6 @@
 """Light files that name the image of each light: RTI's .lp and the JSON of AliceVision (Meshroom).
 
-Their names often come from another machine, with folders that do not exist here, or are mere numbers; so the images of
+The names often come from another machine, with folders that do not exist here, or are only numbers. So the images of
 the folder are matched to them by base name, then by name without suffix, then by order.
 """
 
@@ -30,8 +30,8 @@ class NamedLights:
 
     Args:
         path: the file.
-        names: of the images, without folders.
-        lines: of the file; None for each where lines mean nothing.
+        names: names of the images, without folders.
+        lines: the line of each light in the file; None for each where the file has no lines.
         directions: (F, 3) float64, unit; x right, y up, z to the camera.
         intensities: (F, 3) float64, RGB, or None where the file has none.
     """
@@ -43,12 +43,12 @@ class NamedLights:
     intensities: NDArray[np.float64] | None = None
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
-        """The image of each light, and how it was found: "name", "name without suffix" or "order".
+        """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
 
-        Images that no light names are left out, unless the order alone decides.
+        Images that no light names are left out, unless they are matched by order.
 
         Raises:
-            InputError: two lights have one name, or neither names nor the number of images fit.
+            InputError: two lights have one name, or neither the names nor the number of images fit.
         """
         lines: dict[str, int | None] = {}
         for name, line in zip(self.names, self.lines, strict=True):
@@ -73,17 +73,17 @@ class NamedLights:
             f' the image "{self.names[missing]}" is not among them',
             path=self.path,
             line=self.lines[missing],
-            hint="Give each light's image the name that it has here, or give as many images as lights, in order",
+            hint="Correct the names in the file, or give as many images as lights, in the same order",
         )
 
 
 def read_named_lights(path: Path) -> NamedLights:
-    """Read an .lp or AliceVision JSON file, told by its suffix. Raises InputError."""
+    """Return the lights of an .lp or AliceVision JSON file; the suffix decides which. Raises InputError."""
     return _read_json(path) if path.suffix.lower() == ".json" else _read_lp(path)
 
 
 def _read_lp(path: Path) -> NamedLights:
-    """RTI: a first line with the number of lights, then `file name x y z` a line; names may hold spaces."""
+    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may hold spaces."""
     stored = read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
@@ -113,9 +113,11 @@ def _read_lp(path: Path) -> NamedLights:
 
 
 def _read_json(path: Path) -> NamedLights:
-    """AliceVision: {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
+    """Read AliceVision's format.
 
-    Its y points down and its z away from the camera.
+    {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
+
+    In the file, y points down and z away from the camera.
     """
     try:
         document = json.loads("\n".join(read_lines(path)))
