@@ -10,6 +10,7 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
+from splinecli.cli.choices import fill_in
 from splinecli.cli.panels import sort_into_panels
 
 TERM_WIDTH = 30
@@ -78,7 +79,8 @@ def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def _tidy(meaning: str) -> str:
-    """Return a help text without the ranges of numbers that click adds, such as "[x>=1]"."""
+    """Return a help text with names filled in, and without the ranges of numbers that click adds ("[x>=1]")."""
+    meaning = fill_in(meaning)
     meaning = re.sub(rf"\s*\[{_RANGE}\]$", "", meaning)
     return " ".join(re.sub(rf"; {_RANGE}\]$", "]", meaning).split())
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splinecli.cli import choices
 from splinecli.cli.console import Messages
 from splinecli.cli.options import (
     AmbientOption,
@@ -19,7 +21,6 @@ from splinecli.cli.options import (
     Device,
     DeviceOption,
     FlatFieldOption,
-    JsonOption,
     NormalConvention,
     OverwriteOption,
     Precision,
@@ -30,8 +31,8 @@ from splinecli.cli.options import (
     TransferOption,
     UpdateOption,
     WeightsOption,
+    WhiteLevelOption,
     complete_list,
-    complete_methods,
     parse_indices,
     split_commas,
 )
@@ -39,6 +40,7 @@ from splinecli.errors import SplinecliError, UsageError
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome, Redo
+    from splinecli.pipeline.options import InferOptions
 
 
 _WORDS = {
@@ -53,46 +55,43 @@ _WORDS = {
 
 def infer(
     captures: Annotated[
-        list[Path], typer.Argument(metavar="CAPTURE", help="Folders of images of one object each.")
+        list[Path], typer.Argument(metavar="CAPTURE", help="Folders of images, each of one object.")
     ],
     lights: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Light directions, a line x y z for each image (z to the camera)."),
+        typer.Option(metavar="FILE", help="Light directions: a line x y z for each image, z to the camera."),
     ] = None,
     intensities: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE|equal",
-            help="Light intensities, a line r g b for each image. [default: equal, unless they plainly are not]",
+            help="Light intensities: a line r g b for each image. [default: estimated where they are unequal]",
         ),
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Picture that is bright on the object. [default: all]")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Mask image: non-zero pixels belong to the object. [default: all pixels]"
+        ),
     ] = None,
     auto_mask: Annotated[
         bool,
-        typer.Option(
-            "--auto-mask", help="Find the object where there is no mask; found_mask.png is what was found."
-        ),
+        typer.Option("--auto-mask", help="Find the object if there is no mask, and write found_mask.png."),
     ] = False,
     ground_truth: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF) to compare with."),
+        typer.Option(metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."),
     ] = None,
     transfer: TransferOption = "linear",
     ambient: AmbientOption = None,
     flat_field: FlatFieldOption = None,
+    white_level: WhiteLevelOption = None,
     as_stored: AsStoredOption = False,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Results go to OUT/<capture name>/.")
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/.")
     ] = Path("out"),
     method: Annotated[
-        str,
-        typer.Option(
-            metavar="METHOD",
-            help="spline-net, cnn-ps, ls, ls-trimmed, l1, iw12, st14 or ia14.",
-            autocompletion=complete_methods,
-        ),
+        str, typer.Option(metavar="METHOD", help="{methods}.", autocompletion=choices.methods)
     ] = "spline-net",
     weights: WeightsOption = None,
     n_lights: Annotated[
@@ -111,30 +110,34 @@ def infer(
         typer.Option(
             "--format",
             metavar="LIST",
-            help="Any of png (16-bit), png8 (8-bit), npy, tiff (both float32).",
-            autocompletion=complete_list("png", "png8", "npy", "tiff"),
+            help="Files of the normal map: any of {formats}. png has 16 bits, png8 has 8, npy and tiff are float32.",
+            autocompletion=complete_list(choices.normal_formats),
         ),
     ] = "png,npy",
     maps: Annotated[
         str | None,
         typer.Option(
             metavar="LIST",
-            help="Also write any of albedo, confidence, preview (shaded picture).",
-            autocompletion=complete_list("albedo", "confidence", "preview"),
+            help="Further maps to write: any of {maps} (a shaded image).",
+            autocompletion=complete_list(choices.maps),
         ),
     ] = None,
     html: Annotated[
-        bool, typer.Option("--html", help="Also write page.html: pictures and a view under a movable light.")
+        bool, typer.Option("--html", help="Also write page.html: images and a view under a movable light.")
     ] = False,
     surface: Annotated[
-        bool, typer.Option("--surface", help="Also write mesh.ply, depth.npy and depth.tiff: see integrate.")
+        bool,
+        typer.Option("--surface", help="Also write mesh.ply, depth.npy and depth.tiff, as integrate does."),
     ] = False,
     convention: Annotated[
-        NormalConvention, typer.Option(help="Green of the PNG: opengl is y up, directx is y down.")
+        NormalConvention,
+        typer.Option(help="Green channel of the PNG files: opengl is y up, directx is y down."),
     ] = NormalConvention.opengl,
     overwrite: OverwriteOption = False,
     update: UpdateOption = False,
-    as_json: JsonOption = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a JSON list of the reports on stdout, and nothing else.")
+    ] = False,
     quiet: QuietOption = False,
 ) -> int:
     """Estimate the normal map of each CAPTURE.
@@ -147,62 +150,87 @@ def infer(
     its results, unless --update or --overwrite is given. A capture that fails does not stop the others. The exit code
     is that of the worst capture.
     """
-    from splinecli.pipeline.batch import error_document, infer_batch, worst_exit_code
     from splinecli.pipeline.options import InferOptions
-    from splinecli.results.files import MAPS, NORMALS
 
-    if overwrite and update:
-        raise UsageError("--overwrite and --update exclude each other")
-    options = InferOptions(
-        lights=_text(lights),
-        intensities=_text(intensities),
-        mask=_text(mask),
-        auto_mask=auto_mask,
-        ground_truth=_text(ground_truth),
-        transfer=transfer,
-        ambient=_text(ambient),
-        flat_field=_text(flat_field),
-        as_stored=as_stored,
-        n_lights=n_lights,
-        seed=seed if n_lights is not None else 0,
-        light_indices=None
-        if light_indices is None
-        else tuple(parse_indices(light_indices, "--light-indices")),
-        method=method,
-        weights=weights,
-        rotations=rotations,
-        batch_size=batch_size,
-        device=device.value,
-        precision=precision.value,
-        output=str(output),
-        formats=tuple(split_commas(formats, "--format", list(NORMALS))),
-        maps=() if maps is None else tuple(split_commas(maps, "--maps", list(MAPS))),
-        html=html,
-        surface=surface,
-        convention=convention.value,
-    )
-    messages = Messages(quiet=quiet)
-    outcomes: list[Outcome] = []
+    with _json_documents(as_json) as documents:
+        if overwrite and update:
+            raise UsageError("--overwrite and --update exclude each other")
+        options = InferOptions(
+            lights=_text(lights),
+            intensities=_text(intensities),
+            mask=_text(mask),
+            auto_mask=auto_mask,
+            ground_truth=_text(ground_truth),
+            transfer=transfer,
+            ambient=_text(ambient),
+            flat_field=_text(flat_field),
+            white_level=white_level,
+            as_stored=as_stored,
+            n_lights=n_lights,
+            seed=seed if n_lights is not None else 0,
+            light_indices=None if light_indices is None else _indices(light_indices),
+            method=method,
+            weights=weights,
+            rotations=rotations,
+            batch_size=batch_size,
+            device=device.value,
+            precision=precision.value,
+            output=str(output),
+            formats=tuple(split_commas(formats, "--format", choices.normal_formats())),
+            maps=() if maps is None else tuple(split_commas(maps, "--maps", choices.maps())),
+            html=html,
+            surface=surface,
+            convention=convention.value,
+        )
+        redo: Redo = "all" if overwrite else "changed" if update else "nothing"
+        return _run(
+            captures, options, Messages(quiet=quiet), redo, documents, summaries=not (quiet or as_json)
+        )
+
+
+@contextmanager
+def _json_documents(wanted: bool) -> Iterator[list[dict[str, Any]]]:
+    """Yield a list of documents and print it at the end, also after an error, if it is wanted."""
+    from splinecli.pipeline.batch import error_document
+
     documents: list[dict[str, Any]] = []
     try:
-        redo: Redo = "all" if overwrite else "changed" if update else "nothing"
-        for outcome in infer_batch(captures, options, messages, redo=redo):
-            outcomes.append(outcome)
-            documents.append(outcome.report)
-            _show(outcome, output, messages, with_summary=not (quiet or as_json))
-        if len(captures) == 1:
-            pass
-        elif any(outcome.status == "missing" for outcome in outcomes):
-            messages.say("Nothing was computed.")
-        else:
-            _show_table(outcomes, output, messages)
+        yield documents
     except SplinecliError as error:
         documents.append(error_document(error))
         raise
     finally:
-        if as_json:
+        if wanted:
             print(json.dumps(documents, indent=2))
+
+
+def _run(
+    captures: Sequence[Path],
+    options: InferOptions,
+    messages: Messages,
+    redo: Redo,
+    documents: list[dict[str, Any]],
+    *,
+    summaries: bool,
+) -> int:
+    """Run the batch, print what becomes of each capture, and return the exit code."""
+    from splinecli.pipeline.batch import infer_batch, worst_exit_code
+
+    outcomes, output = [], Path(options.output)
+    for outcome in infer_batch(captures, options, messages, redo=redo):
+        outcomes.append(outcome)
+        documents.append(outcome.report)
+        _show(outcome, output, messages, with_summary=summaries)
+    if any(outcome.status == "missing" for outcome in outcomes):
+        if len(captures) > 1:
+            messages.say("Nothing was computed.")
+    elif len(captures) > 1:
+        _show_table(outcomes, output, messages)
     return worst_exit_code(outcome.exit_code for outcome in outcomes)
+
+
+def _indices(text: str) -> tuple[int, ...]:
+    return tuple(parse_indices(text, "--light-indices"))
 
 
 def _text(path: Path | None) -> str | None:

@@ -1,4 +1,4 @@
-"""Option types that several commands share, the parsing of their values, and what a shell may complete them to."""
+"""Options that several commands share, their completion, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splinecli.cli import choices
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Device(StrEnum):
-    """Where to compute."""
+    """Device to compute on."""
 
     auto = "auto"
     cpu = "cpu"
@@ -26,39 +27,40 @@ class Device(StrEnum):
 
 
 class NormalConvention(StrEnum):
-    """Which way green points in the picture."""
+    """Direction of the green channel of a normal map: up in opengl, down in directx."""
 
     opengl = "opengl"
     directx = "directx"
 
 
 class Precision(StrEnum):
-    """What to compute in."""
+    """Number format to compute in."""
 
     auto = "auto"
     float32 = "float32"
     bfloat16 = "bfloat16"
 
 
-def complete_methods() -> list[str]:
-    """What --method may be."""
-    from splinecli.methods import method_names
-
-    return method_names()
+complete_methods = choices.methods
 
 
 def complete_weights() -> list[str]:
-    """Names of the shipped weights. Where none begins like what was typed, the shell completes to files."""
-    # What else reads this file imports torch, which takes longer than one waits for a completion.
+    """Return the names of the shipped weights. If none begins with the typed text, the shell completes file names."""
+    # The module that reads this file imports torch, which takes too long for a completion.
     return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
 
 
-def complete_list(*items: str) -> Callable[[str], list[str]]:
-    """Completion of "a,b": to what was typed up to the last comma, and each item that is not in it."""
+def complete_list(*items: str | Callable[[], list[str]]) -> Callable[[str], list[str]]:
+    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma.
+
+    Args:
+        items: the items, or functions that return them.
+    """
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")
-        return [",".join([*typed, item]) for item in items if item not in typed]
+        names = [name for item in items for name in ([item] if isinstance(item, str) else item())]
+        return [",".join([*typed, name]) for name in names if name not in typed]
 
     return complete
 
@@ -68,7 +70,7 @@ TransferOption = Annotated[
     typer.Option(
         "--transfer",
         metavar="CURVE",
-        help="Of the images: linear, srgb or gamma:G.",
+        help="Transfer curve of the images: linear, srgb or gamma:G.",
         autocompletion=lambda: ["linear", "srgb", "gamma:2.2"],
     ),
 ]
@@ -77,13 +79,24 @@ AmbientOption = Annotated[
     typer.Option(
         "--ambient",
         metavar="FILE",
-        help="Image without any of the lights, to be taken off. [default: ambient.*]",
+        help="Image taken without the lights, to subtract from all images. [default: ambient.*]",
     ),
 ]
 FlatFieldOption = Annotated[
     Path | None,
     typer.Option(
-        "--flat-field", metavar="DIR", help="Images of something evenly white, one for each light or for all."
+        "--flat-field",
+        metavar="DIR",
+        help="Images of an evenly white surface: one for all lights, or one each.",
+    ),
+]
+WhiteLevelOption = Annotated[
+    float | None,
+    typer.Option(
+        "--white-level",
+        metavar="N",
+        min=0,
+        help="Stored value from which a pixel counts as saturated. [default: found in the images]",
     ),
 ]
 WhiteLevelOption = Annotated[
@@ -99,7 +112,7 @@ AsStoredOption = Annotated[
     bool,
     typer.Option(
         "--as-stored",
-        help="Use the stored values alone: restore no saturated pixels, estimate no intensities.",
+        help="Neither restore saturated pixels nor estimate unknown light intensities.",
     ),
 ]
 WeightsOption = Annotated[
@@ -107,7 +120,7 @@ WeightsOption = Annotated[
     typer.Option(
         "--weights",
         metavar="NAME|FILE",
-        help="Shipped weights by name, or a file. [default: the method's]",
+        help="Weights: a shipped name or a file. [default: those of the method]",
         autocompletion=complete_weights,
     ),
 ]
@@ -117,19 +130,21 @@ RotationsOption = Annotated[
         "--rotations",
         metavar="R",
         min=1,
-        help="Views of each pixel that a network averages. [default: 1; cnn-ps: 10]",
+        help="Rotated copies of each pixel that a network averages over. [default: 1; cnn-ps: 10]",
     ),
 ]
 DeviceOption = Annotated[
-    Device, typer.Option("--device", help="Where to compute; auto takes a CUDA GPU if any.")
+    Device, typer.Option("--device", help="Device to compute on. auto takes a CUDA GPU if there is one.")
 ]
 PrecisionOption = Annotated[
-    Precision, typer.Option("--precision", help="auto takes bfloat16 where the hardware computes in it.")
+    Precision,
+    typer.Option("--precision", help="Number format. auto takes bfloat16 where the hardware supports it."),
 ]
 BatchSizeOption = Annotated[
-    int | None, typer.Option("--batch-size", metavar="N", min=1, help="Pixels at a time in the network.")
+    int | None,
+    typer.Option("--batch-size", metavar="N", min=1, help="Pixels that the method computes at a time."),
 ]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier results.")]
 UpdateOption = Annotated[
     bool, typer.Option("--update", help="Redo captures that changed, skip those that are done.")
@@ -143,12 +158,12 @@ SeedOption = Annotated[
 
 
 def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
-    """The items of "a,b". Raises UsageError for one that is not allowed."""
+    """Return the items of "a,b". Raises UsageError for an item that is not allowed."""
     items = [item.strip() for item in text.split(",") if item.strip()]
     for item in items:
         if item not in allowed:
             raise UsageError(
-                f"{option} holds {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}"
+                f"{option} has {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}"
             )
     if not items:
         raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
@@ -156,7 +171,7 @@ def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
 
 
 def parse_indices(text: str, option: str) -> list[int]:
-    """Whole numbers from "0,5,12". Raises UsageError."""
+    """Return the whole numbers of "0,5,12". Raises UsageError."""
     try:
         return [int(item) for item in text.split(",")]
     except ValueError:

@@ -59,12 +59,12 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
 
 
 def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
-    """Return a digest that changes when any file that is read for the capture changes."""
+    """Return a digest that changes when any file that is read for the capture, or the weight file, changes."""
     from splinecli.capture.stamp import digest, stamp_capture
     from splinecli.files import file_sha256
 
-    own_weights = weights if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
-    return digest([*stamp_capture(source), own_weights])
+    weight_file = None if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
+    return digest([*stamp_capture(source), weight_file or weights])
 
 
 def _differences(earlier: InferOptions, options: InferOptions) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -34,6 +35,7 @@ class InferOptions:
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
+        white_level: stored value from which a pixel counts as saturated, such as 4095. None to find it.
         as_stored: use the stored values alone. By default, saturated pixels are restored and unknown light
             intensities are estimated.
         n_lights, seed: use this many lights, drawn with this seed. None for all lights.
@@ -59,6 +61,7 @@ class InferOptions:
     transfer: str = "linear"
     ambient: str | None = None
     flat_field: str | None = None
+    white_level: float | None = None
     as_stored: bool = False
     n_lights: int | None = None
     seed: int = 0
@@ -92,6 +95,8 @@ class InferOptions:
         if self.light_indices is not None:
             check_light_indices(self.light_indices, max(self.light_indices, default=0) + 1)
         parse_transfer(self.transfer)
+        if self.white_level is not None and not 0 < self.white_level < math.inf:
+            raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
         _check_one_of("precision", self.precision, get_args(Precision))
         _check_one_of("device", self.device, get_args(Device))
         _check_one_of("convention", self.convention, get_args(Convention))
@@ -143,6 +148,7 @@ class InferOptions:
             mask=self.mask,
             ground_truth=self.ground_truth,
             radiometry=self.radiometric_calibration(),
+            white_level=self.white_level,
         )
 
 

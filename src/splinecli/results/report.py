@@ -63,6 +63,7 @@ def report_of(
         "inputs_sha256": inputs,
         "version": __version__,
         "reading": "as stored" if as_stored else "restored",
+        "white_level": None if capture.white_level is None else asdict(capture.white_level),
     }
 
 
