@@ -529,7 +529,7 @@ def test_output_that_cannot_be_written(capture, run, golden):
 
 
 def test_interrupted_while_estimating(capture, run, monkeypatch):
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(LeastSquares, "estimate", interrupt)
@@ -539,7 +539,7 @@ def test_interrupted_while_estimating(capture, run, monkeypatch):
 
 
 def test_interrupted_while_writing(capture, run, monkeypatch):
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("splinecli.results.files.encode_png", interrupt)
@@ -562,7 +562,7 @@ def test_ctrl_c_ends_a_real_process(capture):
 
 
 def test_a_defect_is_called_one(capture, run, monkeypatch):
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("oops")
 
     monkeypatch.setattr(LeastSquares, "estimate", fail)
