@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
-from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -189,41 +187,6 @@ def test_overexposed_photographs(capture, run):
     assert any(warning["code"] == "saturated" for warning in after["warnings"])
 
 
-def test_an_index_of_several_captures(capture, make_capture, run):
-    make_capture("a b")
-    make_capture("broken")
-    Path("broken/image3.png").write_bytes(b"no picture")
-    Path("out").mkdir()
-    Path("out/index.html").write_text("<html>my site</html>", "utf-8")
-    captures = (capture, "a b", "broken", "--method", "ls", "--html")
-    kept = run("infer", *captures)
-    assert (kept.code, "index.html: was not written by splinecli" in kept.err) == (5, True)
-    Path("out/index.html").unlink()
-    assert run("infer", *captures).code == 3
-    index = Path("out/index.html").read_text("utf-8")
-    links = re.findall(r'href="([^"]+)"', index)
-    assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
-    assert all((Path("out") / unquote(link)).is_file() for link in links)
-    assert "found neither PNG, TIFF nor JPEG" in index
-    assert run("infer", *captures).code == 3  # our own index is replaced
-    # Later results in the same place join it, and those of a single capture, too.
-    make_capture("fourth")
-    make_capture("fifth")
-    assert run("infer", "fourth", "a b", "--method", "ls", "--overwrite").code == 0
-    assert run("infer", "fifth", "--method", "ls").code == 0
-    links = re.findall(r'href="([^"]+)"', Path("out/index.html").read_text("utf-8"))
-    assert {f"{name}/normals.npy" for name in ("sphere", "a%20b", "fourth", "fifth")} <= set(links)
-    assert len([link for link in links if link == "a%20b/normals.npy"]) == 1
-    Path("place/index.html").mkdir(parents=True)
-    assert run("infer", capture, "fourth", "--method", "ls", "-o", "place", "--overwrite").code == 5
-
-
-def test_names_that_are_no_text(capture, make_capture, run):
-    odd = make_capture("odd").rename(os.fsdecode(b"x\xff"))
-    assert run("infer", capture, odd, "--method", "ls").code == 0
-    assert 'href="x%FF/normals.npy"' in Path("out/index.html").read_text("utf-8")
-
-
 def test_no_picture_of_ours_is_a_photograph():
     pictures = {Path(name).stem for name in OWN_FILES if Path(name).suffix in IMAGE_SUFFIXES}
     assert pictures <= NOT_PHOTOGRAPHS
@@ -334,17 +297,6 @@ def test_rotations_change_little_and_batches_nothing(capture, run):
     assert angle_between_deg(one[inside], small[inside]).max() < 0.05
 
 
-def test_refuses_to_overwrite(capture, run, golden):
-    run("infer", capture, "--method", "ls")
-    before = read_report(Path("out/sphere"))
-    result = run("infer", capture, "--method", "ls", "--n-lights", 4)
-    assert (result.code, result.out) == (5, "")
-    golden("error_exists.txt", result.err)
-    assert read_report(Path("out/sphere")) == before
-    assert run("infer", capture, "--method", "ls", "--n-lights", 4, "--overwrite").code == 0
-    assert read_report(Path("out/sphere"))["n_lights"] == 4
-
-
 def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
     run("infer", capture, "--method", "ls")
     Path("out/sphere/notes.txt").write_text("mine")
@@ -352,156 +304,6 @@ def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
     run("infer", capture, "--method", "ls", "--overwrite")
     names = sorted(path.name for path in Path("out/sphere").iterdir())
     assert names == ["normals.npy", "normals.png", "notes.txt", "report.json"]
-
-
-def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
-    make_capture("broken")
-    Path("broken/image3.png").write_bytes(b"no picture")
-    make_capture("third")
-    result = run("infer", capture, "broken", "third", "--method", "ls")
-    assert result.code == 3
-    golden("batch.out.txt", result.out)
-    golden("batch.err.txt", re.sub(r"[0-9]+\.[0-9]$", "SECONDS", result.err, flags=re.MULTILINE))
-    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "sphere", "third"]
-
-    documents = json.loads(run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out)
-    assert documents[0] == read_report(Path("out/sphere"))
-    assert documents[1]["capture"] == "broken"
-    assert "image3.png" in documents[1]["error"]
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [("--n-lights", 2), ("--light-indices", "0,0,1"), ("--device", "cuda"), ("--weights", "spline-net")],
-)
-def test_usage_errors_end_a_batch_at_once(arguments, capture, make_capture, run, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    make_capture("second")
-    method = "spline-net" if "--device" in arguments else "ls"
-    result = run("infer", capture, "second", "--method", method, *arguments)
-    assert (result.code, result.out, result.err.count("\n")) == (2, "", 1)
-    assert not Path("out").exists()
-
-
-def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
-    make_capture("second")
-    broken = make_capture("third") / "image3.png"
-    whole = broken.read_bytes()
-    broken.write_bytes(b"no picture")
-    captures = ("sphere", "second", "third")
-    first = run("infer", *captures, "--method", "ls")
-    assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
-    before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
-    broken.write_bytes(whole)
-    again = run("infer", *captures, "--method", "ls")
-    assert again.code == 0
-    assert again.out.startswith("out/third: ")
-    assert "out/second: already done, skipped\n" in again.err
-    assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
-    assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
-    # The same in JSON has all reports.
-    reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
-    assert [report["capture"] for report in reports] == list(captures)
-
-
-def change_light_file(capture: Path) -> tuple[str, ...]:
-    light = capture / "light_directions.txt"
-    light.write_text(light.read_text() + "# measured anew\n")
-    return ()
-
-
-def remove_a_result(capture: Path) -> tuple[str, ...]:
-    (Path("out") / capture / "normals.png").unlink()
-    return ()
-
-
-def change_the_version(capture: Path) -> tuple[str, ...]:
-    path = Path("out") / capture / "report.json"
-    path.write_text(path.read_text().replace('"version": "', '"version": "0.0.'))
-    return ()
-
-
-CHANGES = {
-    "other options (n_lights)": lambda _: ("--n-lights", "4"),
-    "other input files": change_light_file,
-    "without normals.png": remove_a_result,
-    "of version 0.0.": change_the_version,
-}
-
-
-@pytest.mark.parametrize("reason", CHANGES)
-@pytest.mark.parametrize("others", [(), ("second",)], ids=["one", "several"])
-def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason, others):
-    """One capture and several obey the same rules."""
-    make_capture("second")
-    call = ("infer", capture, *others, "--method", "ls")
-    assert run(*call).code == 0
-    extra = CHANGES[reason](capture)
-    before = (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere")))
-    kept = run(*call, *extra)
-    assert (kept.code, kept.out) == (5, "")
-    line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
-    assert reason in line
-    assert "Add --update to redo what changed, --overwrite to redo everything" in line
-    assert (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere"))) == before
-    first, *_ = json.loads(run(*call, *extra, "--json").out)
-    assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
-    updated = run(*call, *extra, "--update")
-    assert updated.code == 0
-    assert Path("out/sphere/normals.npy").stat().st_mtime_ns > before[0]
-    if others and not extra:
-        assert "out/second: already done, skipped" in updated.err
-    assert run(*call, *extra).code == 0
-
-
-def test_update_keeps_files_of_others(capture, run):
-    Path("out/sphere").mkdir(parents=True)
-    Path("out/sphere/normals.png").write_text("drawn by hand")
-    result = run("infer", capture, "--method", "ls", "--update")
-    assert result.code == 5
-    assert "out/sphere: holds normals.png, but no report.json. Add --overwrite" in result.err
-    assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
-    both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
-    assert (both.code, "exclude each other" in both.err) == (2, True)
-
-
-def test_another_object_of_the_same_name(capture, make_capture, run):
-    make_capture("third")
-    assert run("infer", capture, "--method", "ls").code == 0
-    Path("others").mkdir()
-    Path("others/sphere").symlink_to(Path("third").absolute())
-    other = run("infer", "others/sphere", "--method", "ls")
-    assert (other.code, "out/sphere: holds results of other input files" in other.err) == (5, True)
-
-
-def test_links_are_called_by_their_own_names(capture, run):
-    for link in ("x/obj", "y/obj", "one", "two"):
-        Path(link).parent.mkdir(exist_ok=True)
-        Path(link).symlink_to(capture.absolute())
-    assert run("infer", "x/obj", "y/obj", "--method", "ls").code == 2
-    assert run("infer", "one", "two", "--method", "ls").code == 0
-    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "one", "two"]
-
-
-def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
-    holder = capture.parent / "Ball"
-    for kind in ("specular", "metallic"):
-        (holder / f"images_{kind}").mkdir(parents=True)
-        for index in range(8):
-            picture = cv2.imread(str(capture / f"image{index + 1}.png"), cv2.IMREAD_UNCHANGED)
-            tifffile.imwrite(holder / f"images_{kind}/{index:05}.tif", np.dstack([picture] * 3))
-    (holder / "light.txt").write_bytes((capture / "light_directions.txt").read_bytes())
-    for name in ("inboundary.png", "onboundary.png"):
-        (holder / name).write_bytes((capture / "mask.png").read_bytes())
-    result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
-    assert result.code == 0
-    assert result.err.endswith("2 captures: 2 done; see out/index.html\n")
-    assert {path.name for path in Path("out").iterdir()} == {"index.html", "Ball_specular", "Ball_metallic"}
-    assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
-    # An object with several kinds is passed over among others, under its own name.
-    result = run("infer", holder, capture, "--method", "ls", "--overwrite")
-    assert result.code == 3
-    assert "Ball: found 2 folders of images (images_metallic, images_specular)" in result.err
 
 
 def test_interrupted_overwriting_keeps_the_earlier_results(capture, run, monkeypatch):
@@ -559,20 +361,6 @@ def test_ctrl_c_ends_a_real_process(capture):
     assert (process.returncode, err) == (130, "splinecli: interrupted.\n")
     # Nothing half-written stays; the lock is a file of its own.
     assert [path.name for path in Path("run").iterdir() if path.name.startswith(".")] == [".lock"]
-
-
-def test_a_defect_is_called_one(capture, run, monkeypatch):
-    def fail(*_: object, **__: object) -> None:
-        raise ZeroDivisionError("oops")
-
-    monkeypatch.setattr(LeastSquares, "estimate", fail)
-    result = run("infer", capture, "--method", "ls")
-    assert result.code == 1
-    assert "ZeroDivisionError: oops" in result.err
-    assert result.err.endswith(
-        "splinecli: sphere: ZeroDivisionError: oops. This is a defect of splinecli."
-        " Please report it with the lines above.\n"
-    )
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX redirections")

@@ -99,15 +99,6 @@ WhiteLevelOption = Annotated[
         help="Stored value from which a pixel counts as saturated. [default: found in the images]",
     ),
 ]
-WhiteLevelOption = Annotated[
-    float | None,
-    typer.Option(
-        "--white-level",
-        metavar="N",
-        min=0,
-        help="Stored value from which a pixel counts as saturated. [default: found in the images]",
-    ),
-]
 AsStoredOption = Annotated[
     bool,
     typer.Option(

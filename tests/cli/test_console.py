@@ -1,0 +1,64 @@
+"""Progress and messages of the commands: a bar on a terminal, a line every half minute elsewhere."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from splinecli.cli import console
+from splinecli.cli.console import LINE_SECONDS, Messages
+
+
+def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(console.time, "monotonic", lambda: now)
+    with Messages(quiet=False).progress("cat: estimating", 400) as advance:
+        for _ in range(400):
+            now += 0.25
+            advance(1, "calm")
+    lines = capsys.readouterr().err.splitlines()
+    assert LINE_SECONDS == 30
+    assert lines == [
+        "cat: estimating: 30 %, calm",
+        "cat: estimating: 60 %, calm",
+        "cat: estimating: 90 %, calm",
+    ]
+    with Messages(quiet=True).progress("cat: estimating", 1) as advance:
+        now += 100
+        advance(0.5)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX terminals")
+def test_the_bar_moves_at_least_twice_a_second_on_a_terminal():
+    """A bar that is advanced every tenth of a second shows at least four percentages in 2.5 seconds."""
+    import pty
+
+    script = """
+import time
+from splinecli.cli.console import Messages
+with Messages(quiet=False).progress("cat", 25) as advance:
+    for _ in range(25):
+        time.sleep(0.1)
+        advance(1)
+"""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stderr=theirs, env={**os.environ, "TERM": "xterm", "COLUMNS": "80"}
+    )
+    os.close(theirs)
+    shown = b""
+    while True:
+        try:
+            block = os.read(ours, 65536)
+        except OSError:  # the terminal was closed
+            break
+        if not block:
+            break
+        shown += block
+    assert process.wait() == 0
+    percentages = {part.split()[-1] for part in shown.decode().split("%")[:-1] if part.split()}
+    assert len(percentages) >= 4

@@ -1,0 +1,431 @@
+"""One capture and many: what is skipped, kept or redone, failures, the exit code, the JSON and the index."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from splinecli.errors import InputError, OutputError, UsageError
+from splinecli.methods.least_squares import LeastSquares
+from splinecli.pipeline.batch import infer_batch, worst_exit_code
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.observer import Observer
+from splinecli.pipeline.options import InferOptions
+
+
+def read_report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text("utf-8"))
+
+
+def test_refuses_to_overwrite(capture, run, golden):
+    run("infer", capture, "--method", "ls")
+    before = read_report(Path("out/sphere"))
+    result = run("infer", capture, "--method", "ls", "--n-lights", 4)
+    assert (result.code, result.out) == (5, "")
+    golden("error_exists.txt", result.err)
+    assert read_report(Path("out/sphere")) == before
+    assert run("infer", capture, "--method", "ls", "--n-lights", 4, "--overwrite").code == 0
+    assert read_report(Path("out/sphere"))["n_lights"] == 4
+
+
+def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
+    make_capture("broken")
+    Path("broken/image3.png").write_bytes(b"no picture")
+    make_capture("third")
+    result = run("infer", capture, "broken", "third", "--method", "ls")
+    assert result.code == 3
+    golden("batch.out.txt", result.out)
+    golden("batch.err.txt", re.sub(r"[0-9]+\.[0-9]$", "SECONDS", result.err, flags=re.MULTILINE))
+    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "sphere", "third"]
+
+    documents = json.loads(run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out)
+    assert documents[0] == read_report(Path("out/sphere"))
+    assert documents[1]["capture"] == "broken"
+    assert "image3.png" in documents[1]["error"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--n-lights", 2), ("--light-indices", "0,0,1"), ("--device", "cuda"), ("--weights", "spline-net")],
+)
+def test_usage_errors_end_a_batch_at_once(arguments, capture, make_capture, run, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    make_capture("second")
+    method = "spline-net" if "--device" in arguments else "ls"
+    result = run("infer", capture, "second", "--method", method, *arguments)
+    assert (result.code, result.out, result.err.count("\n")) == (2, "", 1)
+    assert not Path("out").exists()
+
+
+def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
+    make_capture("second")
+    broken = make_capture("third") / "image3.png"
+    whole = broken.read_bytes()
+    broken.write_bytes(b"no picture")
+    captures = ("sphere", "second", "third")
+    first = run("infer", *captures, "--method", "ls")
+    assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
+    before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
+    broken.write_bytes(whole)
+    again = run("infer", *captures, "--method", "ls")
+    assert again.code == 0
+    assert again.out.startswith("out/third: ")
+    assert "out/second: already done, skipped\n" in again.err
+    assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
+    assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
+    # The same in JSON has all reports.
+    reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
+    assert [report["capture"] for report in reports] == list(captures)
+
+
+def change_light_file(capture: Path) -> tuple[str, ...]:
+    light = capture / "light_directions.txt"
+    light.write_text(light.read_text() + "# measured anew\n")
+    return ()
+
+
+def remove_a_result(capture: Path) -> tuple[str, ...]:
+    (Path("out") / capture / "normals.png").unlink()
+    return ()
+
+
+def change_the_version(capture: Path) -> tuple[str, ...]:
+    path = Path("out") / capture / "report.json"
+    path.write_text(path.read_text().replace('"version": "', '"version": "0.0.'))
+    return ()
+
+
+CHANGES = {
+    "other options (n_lights)": lambda _: ("--n-lights", "4"),
+    "other input files": change_light_file,
+    "without normals.png": remove_a_result,
+    "of version 0.0.": change_the_version,
+}
+
+
+@pytest.mark.parametrize("reason", CHANGES)
+@pytest.mark.parametrize("others", [(), ("second",)], ids=["one", "several"])
+def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason, others):
+    """One capture and several obey the same rules."""
+    make_capture("second")
+    call = ("infer", capture, *others, "--method", "ls")
+    assert run(*call).code == 0
+    extra = CHANGES[reason](capture)
+    before = (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere")))
+    kept = run(*call, *extra)
+    assert (kept.code, kept.out) == (5, "")
+    line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
+    assert reason in line
+    assert "Add --update to redo what changed, --overwrite to redo everything" in line
+    assert (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere"))) == before
+    first, *_ = json.loads(run(*call, *extra, "--json").out)
+    assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
+    updated = run(*call, *extra, "--update")
+    assert updated.code == 0
+    assert Path("out/sphere/normals.npy").stat().st_mtime_ns > before[0]
+    if others and not extra:
+        assert "out/second: already done, skipped" in updated.err
+    assert run(*call, *extra).code == 0
+
+
+def test_update_keeps_files_of_others(capture, run):
+    Path("out/sphere").mkdir(parents=True)
+    Path("out/sphere/normals.png").write_text("drawn by hand")
+    result = run("infer", capture, "--method", "ls", "--update")
+    assert result.code == 5
+    assert "out/sphere: holds normals.png, but no report.json. Add --overwrite" in result.err
+    assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
+    both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
+    assert (both.code, "exclude each other" in both.err) == (2, True)
+
+
+def test_another_object_of_the_same_name(capture, make_capture, run):
+    make_capture("third")
+    assert run("infer", capture, "--method", "ls").code == 0
+    Path("others").mkdir()
+    Path("others/sphere").symlink_to(Path("third").absolute())
+    other = run("infer", "others/sphere", "--method", "ls")
+    assert (other.code, "out/sphere: holds results of other input files" in other.err) == (5, True)
+
+
+def test_links_are_called_by_their_own_names(capture, run):
+    for link in ("x/obj", "y/obj", "one", "two"):
+        Path(link).parent.mkdir(exist_ok=True)
+        Path(link).symlink_to(capture.absolute())
+    assert run("infer", "x/obj", "y/obj", "--method", "ls").code == 2
+    assert run("infer", "one", "two", "--method", "ls").code == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "one", "two"]
+
+
+def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
+    holder = capture.parent / "Ball"
+    for kind in ("specular", "metallic"):
+        (holder / f"images_{kind}").mkdir(parents=True)
+        for index in range(8):
+            picture = cv2.imread(str(capture / f"image{index + 1}.png"), cv2.IMREAD_UNCHANGED)
+            tifffile.imwrite(holder / f"images_{kind}/{index:05}.tif", np.dstack([picture] * 3))
+    (holder / "light.txt").write_bytes((capture / "light_directions.txt").read_bytes())
+    for name in ("inboundary.png", "onboundary.png"):
+        (holder / name).write_bytes((capture / "mask.png").read_bytes())
+    result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
+    assert result.code == 0
+    assert result.err.endswith("2 captures: 2 done; see out/index.html\n")
+    assert {path.name for path in Path("out").iterdir()} == {"index.html", "Ball_specular", "Ball_metallic"}
+    assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
+    # An object with several kinds is passed over among others, under its own name.
+    result = run("infer", holder, capture, "--method", "ls", "--overwrite")
+    assert result.code == 3
+    assert "Ball: found 2 folders of images (images_metallic, images_specular)" in result.err
+
+
+def test_an_index_of_several_captures(capture, make_capture, run):
+    make_capture("a b")
+    make_capture("broken")
+    Path("broken/image3.png").write_bytes(b"no picture")
+    Path("out").mkdir()
+    Path("out/index.html").write_text("<html>my site</html>", "utf-8")
+    captures = (capture, "a b", "broken", "--method", "ls", "--html")
+    kept = run("infer", *captures)
+    assert (kept.code, "index.html: was not written by splinecli" in kept.err) == (5, True)
+    Path("out/index.html").unlink()
+    assert run("infer", *captures).code == 3
+    index = Path("out/index.html").read_text("utf-8")
+    links = re.findall(r'href="([^"]+)"', index)
+    assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
+    assert all((Path("out") / unquote(link)).is_file() for link in links)
+    assert "found neither PNG, TIFF nor JPEG" in index
+    assert run("infer", *captures).code == 3  # our own index is replaced
+    # Later results in the same place join it, and those of a single capture, too.
+    make_capture("fourth")
+    make_capture("fifth")
+    assert run("infer", "fourth", "a b", "--method", "ls", "--overwrite").code == 0
+    assert run("infer", "fifth", "--method", "ls").code == 0
+    links = re.findall(r'href="([^"]+)"', Path("out/index.html").read_text("utf-8"))
+    assert {f"{name}/normals.npy" for name in ("sphere", "a%20b", "fourth", "fifth")} <= set(links)
+    assert len([link for link in links if link == "a%20b/normals.npy"]) == 1
+    Path("place/index.html").mkdir(parents=True)
+    assert run("infer", capture, "fourth", "--method", "ls", "-o", "place", "--overwrite").code == 5
+
+
+def test_names_that_are_no_text(capture, make_capture, run):
+    odd = make_capture("odd").rename(os.fsdecode(b"x\xff"))
+    assert run("infer", capture, odd, "--method", "ls").code == 0
+    assert 'href="x%FF/normals.npy"' in Path("out/index.html").read_text("utf-8")
+
+
+def test_a_defect_is_called_one(capture, run, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr(LeastSquares, "estimate", fail)
+    result = run("infer", capture, "--method", "ls")
+    assert result.code == 1
+    assert "ZeroDivisionError: oops" in result.err
+    assert result.err.endswith(
+        "splinecli: sphere: ZeroDivisionError: oops. This is a defect of splinecli."
+        " Please report it with the lines above.\n"
+    )
+
+
+FAILURES = {
+    "unreadable image": (PermissionError(errno.EACCES, "Permission denied", "sphere/image1.png"), 3),
+    "bad input": (InputError("the image is damaged"), 3),
+    "usage": (UsageError("too few lights"), 2),
+    "defect": (RuntimeError("oops"), 1),
+    "no memory": (MemoryError("too large"), 1),
+}
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.parametrize("place", ["open", "estimate"])
+def test_a_failure_is_that_of_its_capture(failure, place, capture, make_capture, run, monkeypatch):
+    """The others go on, whatever is raised and wherever."""
+    make_capture("second")
+    error, code = FAILURES[failure]
+    target = {"open": (InferOptions, "open"), "estimate": (LeastSquares, "estimate")}[place]
+    original, calls = getattr(*target), []
+
+    def fail_first(*arguments: object, **options: object) -> object:
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise error
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(*target, fail_first)
+    result = run("infer", capture, "second", "--method", "ls", "--json")
+    assert result.code == code
+    first, second = json.loads(result.out)
+    assert (first["capture"], first["exit_code"], second["capture"]) == ("sphere", code, "second")
+    assert second == read_report(Path("out/second"))
+    if failure == "unreadable image":
+        assert first["error"] == "sphere/image1.png: cannot be read (Permission denied)."
+    assert ("Traceback" in result.err) == (code == 1)
+    assert f"splinecli: {first['error']}\n" in result.err
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may read everything")
+def test_an_image_without_permission(capture, make_capture, run):
+    make_capture("second")
+    (capture / "image1.png").chmod(0)
+    result = run("infer", capture, "second", "--method", "ls")
+    assert (result.code, "sphere/image1.png" in result.err) == (3, True)
+    assert Path("out/second/report.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "error", [OutputError("the folder is full"), OSError(errno.ENOSPC, "No space left on device")]
+)
+def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch):
+    make_capture("second")
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("splinecli.results.files.write_estimate", fail)
+    result = run("infer", capture, "second", "--method", "ls", "--json")
+    (document,) = json.loads(result.out)
+    assert (result.code, document["capture"], document["exit_code"]) == (5, None, 5)
+    assert not Path("out/second").exists()
+
+
+def test_the_worst_exit_code():
+    assert worst_exit_code([]) == 0
+    assert worst_exit_code([0, 3, 0]) == 3
+    assert worst_exit_code([5, 3, 2]) == 5
+    assert worst_exit_code([5, 1, 3]) == 1  # a defect
+
+
+def test_a_folder_of_photographs_and_a_stray_file(capture, run):
+    """A pattern such as captures/* may match files too; they do not stop the captures."""
+    Path("notes.txt").write_text("mine")
+    result = run("infer", capture, "notes.txt", "--method", "ls")
+    assert (result.code, "notes.txt: found a file, expected a folder" in result.err) == (3, True)
+    assert Path("out/sphere/report.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (
+            ("--maps", "albedo", "confidence"),
+            3,
+            "confidence: the folder does not exist. Write lists with commas",
+        ),
+        (("nowhere",), 3, "nowhere: the folder does not exist."),
+        (("--lights", "none.txt"), 3, "none.txt: the file does not exist."),
+        (("--mask", "none.png"), 3, "none.png: the file does not exist."),
+        (("--intensities", "none.txt"), 3, "none.txt: the file does not exist."),
+        (("--ground-truth", "none.mat"), 3, "none.mat: the file does not exist."),
+        (("--ambient", "none.png"), 3, "none.png: the file does not exist."),
+        (("--flat-field", "none"), 3, "none: the folder does not exist."),
+        (("--maps", "albedo,depth"), 2, "--maps has 'depth'"),
+        (("--format", "bmp"), 2, "--format has 'bmp'"),
+        (("--method", "magic"), 2, "no method named 'magic'"),
+        (("--transfer", "rec709"), 2, "the transfer curve is 'rec709'"),
+        (("--white-level", "0"), 2, "the white level is 0, expected a number above 0"),
+        (("--weights", "spline-net"), 2, "method ls uses no weights"),
+        (("--maps", "confidence"), 2, "method ls gives no confidence"),
+        (("--update", "--overwrite"), 2, "--overwrite and --update exclude each other"),
+    ],
+)
+def test_arguments_are_checked_before_the_first_capture(
+    arguments, code, message, capture, make_capture, run, monkeypatch
+):
+    make_capture("second")
+    touched = []
+    monkeypatch.setattr("splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1))
+    method = () if "--method" in arguments else ("--method", "ls")
+    result = run("infer", capture, "second", *method, *arguments)
+    assert (result.code, result.out, touched) == (code, "", [])
+    assert message in result.err
+    assert not Path("out").exists()
+    documents = json.loads(run("infer", capture, "second", *method, *arguments, "--json").out)
+    assert [document["exit_code"] for document in documents] == [code]
+    assert message in documents[0]["error"]
+
+
+def test_json_is_a_list_also_where_nothing_could_be_read(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run("infer", "nofolder", "--json")
+    assert result.code == 3
+    assert json.loads(result.out) == [
+        {"capture": "nofolder", "error": "nofolder: the folder does not exist.", "exit_code": 3}
+    ]
+    assert result.err == "splinecli: nofolder: the folder does not exist.\n"
+
+
+def test_options_are_written_and_read_back(capture, run):
+    """They are the report's `options`, go through JSON and pickle, and tell what changes the results."""
+    options = InferOptions(
+        method="ls",
+        n_lights=5,
+        seed=3,
+        formats=("npy",),
+        maps=("albedo",),
+        white_level=60_000.5,
+        output="elsewhere",
+    )
+    assert InferOptions.from_dict(json.loads(json.dumps(options.as_dict()))) == options
+    assert pickle.loads(pickle.dumps(options)) == options
+    assert infer_capture(capture, options)["options"] == options.as_dict()
+    assert read_report(Path("elsewhere/sphere"))["options"] == options.as_dict()
+    assert options == InferOptions.from_dict(
+        {**options.as_dict(), "output": "x", "device": "cpu", "batch_size": 7}
+    )
+    assert options != InferOptions.from_dict({**options.as_dict(), "seed": 4})
+    for wrong in (
+        {"formats": ("bmp",)},
+        {"maps": ("depth",)},
+        {"convention": "up"},
+        {"mask": "m.png", "auto_mask": True},
+    ):
+        with pytest.raises(UsageError):
+            InferOptions(**wrong)
+
+
+def test_the_pipeline_reports_to_an_observer(capture, make_capture):
+    make_capture("second")
+    (capture / "mask.png").unlink()
+
+    class Recorder(Observer):
+        def __init__(self) -> None:
+            self.stages: list[tuple[str, float]] = []
+
+        def progress(self, label, total, *, start=0.0):
+            self.stages.append((label, total))
+            return super().progress(label, total, start=start)
+
+    recorder = Recorder()
+    outcomes = list(infer_batch([capture, Path("second")], InferOptions(method="ls"), recorder))
+    assert [(one.capture, one.status, one.exit_code) for one in outcomes] == [
+        ("sphere", "done", 0),
+        ("second", "done", 0),
+    ]
+    assert recorder.stages == [
+        ("sphere: reading", 8),
+        ("sphere: estimating", 576),
+        ("second: reading", 8),
+        ("second: estimating", 448),
+    ]
+
+
+def test_as_stored_is_named_and_a_white_level_is_used(capture, run):
+    for path in capture.glob("image*.png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.minimum(picture, 57_000).astype(np.uint16))
+    call = ("infer", capture, "--method", "ls", "--overwrite", "--json", "--white-level", 57_000)
+    restored, stored = (json.loads(run(*call, *extra).out)[0] for extra in ((), ("--as-stored",)))
+    assert (restored["reading"], stored["reading"]) == ("restored", "as stored")
+    assert restored["white_level"] == {"value": 57_000, "origin": "given"}
+    assert restored["angular_error_deg"]["mean"] < 0.1 < stored["angular_error_deg"]["mean"]
+    assert restored["options"]["white_level"] == 57_000
