@@ -38,7 +38,9 @@ OBJECTS = pytest.mark.parametrize(("place", "name"), [(0, "ballPNG"), (1, "catPN
 
 @OBJECTS
 def test_all_lights(shared_data: Path, place: int, name: str) -> None:
-    errors = mean_errors(shared_data / f"DiLiGenT/pmsData/{name}", [*ALL_LIGHTS], Protocol(max_pixels=1000))
+    errors = mean_errors(
+        shared_data / f"DiLiGenT/pmsData/{name}", [*ALL_LIGHTS], Protocol(max_pixels=1000, as_stored=True)
+    )
     check(errors, ALL_LIGHTS, place)
     # Least squares must not pass as one of the robust methods.
     assert all(errors[method] < errors["ls"] - 1 for method in ("iw12", "st14", "ia14"))
@@ -48,9 +50,9 @@ def test_all_lights(shared_data: Path, place: int, name: str) -> None:
 def test_ten_lights(shared_data: Path, place: int, name: str) -> None:
     folder = shared_data / f"DiLiGenT/pmsData/{name}"
     fits = [method for method in TEN_LIGHTS if method != "cnn-ps"]
-    errors = mean_errors(folder, fits, Protocol(10, trials=10, max_pixels=500))
+    errors = mean_errors(folder, fits, Protocol(10, trials=10, max_pixels=500, as_stored=True))
     # CNN-PS averages ten rotations of each pixel, so it gets fewer pixels.
-    errors |= mean_errors(folder, ["cnn-ps"], Protocol(10, trials=3, max_pixels=150))
+    errors |= mean_errors(folder, ["cnn-ps"], Protocol(10, trials=3, max_pixels=150, as_stored=True))
     check(errors, TEN_LIGHTS, place)
     assert all(errors[method] < errors["ls"] - 1 for method in ("iw12", "st14", "ia14"))
     # With ten lights CNN-PS is worse than least squares, in its paper as here.

@@ -1,8 +1,9 @@
-"""Signed distance fields, about: functions of points (N, 3) that are negative inside a shape and grow at about
-unit rate across its surface; and the triangles of their zero.
+"""Approximate signed distance fields, and the triangle meshes of their surfaces.
 
-Smooth union: Quilez, "Smooth minimum" (https://iquilezles.org/articles/smin). Surface: marching cubes (Lewiner et
-al. 2003), its vertices moved onto the field's zero, with the field's own gradient as their normals.
+A field is a function of points (N, 3). It is negative inside the shape and grows at about unit rate across its surface.
+
+Smooth union: Quilez, "Smooth minimum" (https://iquilezles.org/articles/smin). Surface: marching cubes (Lewiner et al.
+2003); the vertices are then moved onto the zero of the field, and its gradient gives their normals.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Field = Callable[[Floats], Floats]
 
 
 def ellipsoid(half_axes: Floats) -> Field:
-    """An ellipsoid about the origin; exact on its surface and for a sphere."""
+    """Return an ellipsoid around the origin. The distance is exact on the surface, and everywhere for a sphere."""
 
     def distance(points: Floats) -> Floats:
         scaled = np.linalg.norm(points / half_axes, axis=1)
@@ -30,7 +31,7 @@ def ellipsoid(half_axes: Floats) -> Field:
 
 
 def box(half_widths: Floats, rounding: float) -> Field:
-    """A box about the origin with rounded edges."""
+    """Return a box around the origin with rounded edges."""
 
     def distance(points: Floats) -> Floats:
         beyond = np.abs(points) - (half_widths - np.float32(rounding))
@@ -41,7 +42,7 @@ def box(half_widths: Floats, rounding: float) -> Field:
 
 
 def torus(radius: float, tube: float) -> Field:
-    """A ring about the z axis."""
+    """Return a ring around the z axis."""
 
     def distance(points: Floats) -> Floats:
         ring = np.hypot(points[:, 0], points[:, 1]) - np.float32(radius)
@@ -51,7 +52,7 @@ def torus(radius: float, tube: float) -> Field:
 
 
 def capsule(half_length: float, radius: float) -> Field:
-    """A rod along z with round ends."""
+    """Return a rod along z with round ends."""
 
     def distance(points: Floats) -> Floats:
         along = points[:, 2] - np.clip(points[:, 2], -np.float32(half_length), np.float32(half_length))
@@ -61,25 +62,25 @@ def capsule(half_length: float, radius: float) -> Field:
 
 
 def moved(field: Field, rotation: Floats, centre: Floats) -> Field:
-    """The shape turned by a rotation matrix and then moved."""
+    """Return the shape, rotated by a matrix and then moved to a centre."""
     return lambda points: field((points - centre) @ rotation)
 
 
 def smooth_union(first: Floats, second: Floats, blend: float) -> Floats:
-    """The distance to either of two shapes, whose seam is filleted over a width of `blend`."""
+    """Return the distance to the union of two shapes, with a fillet of width `blend` along the seam."""
     overlap = np.maximum(blend - np.abs(first - second), 0) / blend
     return np.minimum(first, second) - overlap * overlap * np.float32(blend / 4)
 
 
 def smooth_cut(shape: Floats, tool: Floats, blend: float) -> Floats:
-    """The distance to a shape with another one taken out of it."""
+    """Return the distance to a shape after another one was cut out of it."""
     return -smooth_union(-shape, tool, blend)
 
 
 def waves(rng: np.random.Generator, frequency: float, outputs: int = 1, count: int = 10) -> Field:
-    """A smooth random function of about unit variance (N, outputs): plane waves of random directions.
+    """Draw a smooth random function (N, outputs) of about unit variance: plane waves of random directions.
 
-    Wave numbers U(0.6, 1.4) * frequency, in cycles per unit length. One output is (N,).
+    The wave numbers are U(0.6, 1.4) * frequency, in cycles per unit length. A single output has shape (N,).
     """
     directions = rng.normal(size=(3, count))
     directions *= 2 * np.pi * frequency * rng.uniform(0.6, 1.4, count) / np.linalg.norm(directions, axis=0)
@@ -95,7 +96,7 @@ def waves(rng: np.random.Generator, frequency: float, outputs: int = 1, count: i
 
 
 def ridges(rng: np.random.Generator, frequency: float, octaves: int = 2) -> Field:
-    """Sharp crests between round valleys, about -1 to 1 (N,): octaves of 1 - 2 |waves|, each half the last."""
+    """Draw sharp crests between round valleys (N,), about -1 to 1: octaves of 1 - 2 |waves|, each half as high."""
     layers = [waves(rng, frequency * 2**octave) for octave in range(octaves)]
 
     def value(points: Floats) -> Floats:
@@ -106,7 +107,7 @@ def ridges(rng: np.random.Generator, frequency: float, octaves: int = 2) -> Fiel
 
 
 def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
-    """Central differences (N, 3)."""
+    """Return the gradient (N, 3) by central differences."""
     columns = []
     for axis in np.eye(3, dtype=np.float32) * np.float32(step):
         columns.append((field(points + axis) - field(points - axis)) / np.float32(2 * step))
@@ -114,9 +115,9 @@ def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
 
 
 def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: float) -> Mesh | None:
-    """The zero of a field in a box about the origin, sampled every `spacing`; None where there is none.
+    """Return the surface of a field inside a box around the origin, sampled every `spacing`; None if it is empty.
 
-    Only the largest connected part is kept: crumbs and inner bubbles go.
+    Only the largest connected part is kept.
     """
     counts = [int(np.ceil(2 * half / spacing / COARSE)) * COARSE + 1 for half in half_widths]
     axes = [((np.arange(count) - (count - 1) / 2) * spacing).astype(np.float32) for count in counts]
@@ -127,7 +128,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     found, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(spacing,) * 3)
     vertices = (found + [axis[0] for axis in axes]).astype(np.float32)
     vertices, faces = _largest_part(vertices, faces)
-    # One step of Newton's method: linear interpolation between samples leaves terraces.
+    # Make one step of Newton's method, because linear interpolation between samples leaves terraces.
     slope = gradient(field, vertices)
     squared = np.maximum((slope * slope).sum(axis=1), 1e-2)
     move = np.clip(field(vertices) / squared, -0.4 * spacing, 0.4 * spacing)
@@ -141,14 +142,14 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
-# Samples along the edge of the cells that are skipped where they lie far from the surface.
 COARSE = 4
+"""Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely."""
 
 
 def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
-    """The field on the grid of three axes, exact near its zero and with the right sign elsewhere."""
+    """Sample the field on the grid of three axes: exactly near its surface, with the right sign elsewhere."""
     coarse = _evaluate(field, *np.meshgrid(*(axis[::COARSE] for axis in axes), indexing="ij"))
-    # Fields grow at rates up to about 2, and a cell's centre is half its diagonal from its corners.
+    # Fields grow at rates up to about 2. The centre of a cell is half its diagonal away from its corners.
     reach = 2 * COARSE * spacing * np.sqrt(3) / 2
     near = np.abs(coarse) < reach
     close = np.zeros([size - 1 for size in coarse.shape], dtype=bool)
@@ -162,7 +163,7 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
     shape = tuple(len(axis) for axis in axes)
     values = np.ascontiguousarray(far[: shape[0], : shape[1], : shape[2]])
     exact = np.zeros(shape, dtype=bool)
-    # The upper faces of a cell belong to it too.
+    # The upper faces of a cell belong to it, too.
     for x in (0, 1):
         for y in (0, 1):
             for z in (0, 1):
@@ -174,7 +175,7 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
 
 def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
     points = np.stack((x.ravel(), y.ravel(), z.ravel()), axis=1)
-    # In pieces that stay in the processor's cache.
+    # Evaluate pieces that fit into the processor's cache.
     starts = range(0, max(len(points), 1), 32_768)
     pieces = [field(points[start : start + 32_768]) for start in starts]
     return np.concatenate(pieces).reshape(x.shape).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Triangle meshes in the camera's frame: x right, y up, z to the camera, which sees the square [-1, 1]^2."""
+"""Triangle meshes in the frame of the camera: x right, y up, z to the camera. It sees the square [-1, 1]^2."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from splinecli.extras import import_extra
 
 Floats = NDArray[np.floating]
 
-# Half-width of the object in the camera's square.
 REACH = 0.94
+"""Half-width of the object in the camera's square."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices (V, 3) float32, faces (T, 3) int32 rows of vertices, anticlockwise from outside; vertex_normals
-    (V, 3) float32, unit and outward, which shading interpolates.
+    """A triangle mesh.
+
+    vertices: (V, 3) float32.
+    faces: (T, 3) int32, rows of vertices, anticlockwise as seen from outside.
+    vertex_normals: (V, 3) float32, unit, outward; shading interpolates them.
     """
 
     vertices: Floats
@@ -29,10 +32,10 @@ class Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """The mesh of a file in any format that trimesh reads (PLY, OBJ, STL, OFF, glTF), fitted into the frame.
+    """Read a mesh file in any format that trimesh reads (PLY, OBJ, STL, OFF, glTF) and fit it into the frame.
 
-    Its +z axis looks at the camera. Normals are smooth-shaded: the mean of the faces around a vertex, weighted by
-    angle. Long edges are split, so that every part of the surface has vertices and can have a material.
+    The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces around it, weighted by
+    angle. Long edges are split, so that every part of the surface has vertices and can have its own material.
 
     Raises:
         InputError: the file is missing, not a mesh, or has no faces.
@@ -43,13 +46,13 @@ def read_mesh(path: str | Path) -> Mesh:
         raise InputError("there is no such mesh file", path=path)
     try:
         loaded = trimesh.load_mesh(path, process=True)
-        # Whatever splits vertices, such as texture coordinates, would split the smooth normals too.
+        # Texture coordinates split vertices, and would split the smooth normals too.
         loaded.merge_vertices(merge_tex=True, merge_norm=True)
         if len(loaded.faces) and loaded.is_watertight and loaded.volume < 0:
-            loaded.invert()  # inside out: the camera would see nothing
+            loaded.invert()  # the mesh is inside out, so the camera would see nothing
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
         normals = np.asarray(loaded.vertex_normals) if len(faces) else np.zeros((0, 3))
-    except Exception as error:  # readers of two dozen formats raise what they like
+    except Exception as error:  # the readers of two dozen formats raise many kinds
         raise InputError(
             f"not a mesh that can be read ({type(error).__name__}: {str(error).strip() or 'no reason given'})",
             path=path,
@@ -64,7 +67,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def fit_to_frame(mesh: Mesh, *, reach: float = REACH) -> Mesh:
-    """The mesh scaled and centred so that its wider extent in x and y is 2 * reach and it stands about z = 0."""
+    """Scale and centre a mesh: its larger extent in x and y becomes 2 * reach, and its centre the origin."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     scale = 2 * reach / float((high - low)[:2].max())
     vertices = (mesh.vertices - (low + high) / 2) * np.float32(scale)
@@ -72,10 +75,8 @@ def fit_to_frame(mesh: Mesh, *, reach: float = REACH) -> Mesh:
 
 
 def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = 2_000_000) -> Mesh:
-    """The same surface with each face quartered until its edges are at most `longest`, while faces stay under
-    `most_faces`.
-    """
-    # Position and normal are interpolated together: shading is to stay what it was.
+    """Divide faces into four until no edge is longer than `longest` or there would be more than `most_faces` faces."""
+    # Interpolate positions and normals together, so that the shading stays the same.
     corners = np.concatenate((mesh.vertices, mesh.vertex_normals), axis=1).astype(np.float64)
     faces = mesh.faces.astype(np.int64)
     while True:

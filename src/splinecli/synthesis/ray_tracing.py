@@ -1,7 +1,6 @@
-"""Rays against a mesh, traced by Embree (https://www.embree.org) through embreex.
+"""Intersection of rays with a mesh, by Embree (https://www.embree.org) through embreex.
 
-embreex, scikit-image and trimesh are the extra `render`: nothing but rendering needs them, so they are imported
-when a scene is made.
+embreex belongs to the extra `render`. It is imported when a Tracer is made.
 """
 
 from __future__ import annotations
@@ -14,19 +13,22 @@ from numpy.typing import NDArray
 from splinecli.extras import import_extra
 from splinecli.synthesis.meshes import Floats, Mesh
 
-# Rays start this far above the surface, in the camera's frame of half-width 1: float32 leaves hits uncertain by
-# 1e-7 or so, and a pixel of 128 is 0.016 wide.
 OFFSET = 1e-4
-# Points whose shadows are traced together.
+"""Distance from the surface at which rays start. The frame has half-width 1, so rounding in float32 displaces hits by
+about 1e-7, and one of 128 pixels is 0.016 wide."""
+
 TRACED_ROWS = 16_384
+"""Number of points whose shadows are traced together."""
 
 
 @dataclass(frozen=True)
 class Hits:
-    """The first surface points that N rays meet.
+    """The first surface points that N rays hit.
 
-    triangle (N,) int: row of the mesh's faces; weights (N, 3): barycentric, of the triangle's corners;
-    position (N, 3): on the triangle; normal and facet_normal (N, 3): unit, interpolated and the triangle's own.
+    triangle: (N,) int, row of the mesh's faces.
+    weights: (N, 3), barycentric weights of the corners.
+    position: (N, 3), on the triangle.
+    normal, facet_normal: (N, 3), unit, interpolated and that of the triangle.
     """
 
     triangle: NDArray[np.int64]
@@ -36,16 +38,16 @@ class Hits:
     facet_normal: Floats
 
     def take(self, rays: NDArray[np.int64] | NDArray[np.bool_]) -> Hits:
-        """Some of the points."""
+        """Return some of the points."""
         return Hits(*(getattr(self, name)[rays] for name in self.__dataclass_fields__))
 
     def lifted(self) -> Floats:
-        """Starts of further rays (N, 3), off the surface on its outer side."""
+        """Return the starts of further rays (N, 3), slightly outside the surface."""
         return self.position + np.float32(OFFSET) * self.facet_normal
 
 
 class Tracer:
-    """A mesh made ready for rays. All arrays of origins and directions are (N, 3).
+    """A mesh that is prepared for ray tracing. All arrays of origins and directions are (N, 3).
 
     Raises:
         UsageError: embreex is not installed.
@@ -61,14 +63,14 @@ class Tracer:
         self._facet_normals = (facing / np.maximum(length, 1e-30)).astype(np.float32)
 
     def first_hits(self, origins: Floats, directions: Floats) -> tuple[NDArray[np.int64], Hits]:
-        """The rays that meet the surface, as rows of the input (K,), and where (K points)."""
+        """Return the rows (K,) of the rays that hit the surface, and the K points that they hit first."""
         found = self._scene.run(_packed(origins), _packed(directions), output=True)
         rays = (found["primID"] >= 0).nonzero()[0]
         u, v = found["u"][rays], found["v"][rays]
         return rays, self.points(found["primID"][rays].astype(np.int64), np.stack((1 - u - v, u, v), axis=1))
 
     def points(self, triangle: NDArray[np.int64], weights: Floats) -> Hits:
-        """The surface points with these barycentric weights (N, 3) on these triangles (N,)."""
+        """Return the surface points with these barycentric weights (N, 3) on these triangles (N,)."""
         corners = self.mesh.faces[triangle]
         position = np.einsum("nk,nkc->nc", weights, self.mesh.vertices[corners])
         normal = np.einsum("nk,nkc->nc", weights, self.mesh.vertex_normals[corners])
@@ -76,9 +78,9 @@ class Tracer:
         return Hits(triangle, weights, position, normal, self._facet_normals[triangle])
 
     def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
-        """Which directions (F, 3) are free of the mesh from which origins, where `facing` (N, F) asks: (N, F)."""
+        """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`."""
         free = np.zeros(facing.shape, dtype=bool)
-        # Light by light, since rays of one direction are one array shorter and traverse the tree together.
+        # One light at a time: rays with the same direction need less memory and traverse the tree together.
         for light, asked in enumerate(facing.T):
             rows = asked.nonzero()[0]
             if len(rows):
@@ -90,23 +92,23 @@ class Tracer:
 
 
 class ShadowCache:
-    """Which lights reach which vertices of the mesh, traced when first asked for."""
+    """The lights that reach each vertex of the mesh, traced when they are first needed."""
 
     def __init__(self, tracer: Tracer, lights: Floats) -> None:
         self._tracer, self._lights = tracer, lights
         vertices = len(tracer.mesh.vertices)
-        # Rows that are never asked for take no memory.
+        # Rows that are never used take no memory.
         self._free = np.zeros((vertices, len(lights)), dtype=bool)
         self._known = np.zeros(vertices, dtype=bool)
 
     def lit(self, hits: Hits) -> NDArray[np.bool_]:
-        """Which lights are free of the mesh at the vertices nearest to surface points, (N, F) bool."""
+        """Return which lights reach the vertices nearest to the surface points, (N, F) bool."""
         nearest = self._nearest(hits)
         self._trace(nearest)
         return self._free[nearest]
 
-    def expect(self, hits: Hits) -> None:
-        """Trace for surface points that will be asked for: many together are quicker than few at a time."""
+    def prepare(self, hits: Hits) -> None:
+        """Trace the shadows at surface points in advance: many together are faster than few at a time."""
         self._trace(self._nearest(hits))
 
     def _nearest(self, hits: Hits) -> NDArray[np.int64]:

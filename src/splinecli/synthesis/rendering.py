@@ -200,7 +200,7 @@ def _gather(
     radiance: dict[str, Tensor],
 ) -> None:
     """Add the light that the vertices reflect to the radiance of their pixels."""
-    shadows.expect(vertices.hits)
+    shadows.prepare(vertices.hits)
     for start in range(0, len(vertices.pixel), SHADED_ROWS):
         some = slice(start, start + SHADED_ROWS)
         hits = vertices.hits.take(np.arange(start, min(start + SHADED_ROWS, len(vertices.pixel))))

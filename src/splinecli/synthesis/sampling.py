@@ -1,8 +1,8 @@
-"""Random directions for light that reaches a surface by way of another one.
+"""Random directions of indirect light.
 
-One mixture serves every material: a cosine lobe for what is matte, and two lobes of visible GGX normals (Heitz,
-"Sampling the GGX distribution of visible normals", JCGT 2018) for what shines. Directions are weighted by the
-mixture's whole density (the balance heuristic, Veach 1997), so no material has to know how to sample itself.
+One mixture is used for all materials: a cosine lobe for matte ones, and two lobes of visible GGX normals (Heitz,
+"Sampling the GGX distribution of visible normals", JCGT 2018) for glossy ones. Directions are weighted by the density
+of the whole mixture (the balance heuristic, Veach 1997), so materials need no sampling function of their own.
 """
 
 from __future__ import annotations
@@ -12,24 +12,27 @@ import math
 import torch
 from torch import Tensor
 
-# Width (roughness squared) of the lobes; 0 stands for the cosine lobe. Every four directions fall to these.
 LOBES = (0.0, 0.1, 0.0, 0.35)
+"""Widths (roughness squared) of the lobes of four successive directions; 0 is the cosine lobe."""
 
 
-def draw_directions(normals: Tensor, views: Tensor, first: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions (N, 3) above surfaces with unit normals (N, 3) seen from views (N, 3), and densities (N, 1).
+def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the horizon.
 
-    first (N,) int64: which of a pixel's directions it is, and thereby its lobe and its place in the R2 sequence
-    (Roberts 2018), whose points cover the lobe evenly; shift (N, 2): the pixel's own offset in it. Directions may
-    come out below the horizon.
+    Args:
+        normals: (N, 3), unit normals of the surfaces.
+        back: (N, 3), unit directions to the previous vertices of the paths.
+        first: (N,) int64, index of the direction among those of its pixel. It determines the lobe and the point of the
+            R2 sequence (Roberts 2018), which covers the lobe evenly.
+        shift: (N, 2), offset of the pixel in the sequence.
     """
     ordinal = torch.div(first, len(LOBES), rounding_mode="floor")
     u = (shift[:, 0] + ordinal * 0.7548776662466927) % 1.0
     v = (shift[:, 1] + ordinal * 0.5698402909980532) % 1.0
     tangent, bitangent = basis(normals)
-    local_view = torch.stack([(views * axis).sum(-1) for axis in (tangent, bitangent, normals)], dim=1)
+    local_view = torch.stack([(back * axis).sum(-1) for axis in (tangent, bitangent, normals)], dim=1)
     lobe = first % len(LOBES)
-    # Lobes of one kind take different stretches of the sequence.
+    # Lobes of the same kind use different parts of the sequence.
     u = (u + lobe * 0.25) % 1.0
     alpha = torch.tensor(LOBES)[lobe][:, None]
     matte = _cosine_direction(u, v)
@@ -41,7 +44,7 @@ def draw_directions(normals: Tensor, views: Tensor, first: Tensor, shift: Tensor
 
 
 def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
-    """Density of the mixture per steradian, for cosines of any one shape."""
+    """Return the density of the mixture per steradian, from cosines that have the same shape."""
     half_length = (2 * (1 + w_dot_v)).clamp(min=1e-6).sqrt()
     n_dot_h = ((n_dot_w + n_dot_v) / half_length).clamp(0, 1)
     total = LOBES.count(0.0) * n_dot_w.clamp(min=0) / math.pi
@@ -55,7 +58,7 @@ def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
 
 
 def basis(normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors (N, 3) that make a right-handed frame with each unit normal (Duff et al. 2017)."""
+    """Return two unit vectors (N, 3) that form a right-handed frame with each unit normal (Duff et al. 2017)."""
     x, y, z = normals.unbind(dim=1)
     sign = torch.where(z >= 0, 1.0, -1.0)
     a = -1 / (sign + z)
@@ -70,7 +73,7 @@ def _cosine_direction(u: Tensor, v: Tensor) -> Tensor:
 
 
 def _visible_normal(view: Tensor, alpha: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Heitz's routine, in the frame of the normal (N, 3)."""
+    """Return visible normals (N, 3) in the frame of the surface normal, by the routine of Heitz."""
     stretched = torch.nn.functional.normalize(
         torch.cat((alpha * view[:, :2], view[:, 2:].clamp(min=1e-4)), dim=1), dim=1
     )

@@ -1,6 +1,6 @@
-"""Random shapes with the folds, hollows and occlusions of sculptures, made of signed distance fields.
+"""Random shapes with folds, hollows and occlusions as sculptures have, made of signed distance fields.
 
-Unions of round blobs alone are too convex: hardly anything in them shades or lights anything else.
+Unions of round blobs alone would be too convex: they have few cast shadows and few interreflections.
 """
 
 from __future__ import annotations
@@ -24,18 +24,23 @@ from splinecli.synthesis.fields import (
 )
 from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
 
-# Distance between the samples of the fields; 128 pixels over the frame are 0.0156 apart.
 SPACING = 0.0125
+"""Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156 apart."""
+
 FEWEST_FACES = 5_000
+"""Meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces."""
 
 
 def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[str, Mesh]:
-    """A random shape and the name of its kind, fitted into the camera's frame.
+    """Draw a random shape, fitted into the camera's frame, and return the name of its kind and its mesh.
 
-    `place`, in 0 to 1, decides the kind: evenly spread ones give a set its share of each. Random by default.
+    40 % are carved (warped unions of solids with pieces cut out), 20 % rough (spheres with noise), 15 % relief (folded
+    slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera).
 
-    Kinds: 40 % carved (warped unions of solids with pieces cut out), 20 % rough (spheres under noise), 15 %
-    relief (folded slabs that fill the frame), 25 % vessel (bowls and cups that show the camera their inside).
+    Args:
+        place: determines the kind, from 0 to 1. Evenly spread values give a set the right share of each kind. None
+        draws
+            it at random.
 
     Raises:
         UsageError: the extra `render` is not installed.
@@ -46,16 +51,15 @@ def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[st
 
 
 def draw_shape_of_kind(name: str, rng: np.random.Generator) -> Mesh:
-    """A random shape of one kind, `carved`, `rough`, `relief` or `vessel`; errors as of draw_shape."""
+    """Draw a random shape of one kind: `carved`, `rough`, `relief` or `vessel`. Raises what draw_shape does."""
     while True:
         mesh = KINDS[name](rng)
-        # A cut now and then leaves nothing or crumbs.
         if mesh is not None and len(mesh.faces) > FEWEST_FACES:
             return mesh
 
 
 def draw_rotation(rng: np.random.Generator) -> Floats:
-    """A rotation matrix (3, 3), uniform over all (Shoemake 1992)."""
+    """Draw a rotation matrix (3, 3), uniform over all rotations (Shoemake 1992)."""
     w, x, y, z = (quaternion := rng.normal(size=4)) / np.linalg.norm(quaternion)
     return np.array(
         [
@@ -68,7 +72,7 @@ def draw_rotation(rng: np.random.Generator) -> Floats:
 
 
 def turn(mesh: Mesh, rotation: Floats) -> Mesh:
-    """The mesh rotated about the origin."""
+    """Return the mesh, rotated about the origin."""
     return Mesh(mesh.vertices @ rotation.T, mesh.faces, mesh.vertex_normals @ rotation.T)
 
 
@@ -93,7 +97,7 @@ Range = tuple[float, float]
 
 
 def _draw_waves(rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1) -> Field:
-    """Smooth noise, its frequency in cycles per unit and its height from its mean slope."""
+    """Draw smooth noise with a frequency in cycles per unit length; the mean slope determines its height."""
     frequency = rng.uniform(*frequencies)
     height = np.float32(rng.uniform(*slopes) / (2 * np.pi * frequency))
     noise = waves(rng, frequency, outputs)
@@ -101,7 +105,7 @@ def _draw_waves(rng: np.random.Generator, frequencies: Range, slopes: Range, *, 
 
 
 def _draw_folds(rng: np.random.Generator, frequencies: Range, slopes: Range) -> Field:
-    """Ridged noise; arguments as for smooth noise."""
+    """Draw ridged noise; arguments as for smooth noise."""
     frequency = rng.uniform(*frequencies)
     height = np.float32(rng.uniform(*slopes) / (4 * np.pi * frequency))
     noise = ridges(rng, frequency)
@@ -109,7 +113,7 @@ def _draw_folds(rng: np.random.Generator, frequencies: Range, slopes: Range) -> 
 
 
 def draw_carved(rng: np.random.Generator) -> Mesh | None:
-    """Three to seven solids grown together and bent, three to eight pieces taken out, often with folds on top."""
+    """Draw three to seven merged and bent solids with three to eight pieces cut out, often with folds."""
     solids = [
         _place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5)) for _ in range(rng.integers(3, 8))
     ]
@@ -134,7 +138,7 @@ def draw_carved(rng: np.random.Generator) -> Mesh | None:
 
 
 def draw_rough(rng: np.random.Generator) -> Mesh | None:
-    """A sphere raised and sunk by noise, smooth or ridged, often with craters."""
+    """Draw a sphere with smooth or ridged noise, often with craters."""
     swell = _draw_waves(rng, (0.5, 1.2), (0.3, 0.9))
     drawn = _draw_folds if rng.random() < 0.6 else _draw_waves
     detail = drawn(rng, (1.2, 2.4), (0.2, 0.7))
@@ -151,7 +155,7 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
         shape = np.linalg.norm(bent, axis=1) - np.float32(0.7) - swell(bent) - detail(bent)
         for crater in craters:
             shape = smooth_cut(shape, crater(bent), 0.05)
-        # Noise steepens the field; distances are to stay distances.
+        # Noise makes the field steeper. Scale it, so that it stays close to a distance.
         return np.asarray(shape * np.float32(0.7))
 
     mesh = triangulate(distance, (1.3, 1.3, 1.3), SPACING)
@@ -159,7 +163,7 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
 
 
 def draw_relief(rng: np.random.Generator) -> Mesh | None:
-    """A slab that fills the frame, folded into ridges, valleys and overhangs."""
+    """Draw a slab that fills the frame, folded into ridges, valleys and overhangs."""
     swell, folds = _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), _draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
     pits = [
@@ -169,7 +173,7 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
 
     def distance(points: Floats) -> Floats:
         bent = points + bend(points)
-        # Across the slab the noise runs slower, so that heights stay heights and overhangs are an exception.
+        # The noise varies more slowly across the slab, so that overhangs are rare.
         flat = bent * np.array((1, 1, 0.3), dtype=np.float32)
         shape: Floats = (bent[:, 2] - swell(flat) - folds(flat)) * np.float32(0.7)
         for pit in pits:
@@ -180,7 +184,7 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
 
 
 def draw_vessel(rng: np.random.Generator) -> Mesh | None:
-    """A bowl, cup or vase, round or fluted, its mouth up to 55 degrees from the camera; half hold or wear things."""
+    """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees; half may have further solids."""
     half_height = rng.uniform(0.3, 0.75)
     wall = np.float32(rng.uniform(0.05, 0.12))
     profile = _draw_profile(rng)
@@ -200,7 +204,7 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
         radius = profile(height) * (1 + np.float32(depth) * np.cos(flutes * azimuth))
         side = (np.hypot(points[:, 0], points[:, 1]) - radius) * np.float32(0.75)
         outer = -smooth_union(-side, half_height - np.abs(points[:, 2]), 0.08)
-        # The inside is the outside drawn in by the wall, and open at the top.
+        # The inside is the outside, moved inwards by the wall, and open at the top.
         inner = -smooth_union(-(side + wall), points[:, 2] - floor, 0.25)
         shape = -smooth_union(-outer, inner, 0.03)
         for extra in extras:
@@ -215,7 +219,7 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
 
 
 def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
-    """Radius over height from -1 to 1: a smooth curve through five random radii, wider at the mouth for half."""
+    """Draw the radius over the height from -1 to 1, a smooth curve through five radii; half widen to the mouth."""
     from scipy.interpolate import PchipInterpolator
 
     radii = rng.uniform(0.35, 0.9, 5)
@@ -226,7 +230,7 @@ def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
 
 
 def _tilt(angle: float, azimuth: float) -> Floats:
-    """The rotation that takes +z by an angle towards an azimuth in the image."""
+    """Return the rotation that tilts +z by an angle towards an azimuth in the image."""
     c, s, a, b = np.cos(angle), np.sin(angle), np.cos(azimuth), np.sin(azimuth)
     about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     about_z = np.array([[a, -b, 0], [b, a, 0], [0, 0, 1]])
