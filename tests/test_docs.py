@@ -193,6 +193,14 @@ def test_rooms_of_the_contributing_page():
     assert shown == ranked
 
 
+def test_places_of_the_contributing_page():
+    """Each path that CONTRIBUTING.md names exists."""
+    paths = re.findall(r"`([\w/.]+(?:\.(?:py|md|json|html)|/))`", text_of("CONTRIBUTING.md"))
+    roots = (REPOSITORY, REPOSITORY / "src/splinecli", *(REPOSITORY / "src/splinecli").glob("*/"))
+    roots += tuple((REPOSITORY / "src/splinecli/capture").glob("*/"))
+    assert [path for path in paths if not any((r / path).exists() for r in roots)] == []
+
+
 def rows(page: str, head: str) -> dict[str, list[str]]:
     """The cells of the table that has `head` in its first line, by their first cell without markup."""
     _, _, rest = text_of(page).partition(head)
