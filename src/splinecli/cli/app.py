@@ -22,7 +22,7 @@ app = typer.Typer(
     cls=Group,
     help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
     epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
-    # Plain help reads the same on a terminal, in a pipe and in the README.
+    # Plain text reads the same on a terminal, in a pipe and in the documentation.
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},

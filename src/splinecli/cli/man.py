@@ -1,4 +1,4 @@
-"""The man pages, one of the whole and one a command, made from the commands: `python -m splinecli.cli.man man`."""
+"""Make the man pages, an overview and one page per command, from the commands: `python -m splinecli.cli.man man`."""
 
 from __future__ import annotations
 
@@ -119,11 +119,11 @@ EXAMPLES = (
     ),
 )
 EXAMPLE_WIDTH = 64
-"""Columns that an example may fill: with its indent a line of a terminal of 80."""
+"""Columns of an example. With its indent it fits a terminal of 80 columns."""
 
 
 def man_pages() -> dict[str, str]:
-    """Name of the file -> the page in the man macros, of splinecli and of each command."""
+    """Return file name -> man page, for splinecli and each command."""
     group: Any = typer.main.get_command(app)
     context = group.context_class(group, info_name="splinecli", **group.context_settings)
     commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
@@ -153,7 +153,7 @@ def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
 def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any]) -> str:
     summary = _paragraphs(command.help)[0].rstrip(".")
     lines = [
-        # In NAME stands no sentence: no capital, no full stop.
+        # The section NAME takes a phrase: no capital letter, no full stop.
         *_beginning(_page_name(name), summary[0].lower() + summary[1:], command, context),
         ".SH OPTIONS",
         *_options(help_panels(command, context)),
@@ -162,18 +162,18 @@ def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any
         ".BR splinecli (1).",
         *_examples(name),
     ]
-    # The other commands that this one's texts speak of.
+    # Commands that this page mentions.
     text = " ".join([command.help, *(parameter.help or "" for parameter in command.params)])
     related = [other for other in commands if other != name and re.search(rf"\b{other}\b", text)]
     return _page_text([*lines, *_see_also(["", *related])])
 
 
 def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str]:
-    """All up to and with the description."""
+    """Return the page's head, name, synopsis and description."""
     usage = " ".join(command.collect_usage_pieces(context))
     return [
         f'.TH {_escape(title.upper())} 1 "" "splinecli {__version__}" "User Commands"',
-        # No hyphens in names of files, no gaps between words.
+        # Do not hyphenate file names, and do not stretch lines.
         ".nh",
         ".ad l",
         ".SH NAME",
@@ -200,17 +200,17 @@ def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
 
 
 def _examples(name: str) -> list[str]:
-    """Those of a command, or all."""
+    """Return the examples of a command, or all for an empty name."""
     lines = [".SH EXAMPLES"]
     for command_line, meaning in EXAMPLES:
         if name in ("", shlex.split(command_line)[1]):
             lines += [_escape(meaning), ".PP", ".RS", ".nf", _escape(_wrap(command_line))]
             lines += [".fi", ".RE", ".PP"]
-    return lines[:-1]  # no new paragraph before the next section
+    return lines[:-1]  # the next section starts its own paragraph
 
 
 def _wrap(command_line: str) -> str:
-    """The command on several lines where it is long, an option beside its value."""
+    """Return a long command on several lines, with each option beside its value."""
     whole = re.sub(r"( -\S+) (?!-)", "\\1\0", command_line)
     lines = textwrap.wrap(whole, EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False)
     return " \\\n    ".join(lines).replace("\0", " ")
@@ -236,7 +236,7 @@ def _paragraphs(text: str) -> list[str]:
     return [" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n")]
 
 
-# Bare, these would be typeset: hyphens, curly quotes, accents.
+# Without escapes, groff turns these into typographic hyphens, quotes and accents.
 _PLAIN = str.maketrans({"\\": "\\e", "-": "\\-", "'": "\\(aq", "`": "\\(ga", "^": "\\(ha", "~": "\\(ti"})
 
 

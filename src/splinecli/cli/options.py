@@ -7,15 +7,12 @@ from collections.abc import Callable
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from splinecli.cli import choices
 from splinecli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splinecli.capture import RadiometricCalibration
 
 
 class Device(StrEnum):
@@ -167,10 +164,3 @@ def parse_indices(text: str, option: str) -> list[int]:
         return [int(item) for item in text.split(",")]
     except ValueError:
         raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
-
-
-def parse_radiometry(transfer: str, ambient: Path | None, flat_field: Path | None) -> RadiometricCalibration:
-    """Return what --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
-    from splinecli.pipeline.options import radiometric_calibration
-
-    return radiometric_calibration(transfer, ambient, flat_field)

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
-EQUAL = "equal"
-"""Value of `intensities` that makes all lights equally bright."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class InferOptions:
@@ -126,6 +123,8 @@ class InferOptions:
 
     def check_files(self) -> None:
         """Raise InputError if a file that the options name does not exist, or --flat-field holds no images."""
+        from splinecli.capture.reader import EQUAL
+
         intensities = None if self.intensities == EQUAL else self.intensities
         for name in (self.lights, intensities, self.mask, self.ground_truth, self.ambient):
             if name is not None and not Path(name).is_file():

@@ -1,4 +1,4 @@
-"""Several captures' results side by side: the rows of the table on the terminal, and the page that links them."""
+"""Overview of the results of several captures: rows of a table, and the page index.html that links them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OURS = b'<meta name="generator" content="splinecli">'
 
 
 class Row(NamedTuple):
-    """What the tables say of a capture, in words; of a bad one only its name and the error."""
+    """One row of the overview, as text. A capture that failed has only its name and the error."""
 
     capture: str
     lights: str = ""
@@ -34,7 +34,7 @@ HEADER = Row("capture", "lights", "pixels", "MAE", "likely within 5°", "warning
 
 
 def row_of(report: Mapping[str, Any]) -> Row:
-    """The row of a report of the contract, or of {capture, error}."""
+    """Return the row of a report (see report_of) or of a document with `capture` and `error`."""
     if "error" in report:
         return Row(report["capture"], error=report["error"])
     errors, expected = report["angular_error_deg"], report["expected_under_5"]
@@ -50,10 +50,10 @@ def row_of(report: Mapping[str, Any]) -> Row:
 
 
 def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
-    """A page that shows the captures' normal maps and links their files, to lie beside their folders."""
+    """Return the page that shows the normal maps and links the files. It belongs beside the captures' folders."""
     rows = []
     for report in reports:
-        # As bytes: a folder's name need not be text.
+        # As bytes, because a folder's name may not be valid text.
         folder, files = quote(os.fsencode(report["capture"])), report.get("files", [])
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
         rows.append(
@@ -68,13 +68,13 @@ def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
 
 
 def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Mapping[str, Any]]:
-    """The reports, and those of other captures whose results lie in the folder, by name."""
+    """Return the reports, followed by those of other captures that have results in the folder, sorted by name."""
     names = {report["capture"] for report in reports}
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
         try:
             report = json.loads(path.read_text("utf-8"))
-            row_of(report)  # raises where it is none
+            row_of(report)  # raises if this is not a report
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
         if report["capture"] == path.parent.name not in names:
@@ -83,7 +83,7 @@ def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Map
 
 
 def has_index(folder: Path) -> bool:
-    """Whether the folder holds an index.html that splinecli wrote."""
+    """Return whether the folder has an index.html that splinecli wrote."""
     try:
         return _OURS in (folder / INDEX).read_bytes()
     except OSError:
@@ -91,7 +91,7 @@ def has_index(folder: Path) -> bool:
 
 
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError where the folder holds an index.html that splinecli did not write and may not replace."""
+    """Raise OutputError if the folder has an index.html that splinecli did not write and may not replace."""
     path = folder / INDEX
     if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
         raise OutputError(
