@@ -165,14 +165,14 @@ def _further_files(
 def _surface(
     estimate: NormalEstimate, colours: NDArray[np.uint8] | None, observer: Observer
 ) -> Callable[[Path], None]:
+    from splinecli.pipeline.integrate import share_of_iterations
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
     from splinecli.surface.surface_files import write_surface
 
     mask = estimate.capture.mask
     with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
-        depth = integrate_normals(estimate.normal_map, mask)
-        advance(1)
+        depth = integrate_normals(estimate.normal_map, mask, progress=share_of_iterations(advance))
     mesh = surface_mesh(depth, mask, colours=colours)
     return partial(write_surface, depth=depth, mesh=mesh)
 

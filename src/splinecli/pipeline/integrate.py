@@ -97,7 +97,7 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
             mask,
             camera_matrix,
             stiffness=options.stiffness,
-            progress=_share_of_iterations(advance),
+            progress=share_of_iterations(advance),
         )
     mesh = surface_mesh(depth, mask, camera_matrix, colours, largest_step=options.largest_step)
     report = _report(options, depth, mesh, perspective=camera_matrix is not None)
@@ -134,7 +134,7 @@ def _report(
     }
 
 
-def _share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
+def share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
     """Return the progress function of integrate_normals that moves `advance` from 0 to 1.
 
     Integration usually converges long before the largest number of iterations, so the share grows fast at first.
