@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -93,3 +94,24 @@ def test_busy_machine(run: Run) -> None:
     default, passive, single, ratio = numbers(row)
     assert min(default, passive, single) > 0
     assert ratio == pytest.approx(default / passive, abs=0.02 * ratio + 0.02)
+
+
+def test_diligent_figures(run: Run, tmp_path: Path) -> None:
+    """The mean is that of the trials; figures of both files are stored once."""
+    entry = {"method": "ls", "capture": "ball", "n_lights": 10, "light_noise_deg": 0.0, "trials": 2}
+    entry |= {"mae_deg": 2.5, "std_deg": 0.5, "maes_deg": [2.0, 3.0]}
+    documents = [[entry, {**entry, "n_lights": 96}], [entry, {**entry, "light_noise_deg": 4.0}]]
+    for name, results in zip(("lights.json", "noise.json"), documents, strict=True):
+        (tmp_path / name).write_text(json.dumps({"protocol": {"seed": 0}, "results": results}))
+    stored = tmp_path / "figures.json"
+    printed = run(
+        "diligent_figures",
+        str(tmp_path / "lights.json"),
+        str(tmp_path / "noise.json"),
+        "--output",
+        str(stored),
+    )
+    assert "| n_lights | 10 | 96 |" in printed
+    assert "| light_noise_deg | 0.0 | 4.0 |" in printed
+    assert printed.count("| ball, `ls` | 2.50 | 2.50 |") == 2
+    assert len(json.loads(stored.read_text())["results"]) == 3

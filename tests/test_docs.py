@@ -195,7 +195,7 @@ def test_rooms_of_the_contributing_page():
 
 def test_places_of_the_contributing_page():
     """Each path that CONTRIBUTING.md names exists."""
-    paths = re.findall(r"`([\w/.]+(?:\.(?:py|md|json|html)|/))`", text_of("CONTRIBUTING.md"))
+    paths = re.findall(r"`([\w/.]+(?:\.(?:py|md|html)|/))`", text_of("CONTRIBUTING.md"))
     roots = (REPOSITORY, REPOSITORY / "src/splinecli", *(REPOSITORY / "src/splinecli").glob("*/"))
     roots += tuple((REPOSITORY / "src/splinecli/capture").glob("*/"))
     assert [path for path in paths if not any((r / path).exists() for r in roots)] == []
