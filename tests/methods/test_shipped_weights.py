@@ -82,7 +82,7 @@ def test_confidence_on_generated_pixels():
             batch.observations, batch.light_directions, batch.valid
         )
     assert error is not None
-    error_deg = angle_between_deg(normals.numpy(), batch.scene.normals.numpy())
+    error_deg = angle_between_deg(normals.numpy(), batch.truth.normals.numpy())
     confidence = probability_within(error, CONFIDENT_DEG).numpy()
     for fifth in np.array_split(confidence.argsort(), 5):
         assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == pytest.approx(confidence[fifth].mean(), abs=0.06)

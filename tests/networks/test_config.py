@@ -24,11 +24,11 @@ def test_round_trip() -> None:
     [
         ({"depth": 3}, "unknown network setting 'depth'; known are size, map_size, width"),
         ({"grid": "odd"}, "network grid is 'odd'; expected 'even' or 'cnn-ps'"),
-        ({"grid": "cnn-ps"}, "network grid is 'cnn-ps'; only the size 'paper' has it"),
+        ({"grid": "cnn-ps"}, "network grid is 'cnn-ps'; it needs the size 'paper'"),
         ({"size": "huge"}, "network size is 'huge'; expected 'paper' or 'compact'"),
         ({"fits": ["cow"]}, r"'fits' is \['cow'\]; expected a list of ls, iw12, iw12-all, ia14"),
         ({"fits": "ls"}, "'fits' is 'ls'"),
-        ({"size": "paper", "fits": ["ls"]}, "'fits' is for the size 'compact' alone"),
+        ({"size": "paper", "fits": ["ls"]}, "'fits' needs the size 'compact'"),
         ({"interpolates": "no"}, "interpolates is 'no'; expected True or False"),
         ({"width": 0}, "network setting 'width' is 0; expected a whole number from 1 to 4096"),
         ({"width": 1}, "network setting 'width' is 1; expected at least 2"),

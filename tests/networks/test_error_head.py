@@ -12,7 +12,7 @@ from scipy import stats
 
 from splinecli.errors import ModelError
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.error_head import error_surprise, probability_within
+from splinecli.networks.error_head import error_negative_log_likelihood, probability_within
 from splinecli.networks.spline_net import SplineNet
 
 
@@ -24,7 +24,7 @@ def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
         assert probability_within(error, limit_deg).item() == pytest.approx(expected.cdf(limit_deg + 0.1))
     angles_deg = np.array([0.3, 4.0, 50.0])
     # Of the angle's logarithm, a tenth of a degree added.
-    found = error_surprise(error, torch.from_numpy(np.radians(angles_deg)))
+    found = error_negative_log_likelihood(error, torch.from_numpy(np.radians(angles_deg)))
     logistic = stats.logistic(math.log(median_deg), 1 / shape)
     np.testing.assert_allclose(found, -logistic.logpdf(np.log(angles_deg + 0.1)))
 
@@ -48,5 +48,5 @@ def test_it_changes_no_normal(random_network: Callable[..., SplineNet]) -> None:
 
 
 def test_the_paper_s_size_has_none() -> None:
-    with pytest.raises(ModelError, match="'error_head' is for the size 'compact' alone"):
+    with pytest.raises(ModelError, match="'error_head' needs the size 'compact'"):
         NetworkConfig.from_dict({"size": "paper", "error_head": True})

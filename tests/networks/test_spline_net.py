@@ -16,6 +16,7 @@ from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 Make = Callable[..., SplineNet]
 PAPER = {"size": "paper", "map_size": 8}
+FITS = {"fits": ["ls"]}
 FLIP = torch.tensor((1.0, -1.0, 1.0))
 
 
@@ -25,7 +26,7 @@ def pixels() -> tuple[Tensor, Tensor]:
     config = PixelGeneratorConfig(min_lights=10, max_lights=10, light_direction_error_share=0.0)
     generator = torch.Generator().manual_seed(5)
     lights = PixelGenerator(config, generator).draw(1).light_directions[0].double()
-    scene = PixelGenerator(config, generator).draw(64).scene
+    scene = PixelGenerator(config, generator).draw(64).truth
     return scene.radiance(lights.float()).double(), torch.nn.functional.normalize(lights, dim=1)
 
 
@@ -34,7 +35,7 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
 
-@pytest.mark.parametrize("settings", [{}, {"map_size": 16}, PAPER])
+@pytest.mark.parametrize("settings", [{}, {"map_size": 16}, FITS, PAPER])
 def test_normals_are_unit_vectors(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -45,7 +46,7 @@ def test_normals_are_unit_vectors(
     assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("settings", [{}, PAPER])
+@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
 def test_dense_map_ends_with_the_unit_disc(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -81,12 +82,13 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
     torch.testing.assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("settings", [{}, FITS])
 @pytest.mark.parametrize("degrees", [90.0, 33.0, -171.5])
 def test_compact_estimates_turn_with_the_lights(
-    random_network: Make, pixels: tuple[Tensor, Tensor], degrees: float
+    random_network: Make, pixels: tuple[Tensor, Tensor], degrees: float, settings: dict[str, object]
 ) -> None:
     observations, lights = pixels
-    network = random_network().double()
+    network = random_network(**settings).double()
     with torch.no_grad():
         here, there = (
             network(observations, lights).normals,
@@ -98,7 +100,7 @@ def test_compact_estimates_turn_with_the_lights(
     assert (here - torch.nn.functional.normalize(fit, dim=1)).abs().max() > 0.01
 
 
-@pytest.mark.parametrize("settings", [{}, PAPER])
+@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
 def test_brightness_does_not_matter(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -113,7 +115,7 @@ def test_brightness_does_not_matter(
         )
 
 
-@pytest.mark.parametrize("settings", [{}, PAPER])
+@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
 def test_order_of_the_lights_does_not_matter(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -129,11 +131,12 @@ def test_order_of_the_lights_does_not_matter(
         )
 
 
+@pytest.mark.parametrize("settings", [{}, FITS])
 def test_observations_that_are_not_valid_do_not_matter(
-    random_network: Make, pixels: tuple[Tensor, Tensor]
+    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
     observations, lights = pixels
-    network = random_network().double()
+    network = random_network(**settings).double()
     valid = (torch.arange(10) < 7).expand(64, 10)
     garbage = observations.where(valid, torch.tensor(9.0, dtype=torch.float64))
     with torch.no_grad():
@@ -141,7 +144,7 @@ def test_observations_that_are_not_valid_do_not_matter(
         torch.testing.assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("settings", [{}, PAPER])
+@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
 def test_all_zero_pixels_give_a_unit_normal(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:

@@ -67,7 +67,7 @@ def test_walls_have_the_stated_shapes() -> None:
     # It faces back over the pixel.
     assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
     assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
-    assert not wall.strength[~present].any()
+    assert not wall.reflectance[~present].any()
     assert wall.same.float().mean().item() == pytest.approx(0.5, abs=SHARE)
     # What reflects lies on the wall, on the side that faces the pixel.
     torch.testing.assert_close(wall.towards.norm(dim=1), torch.ones(N))
@@ -94,7 +94,7 @@ def test_walls_stand_where_the_surface_looks() -> None:
 def test_walls_reflect_what_they_see_of_the_sky() -> None:
     wall = draw_wall(draw_visible_normals(N, generator(1)), 1.0, generator())
     seen = 1 - (1 + wall.tan_height.double() ** 2) ** -0.5
-    share = (wall.strength / seen).numpy().ravel()
+    share = (wall.reflectance / seen).numpy().ravel()
     same = wall.same.numpy().ravel()
     fresh = np.random.default_rng(0)
     expected = fresh.uniform(0.5, 2, N) * fresh.uniform(size=N)
@@ -120,7 +120,7 @@ def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
     directions, inside = cell_directions()
     cosine = dot(wall.facing, directions[inside]).clamp(min=0)
     arriving = (normals * wall.towards).sum(dim=1, keepdim=True).clamp(min=0)
-    expected = wall.strength * arriving * cosine
+    expected = wall.reflectance * arriving * cosine
     returned = wall.reflected(normals, matte(50), directions[inside])
     # An interface of no reflectance at normal incidence still mirrors a little at grazing angles.
     steep = normals[:, 2] > 0.5
@@ -137,7 +137,7 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
         tan_half_width=one,
         softness=one,
         facing=torch.tensor([[-half, 0.0, half]]),
-        strength=one,
+        reflectance=one,
         towards=torch.tensor([[1.0, 0.0, 0.0]]),
         same=one > 0,
     )
@@ -201,7 +201,7 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
         tan_half_width=torch.tensor([[math.tan(math.radians(30))]]),
         softness=torch.tensor([[0.01]]),
         facing=wall.facing,
-        strength=wall.strength,
+        reflectance=wall.reflectance,
         towards=wall.towards,
         same=wall.same,
     )
@@ -247,7 +247,7 @@ def test_errors_of_light_directions() -> None:
     np.testing.assert_allclose(disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6)
 
 
-def test_errors_of_light_strengths() -> None:
+def test_errors_of_light_intensities() -> None:
     observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
     factor = (disturb_light_intensities(observations, 0.6, generator()) / observations).numpy()
     sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))

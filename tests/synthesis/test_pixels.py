@@ -39,14 +39,13 @@ def test_batches_hold_what_a_capture_would() -> None:
     assert batch.valid.dtype == torch.bool
     assert batch.exposure.shape == (pixels, 1)
     counts = batch.valid.sum(dim=1)
-    assert counts.min() == 4
     assert counts.max() == lights <= 96
-    assert (counts == 10).float().mean() > 0.3
+    # The numbers of one draw differ by a fifth.
+    assert 4 <= counts.min() >= 0.8 * lights - 1
     assert batch.light_directions.norm(dim=-1).sub(1).abs().max() < 1e-5
     assert (batch.light_directions[..., 2] > 0).all()
     assert torch.isfinite(batch.observations).all()
     assert batch.observations.min() >= 0
-    assert batch.observations.max() <= 1
     assert not batch.observations[~batch.valid].any()
     # A pixel that none of its few, low lights reaches happens, but not often.
     assert (batch.observations.amax(dim=1) == 0).float().mean() < 0.02
@@ -56,8 +55,8 @@ def test_a_seed_says_everything() -> None:
     one, other, third = draw(50), draw(50), draw(50, seed=1)
     assert torch.equal(one.observations, other.observations)
     assert torch.equal(one.light_directions, other.light_directions)
-    assert torch.equal(one.scene.dense_map(), other.scene.dense_map())
-    assert not torch.equal(one.scene.normals, third.scene.normals)
+    assert torch.equal(one.truth.dense_map(), other.truth.dense_map())
+    assert not torch.equal(one.truth.normals, third.truth.normals)
 
 
 def test_the_global_generator_is_left_alone() -> None:
@@ -69,14 +68,14 @@ def test_the_global_generator_is_left_alone() -> None:
 def test_matte_pixels_obey_lambert_s_law() -> None:
     batch = draw(500, NOTHING)
     scene = replace(
-        batch.scene,
+        batch.truth,
         material=replace(
-            batch.scene.material,
+            batch.truth.material,
             **{name: torch.zeros(500, 1) for name in ("metallic", "specular", "sheen", "clearcoat")},
             minnaert=torch.ones(500, 1),
             # What an interface mirrors is much where it is smooth, and a larger share of dark surfaces.
-            base=batch.scene.material.base.clamp(min=0.2),
-            roughness=batch.scene.material.roughness.clamp(min=0.5),
+            base=batch.truth.material.base.clamp(min=0.2),
+            roughness=batch.truth.material.roughness.clamp(min=0.5),
         ),
     )
     lights = batch.light_directions
@@ -138,7 +137,7 @@ def test_dense_map_has_no_holes_in_the_disc_and_nothing_outside() -> None:
 
 def test_without_a_camera_s_faults_observations_are_exposed_radiance() -> None:
     batch = draw(200, PLAIN)
-    expected = batch.scene.radiance(batch.light_directions) * batch.exposure * batch.valid
+    expected = batch.truth.radiance(batch.light_directions) * batch.exposure * batch.valid
     # The directions come back from an error of zero, rounded.
     torch.testing.assert_close(batch.observations, expected.clamp(max=1), rtol=1e-3, atol=1e-5)
 
@@ -147,9 +146,9 @@ def test_sparse_and_dense_map_agree_where_a_light_is_in_its_cell_s_centre() -> N
     batch = draw(100, PLAIN)
     directions, inside = cell_directions()
     lights = directions[inside][5::23]
-    observed = batch.scene.radiance(lights) * batch.exposure
+    observed = batch.truth.radiance(lights) * batch.exposure
     sparse = sparse_map(observed, lights)
-    dense = batch.scene.dense_map() * batch.exposure[..., None, None]
+    dense = batch.truth.dense_map() * batch.exposure[..., None, None]
     assert sparse.holds[0].sum() == len(lights)
     torch.testing.assert_close(sparse.values, dense * sparse.holds, rtol=1e-3, atol=1e-6)
 

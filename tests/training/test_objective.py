@@ -145,7 +145,7 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
         found = compute_losses(network, batch, config, part=part)
         views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
         dense_truth = dense_truth_in_frame(batch, views, size=32)
-        normal_truth = to_pixel_frame(batch.scene.normals, views)
+        normal_truth = to_pixel_frame(batch.truth.normals, views)
         dense = network.interpolate(views)
         normals = network.estimate(views, dense).normals
         cells = cell_directions(32)[1].sum()
@@ -211,17 +211,17 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     directions, inside = cell_directions()
     lights = directions[inside][3::29]
     exposure = torch.linspace(0.3, 2, 40)[:, None]
-    observations = batch.scene.radiance(lights) * exposure
-    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.scene, exposure)
+    observations = batch.truth.radiance(lights) * exposure
+    seen = PixelBatch(observations, lights, torch.ones_like(observations) > 0, batch.truth, exposure)
     # Without a turn beyond multiples of 90 degrees, centres stay centres.
     views = network.build_maps(observations, lights)._replace(
         cosine=torch.zeros(40), sine=torch.ones(40), mirrored=mirror
     )
     dense = dense_truth_in_frame(seen, views, size=32)
-    normals = to_pixel_frame(seen.scene.normals, views)
+    normals = to_pixel_frame(seen.truth.normals, views)
     turned = torch.stack((-lights[:, 1], lights[:, 0], lights[:, 2]), dim=1)
     expected_normals = torch.stack(
-        (-seen.scene.normals[:, 1], *seen.scene.normals[:, [0, 2]].unbind(1)), dim=1
+        (-seen.truth.normals[:, 1], *seen.truth.normals[:, [0, 2]].unbind(1)), dim=1
     )
     if mirror:
         turned, expected_normals = (
@@ -243,11 +243,11 @@ def test_truth_and_views_share_any_turn(tiny: TrainingConfig) -> None:
     turn_deg = torch.tensor([0.0, 10.0, -35.0, 90.0, 200.0])
     views = network.build_maps(batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg)
     dense = dense_truth_in_frame(batch, views, size=16)
-    normals = to_pixel_frame(batch.scene.normals, views)
-    azimuth = torch.atan2(batch.scene.normals[:, 1], batch.scene.normals[:, 0])
+    normals = to_pixel_frame(batch.truth.normals, views)
+    azimuth = torch.atan2(batch.truth.normals[:, 1], batch.truth.normals[:, 0])
     turned = azimuth + torch.atan2(views.sine, views.cosine)
     torch.testing.assert_close(torch.cos(torch.atan2(normals[:, 1], normals[:, 0]) - turned), torch.ones(5))
-    torch.testing.assert_close(normals[:, 2], batch.scene.normals[:, 2])
+    torch.testing.assert_close(normals[:, 2], batch.truth.normals[:, 2])
     assert dense.values.shape == (5, 1, 16, 16)
 
 

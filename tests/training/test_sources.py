@@ -12,7 +12,7 @@ import torch
 from splinecli.errors import InputError
 from splinecli.pixel_sets.source import SampledPixels
 from splinecli.pixel_sets.store import Entry, PixelSet
-from splinecli.synthesis.batches import PixelBatch
+from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.sources import MixedSource, open_sources, split_scenes
@@ -27,7 +27,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 def assert_same(one: PixelBatch, other: PixelBatch) -> None:
     for name in ("observations", "light_directions", "valid", "exposure"):
         assert torch.equal(getattr(one, name), getattr(other, name))
-    assert torch.equal(one.scene.normals, other.scene.normals)
+    assert torch.equal(one.truth.normals, other.truth.normals)
 
 
 class Constant:
@@ -35,10 +35,8 @@ class Constant:
 
     def __init__(self, number: float, lights: int) -> None:
         self.number, self.lights = number, lights
-        self.asked: list[int] = []
 
     def draw(self, pixels: int) -> PixelBatch:
-        self.asked.append(pixels)
         lights = torch.tensor((0.0, 0.0, 1.0)).expand(pixels, self.lights, 3)
         ones = torch.ones(pixels, self.lights)
         scene = SampledPixels(lights[:, 0], ones, lights, ones > 0)
@@ -47,23 +45,28 @@ class Constant:
 
 def test_a_mixture_keeps_its_weights() -> None:
     parts = [Constant(1.0, 3), Constant(2.0, 5), Constant(3.0, 4)]
-    batch = MixedSource(parts, (1.0, 6.0, 3.0), seeded()).draw(8000)
-    assert batch.observations.shape == (8000, 5)
+    mixed = MixedSource(parts, (1.0, 6.0, 3.0), seeded())
+    batches = [mixed.draw(3) for _ in range(2000)]
+    numbers = np.array([batch.exposure.unique().item() for batch in batches])  # a batch has one source
     for number, share in ((1.0, 0.1), (2.0, 0.6), (3.0, 0.3)):
-        found = (batch.exposure == number).sum().item()
         # Four standard deviations of the binomial.
-        assert found == pytest.approx(8000 * share, abs=4 * np.sqrt(8000 * share * (1 - share)))
+        expected = pytest.approx(2000 * share, abs=4 * np.sqrt(2000 * share * (1 - share)))
+        assert (numbers == number).sum() == expected
+
+
+def test_batches_of_other_numbers_of_lights_are_padded() -> None:
+    batch = join_batches([Constant(1.0, 3).draw(2), Constant(2.0, 5).draw(3)])
+    assert batch.observations.shape == (5, 5)
     # Pixels with fewer lights are padded with lights that are not valid.
-    assert torch.equal(batch.valid.sum(dim=1), torch.tensor([0, 3, 5, 4])[batch.exposure[:, 0].long()])
+    assert batch.valid.sum(dim=1).tolist() == [3, 3, 5, 5, 5]
     assert not batch.observations[~batch.valid].any()
 
 
-def test_a_mixture_is_its_seed_s_and_never_asks_for_no_pixel() -> None:
+def test_a_mixture_follows_its_seed() -> None:
     def exposures(seed: int) -> torch.Tensor:
         parts = [Constant(1.0, 3), Constant(2.0, 3)]
         mixed = MixedSource(parts, (0.02, 1.0), seeded(seed))
         drawn = torch.cat([mixed.draw(4).exposure for _ in range(40)])
-        assert 0 not in parts[0].asked
         return drawn
 
     assert torch.equal(exposures(3), exposures(3))
@@ -119,7 +122,7 @@ def rows_of(pixel_set: PixelSet, *names: str) -> set[tuple[float, ...]]:
 
 
 def normals_of(batch: PixelBatch) -> set[tuple[float, ...]]:
-    return {tuple(normal) for normal in batch.scene.normals.tolist()}
+    return {tuple(normal) for normal in batch.truth.normals.tolist()}
 
 
 def test_training_never_draws_from_validation_scenes(make_set: MakeSet, tiny: TrainingConfig) -> None:
@@ -131,7 +134,8 @@ def test_training_never_draws_from_validation_scenes(make_set: MakeSet, tiny: Tr
     assert normals_of(training) == rows_of(pixel_set, *({"a1", "b1", "b2"} - for_validation))
     assert normals_of(validation) == rows_of(pixel_set, *for_validation)
     assert (validation.valid.sum(dim=1) == tiny.pixels.usual_lights).all()
-    assert len(set(training.valid.sum(dim=1).tolist())) > 3
+    counts = {int(opened.training.draw(1).valid.sum()) for _ in range(30)}
+    assert len(counts) > 3
 
 
 def test_a_single_scene_is_validated_on_itself(make_set: MakeSet, tiny: TrainingConfig) -> None:
@@ -144,21 +148,28 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     pixel_set = make_set()
     config = replace(tiny, sources={str(pixel_set.folder): 1.0, GENERATOR: 3.0})
 
-    def draw(seed: int) -> tuple[PixelBatch, PixelBatch]:
+    def draw(seed: int) -> tuple[list[PixelBatch], list[PixelBatch]]:
         opened = open_sources(config, seeded(seed), seeded(seed + 1))
-        return opened.training.draw(2000), opened.validation.draw(400)
+        return (
+            [opened.training.draw(5) for _ in range(400)],
+            [opened.validation.draw(5) for _ in range(80)],
+        )
 
     (training, validation), again = draw(5), draw(5)
-    assert_same(training, again[0])
-    assert_same(validation, again[1])
-    assert not torch.equal(draw(6)[0].scene.normals, training.scene.normals)
+    for batches, others in ((training, again[0]), (validation, again[1])):
+        for batch, other in zip(batches, others, strict=True):
+            assert_same(batch, other)
+    assert not torch.equal(draw(6)[0][0].truth.normals, training[0].truth.normals)
     for_validation = {entry.name for entry in split_scenes(pixel_set.entries, config.held_share)[1]}
     stored = rows_of(pixel_set, *({"a", "b", "c"} - for_validation))
-    from_set = sum(tuple(normal) in stored for normal in training.scene.normals.tolist())
-    assert from_set == pytest.approx(500, abs=4 * np.sqrt(2000 * 0.25 * 0.75))
-    assert normals_of(validation) & rows_of(pixel_set, "a", "b", "c") <= rows_of(pixel_set, *for_validation)
+    # A batch has one source. The set gives a quarter of the batches.
+    from_set = [sum(normal in stored for normal in normals_of(batch)) for batch in training]
+    assert all(count in (0, len(normals_of(batch))) for count, batch in zip(from_set, training, strict=True))
+    assert sum(count > 0 for count in from_set) == pytest.approx(100, abs=4 * np.sqrt(400 * 0.25 * 0.75))
+    found = set().union(*(normals_of(batch) for batch in validation)) & rows_of(pixel_set, "a", "b", "c")
+    assert found <= rows_of(pixel_set, *for_validation)
     # Both kinds of truth give maps of one shape.
-    assert training.scene.dense_truth(32).values.shape == (2000, 1, 32, 32)
+    assert {batch.truth.dense_truth(32).values.shape for batch in training} == {(5, 1, 32, 32)}
 
 
 def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(

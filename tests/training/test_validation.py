@@ -34,7 +34,7 @@ def test_validation_is_the_mean_angle_to_the_truth(network: SplineNet, batch: Pi
     assert not network.training
     with torch.no_grad():
         normals = network(batch.observations, batch.light_directions, batch.valid).normals
-    cosine = (normals.double() * batch.scene.normals).sum(dim=1).clamp(-1, 1)
+    cosine = (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1)
     assert found == pytest.approx(cosine.acos().rad2deg().mean().item(), abs=1e-3)
     assert all(parameter.grad is None for parameter in network.parameters())
 
@@ -52,7 +52,7 @@ def test_the_maps_of_some_pixels(network: SplineNet, batch: PixelBatch) -> None:
     with torch.no_grad():
         dense = network.interpolate(views)
         normals = network(batch.observations, batch.light_directions, batch.valid).normals
-    cosine = (normals.double() * batch.scene.normals).sum(dim=1).clamp(-1, 1)
+    cosine = (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1)
     for index in range(SHOWN_PIXELS):
         pixel = 5 * index  # spread over the 40
         holds = views.holds[pixel, 0].numpy() > 0

@@ -1,4 +1,4 @@
-"""Network configurations: everything needed to rebuild a network, frozen, stored inside its weight file."""
+"""Network configurations: everything that rebuilds a network. A weight file stores its configuration."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """A SPLINE-Net, or a CNN-PS.
+    """The layers of a SPLINE-Net or a CNN-PS.
 
     Attributes:
-        size: "paper", the layers of the authors' networks; "compact", made for laptop cores.
+        size: "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
         map_size: cells along a side of the observation map.
-        grid: how lights fall on its cells; "cnn-ps" for the authors' own weights, of the paper size alone.
-        fits: whose normals NE-Net starts from, among the STARTING_FITS, beside the robust Lambertian one; of the
-            compact size alone.
-        interpolates: whether there is a LI-Net. Without it NE-Net reads the sparse map alone, which is CNN-PS.
-        error_head: whether NE-Net tells its error, too; of the compact size alone.
-        width, li_blocks, ne_blocks, head_width: channels, residual blocks of each network and the head's
-            hidden features of the compact size; the paper size has fixed layers and ignores them.
+        grid: how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
+        fits: the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact
+            size only.
+        interpolates: whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
+        error_head: whether NE-Net also estimates its own error. Compact size only.
+        width: channels of the compact size.
+        li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size.
+        head_width: hidden features of NE-Net's head in the compact size.
     """
 
     size: Literal["paper", "compact"] = "compact"
@@ -46,16 +47,16 @@ class NetworkConfig:
 
     @property
     def is_canonical(self) -> bool:
-        """Whether each pixel's lights are turned until its robust Lambertian normal has azimuth zero."""
+        """Whether the lights of each pixel are turned until its robust Lambertian normal has azimuth zero."""
         return self.size == "compact"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as stored in weight files and checkpoints."""
+        """Return plain values, as weight files and checkpoints store them."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Rebuild a configuration. Raises ModelError for an unknown key or value."""
+        """Rebuild a configuration from plain values. Raises ModelError for an unknown key or value."""
         known = {field.name: field.type for field in fields(cls)}
         unknown = sorted(set(values) - set(known))
         if unknown:
@@ -72,17 +73,17 @@ class NetworkConfig:
                     f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096"
                 )
         config = cls(**values, fits=fits)
-        # Both sizes halve the map twice; an instance norm needs more than one cell after that.
+        # Both sizes halve the map twice. An instance norm needs more than one cell after that.
         if config.map_size % 4 or not 8 <= config.map_size <= 128:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
         if config.width < 2:
             raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
         if config.fits and config.size != "compact":
-            raise ModelError("network setting 'fits' is for the size 'compact' alone")
+            raise ModelError("network setting 'fits' needs the size 'compact'")
         if config.error_head and config.size != "compact":
-            raise ModelError("network setting 'error_head' is for the size 'compact' alone")
+            raise ModelError("network setting 'error_head' needs the size 'compact'")
         if config.grid != "even" and config.size != "paper":
-            raise ModelError(f"network grid is {config.grid!r}; only the size 'paper' has it")
+            raise ModelError(f"network grid is {config.grid!r}; it needs the size 'paper'")
         return config
 
 

@@ -1,4 +1,4 @@
-"""Blocks that the compact LI-Net and NE-Net share."""
+"""Layers that the compact LI-Net and NE-Net share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PATCH = 4
 
 
 class ResidualBlock(nn.Module):
-    """x + conv3x3(relu(conv3x3(relu(x)))), (P, C, h, w) -> the same. Starts as the identity, with no norm."""
+    """x + conv3x3(relu(conv3x3(relu(x)))) on (P, C, h, w). It has no norm and starts as the identity."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -25,11 +25,10 @@ class ResidualBlock(nn.Module):
 
 
 class MapEncoder(nn.Module):
-    """Maps (P, C, w, w) -> features (P, width, w / 4, w / 4).
+    """Encodes maps (P, C, w, w) as features (P, width, w / 4, w / 4).
 
-    Every 4 x 4 patch of cells becomes one position (a space-to-depth step, where a CPU is fastest), tagged
-    with a learned embedding of where it lies: cells are light directions, so a map, unlike a photograph, is
-    not translation invariant.
+    Each patch of 4 x 4 cells becomes one position; this is fast on a CPU. Each position gets a learned embedding. Cells
+    are light directions, so a map is not translation invariant as a photograph is.
     """
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:

@@ -9,12 +9,12 @@ from splinecli.networks.layers import PATCH, MapEncoder
 
 
 class PaperLINet(nn.Module):
-    """The authors' generator (Zheng et al., ICCV 2019): (P, 1, w, w) -> the same, in 0..1; 8.40 M parameters.
+    """The authors' LI-Net (Zheng et al., ICCV 2019): (P, 1, w, w) to the same shape, in 0..1; 8.40 M parameters.
 
-    7x7 conv to 64; two stride-2 4x4 convs to 128 and 256; six residual blocks; two transposed convs back; 7x7
-    conv; sigmoid. No conv has a bias; an instance norm with a scale and an offset for each channel follows all
-    but the last. It normalises by each map's own statistics, in training and after it: the authors track
-    running ones but never use them.
+    Its layers are a 7x7 conv to 64 channels, two 4x4 convs of stride 2 to 128 and 256, six residual blocks, two
+    transposed convs back, a 7x7 conv and a sigmoid. No conv has a bias. An instance norm with a scale and an offset for
+    each channel follows every conv but the last. It normalises by the statistics of each map, also after training:
+    the authors track running statistics but never use them.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class _PaperResidualBlock(nn.Module):
 
 
 class CompactLINet(nn.Module):
-    """An encoder-decoder on 4 x 4 patches: (P, C, w, w) -> a correction (P, 1, w, w), zero at first."""
+    """An encoder-decoder on 4 x 4 patches, from (P, C, w, w) to a correction (P, 1, w, w) that is zero at first."""
 
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
         super().__init__()

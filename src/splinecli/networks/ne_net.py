@@ -9,16 +9,16 @@ from splinecli.networks.error_head import ErrorHead
 from splinecli.networks.layers import MapEncoder
 
 DROPOUT = 0.2
-"""Share of the paper size's channels left out in training."""
+"""Share of the channels that the paper size drops in training."""
 
 
 class PaperNENet(nn.Module):
-    """The authors' CNN-PS (Ikehata, ECCV 2018) on two maps: (P, channels, w, w) -> (P, 3), not yet of unit length.
+    """The authors' CNN-PS (Ikehata, ECCV 2018) on two maps: (P, channels, w, w) to (P, 3), not of unit length.
 
-    2.65 M parameters for two channels of 32 x 32, nearly all of them in the 20480 x 128 layer. As in the
-    authors' code no ReLU comes before the last 1x1 conv or between the two linear layers, and the pooling
-    windows overlap: 4 x 4 at a stride of 2. Dropout takes whole channels and ends with the training; the
-    authors' test leaves it on, which adds noise to their normals.
+    It has 2.65 M parameters for two channels of 32 x 32, nearly all of them in the 20480 x 128 layer. As in the
+    authors' code, no ReLU comes before the last 1x1 conv or between the two linear layers, and the pooling
+    windows overlap: 4 x 4 at a stride of 2. Dropout removes whole channels, in training only. The authors leave it on
+    when they test, which adds noise to their normals.
     """
 
     def __init__(self, channels: int, map_size: int) -> None:
@@ -42,7 +42,7 @@ class PaperNENet(nn.Module):
 
 
 class _DenseBlock(nn.Module):
-    """Two 3x3 convs of 16 channels, each joined to all that came before: (P, C, ...) -> (P, C + 32, ...)."""
+    """Two 3x3 convs of 16 channels, each concatenated to its input: (P, C, ...) to (P, C + 32, ...)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -57,10 +57,11 @@ class _DenseBlock(nn.Module):
 
 
 class CompactNENet(nn.Module):
-    """Maps (P, C, w, w) and the normals that K + 1 fits give (P, K + 1, 3) -> (P, 3), not yet of unit length.
+    """Maps (P, C, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit length.
 
-    Beside them stands what the error head says (P, 2), None without one. A weighted sum of the fits' normals plus a
-    correction: at first the first fit has the weight 1 and all else is zero; with K = 0 that weight is fixed.
+    The result is a weighted sum of the starting normals plus a correction. At first the first normal has weight 1, and
+    all else is zero. With K = 0 this weight is fixed.
+    The second result is that of the error head (P, 2), None without one.
     """
 
     def __init__(
@@ -94,13 +95,13 @@ class CompactNENet(nn.Module):
 
     def forward(self, maps: Tensor, normals: Tensor) -> tuple[Tensor, Tensor | None]:
         features = torch.relu(self.squeeze(torch.relu(self.encoder(maps))))
-        # Patches first, channels last: the order in memory, so that flattening copies nothing.
+        # Patches first, channels last: this is the order in memory, so flattening does not copy.
         hidden = self.hidden(features.permute(0, 2, 3, 1).flatten(1))
         if self.compare is None or self.weigh is None:
             start = normals[:, 0]
         else:
             hidden = hidden + self.compare(normals[:, 1:].flatten(1))
-            # In float32, whatever the layers compute in: the normals' digits are needed.
+            # In float32 whatever the layers compute in, because the sum needs the digits of the normals.
             weight = self.weigh(torch.relu(hidden)).float()
             start = (weight[..., None] * normals).sum(dim=1)
         hidden = torch.relu(hidden)

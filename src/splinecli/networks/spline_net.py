@@ -1,15 +1,15 @@
-"""SPLINE-Net (Zheng et al., ICCV 2019): observations -> maps -> LI-Net -> NE-Net -> normal.
+"""SPLINE-Net (Zheng et al., ICCV 2019): from observations to maps, through LI-Net and NE-Net, to normals.
 
-The compact size differs from the paper's in four ways, all of them about learning more from each pixel:
+The compact size differs from the paper's in four ways. Each helps it learn more from each pixel.
 
-1. Canonical azimuth: each pixel's lights are turned about the view axis until its robust Lambertian normal
-   lies over the +x axis, and the estimate is turned back. Normals then come in one azimuth only.
-2. Both networks correct that Lambertian fit instead of starting from nothing: LI-Net its map, NE-Net its
-   normal. A matte pixel is right from the start. NE-Net may weigh the normals of further fits, too.
-3. Beside the sparse map stand the cells that hold an observation, and the residual of the fit there, computed
-   with the exact light directions, which a 32 x 32 grid alone would round by up to 2 degrees.
-4. The dense map shares the sparse map's scale (its largest observation), values above 1 cut off: a highlight
-   that no light has hit does not change the scale of everything else.
+1. Canonical azimuth: the lights of each pixel are turned about the view axis until its robust Lambertian normal has
+   azimuth zero. The estimate is turned back. The network therefore sees normals of one azimuth only.
+2. Both networks correct the Lambertian fit: LI-Net its map, NE-Net its normal. A matte pixel is right from the start.
+   NE-Net may also weigh the normals of further fits.
+3. Two more channels accompany the sparse map: which cells have an observation, and the residual of the fit there. The
+   residual uses the exact light directions, which a 32 x 32 grid rounds by up to 2 degrees.
+4. The dense map has the scale of the sparse map, its largest observation. Values above 1 are cut off, so that a
+   highlight under some other light does not change the scale of all other values.
 """
 
 from __future__ import annotations
@@ -39,9 +39,13 @@ RESIDUAL_LIMIT = 3.0
 class PixelMaps(NamedTuple):
     """Observation maps of P pixels and what belongs to them, in each pixel's own frame.
 
-    sparse, holds, residual, lambertian_map: (P, 1, w, w); lambertian_normals (P, 3); scale (P, 1), the
-    observation that the maps call 1; fitted_normals (P, K, 3), of the configuration's further fits; cosine,
-    sine (P,): the turn from the capture's frame to the pixel's; mirrored: y flipped after it.
+    Attributes:
+        sparse, holds, residual, lambertian_map: (P, 1, w, w); holds is 1 in cells with an observation.
+        lambertian_normals: (P, 3), unit.
+        scale: (P, 1), the largest observation, which is 1 in the maps.
+        fitted_normals: (P, K, 3), of the further fits in the configuration.
+        cosine, sine: (P,), of the turn from the capture's frame to the pixel's.
+        mirrored: whether y is flipped after the turn.
     """
 
     sparse: Tensor
@@ -57,14 +61,14 @@ class PixelMaps(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Unit normals (P, 3), and the error head's distribution of their errors (P, 2), None without an error head."""
+    """Unit normals (P, 3), and the distributions of their errors (P, 2), None without an error head."""
 
     normals: Tensor
     error: Tensor | None
 
 
 class SplineNet(nn.Module):
-    """LI-Net and NE-Net with everything between raw observations and normals."""
+    """LI-Net, NE-Net and all steps between raw observations and normals."""
 
     cells: Tensor
     inside: Tensor
@@ -103,11 +107,12 @@ class SplineNet(nn.Module):
         turn_deg: float | Tensor = 0.0,
         mirror: bool = False,
     ) -> PixelMaps:
-        """Maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
+        """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
 
         Args:
-            turn_deg: a further turn of the lights about the view axis, one for all or (P,).
-            mirror: then flip y; an isotropic pixel looks the same from its mirrored lights.
+            valid: (P, F) bool, all by default; the others are left out.
+            turn_deg: a further turn of the lights about the view axis, a number or (P,).
+            mirror: flip y after the turn. An isotropic pixel looks the same under its mirrored lights.
         """
         scale = map_scale(observations, valid)
         observed = observations / scale
@@ -116,7 +121,7 @@ class SplineNet(nn.Module):
         else:
             scaled_normals = observed.new_tensor((0.0, 0.0, 1.0)).expand(len(observed), 3)
         x, y, z = scaled_normals.unbind(-1)
-        # A fit that looks away from the camera is laid on the rim, where the closest visible normal is.
+        # A fit that points away from the camera is moved to the rim, where the closest visible normal is.
         z = torch.maximum(z, 0.02 * torch.hypot(x, y))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
         angle = torch.as_tensor(turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
@@ -151,7 +156,7 @@ class SplineNet(nn.Module):
         )
 
     def interpolate(self, maps: PixelMaps) -> Tensor | None:
-        """LI-Net: dense maps (P, 1, w, w), zero outside the unit disc; None for a network without LI-Net."""
+        """Return the dense maps of LI-Net (P, 1, w, w), zero outside the unit disc; None without a LI-Net."""
         if self.li_net is None:
             return None
         if self.config.size == "paper":
@@ -162,7 +167,7 @@ class SplineNet(nn.Module):
         return dense * self.inside
 
     def estimate(self, maps: PixelMaps, dense: Tensor | None) -> Estimate:
-        """NE-Net: normals in the pixels' frames, and their errors."""
+        """Return the normals of NE-Net in the pixels' frames, and their errors."""
         interpolated = [] if dense is None else [dense.to(maps.sparse.dtype)]
         if self.config.size == "paper":
             raw, error = self.ne_net(torch.cat((maps.sparse, *interpolated), dim=1)), None
@@ -181,7 +186,7 @@ class SplineNet(nn.Module):
         turn_deg: float | Tensor = 0.0,
         mirror: bool = False,
     ) -> Estimate:
-        """Normals in the capture's frame, and their errors.
+        """Return normals in the capture's frame, and their errors.
 
         Args:
             observations: (P, F), linear, divided by the light intensities; any scale.

@@ -1,4 +1,4 @@
-"""The normals of other fits, which NE-Net weighs and corrects beside the robust Lambertian one."""
+"""The fits whose normals NE-Net weighs and corrects, beside the robust Lambertian fit."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def _sparse(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Te
 
 
 STARTING_FITS = {"ls": _least_squares, "iw12": iw12.solve, "iw12-all": _sparse, "ia14": ia14.solve}
-"""By the names that NetworkConfig.fits holds. "iw12-all" leaves no observation out: far better on metals."""
+"""Fits by their names in NetworkConfig.fits. "iw12-all" uses every observation, which is far better on metals."""
 
 
 @torch.no_grad()
 def fit_normals(
     names: Sequence[str], observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
 ) -> Tensor:
-    """Unit normals (P, K, 3) of K fits, zero where a fit has none.
+    """Return unit normals (P, K, 3) of K fits, zero where a fit has none.
 
     Args:
         names: among STARTING_FITS.
@@ -39,7 +39,7 @@ def fit_normals(
         return observations.new_zeros(len(observations), 0, 3)
     if valid is None:
         valid = torch.ones_like(observations, dtype=torch.bool)
-    # Negative ones, which a subtracted dark frame leaves, are shadow.
+    # A subtracted dark frame leaves negative values in shadows.
     observed = torch.where(valid, observations, 0).clamp(min=0).double()
     lights = light_directions.double()
     found = torch.stack([STARTING_FITS[name](observed, lights, valid) for name in names], dim=1)

@@ -1,4 +1,4 @@
-"""Batches of training pixels, whatever they come from: what a capture would hold of them, and the truth."""
+"""Batches of training pixels from any source: what a capture would show of them, and the truth."""
 
 from __future__ import annotations
 
@@ -20,8 +20,17 @@ from splinecli.synthesis.effects import (
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How pixels are photographed: lights from `min_lights` to `max_lights`, 30 % of the pixels under
-    `usual_lights`; and the shares of the pixels whose capture has each fault, 0 switches it off.
+    """How pixels are photographed, and the share of the pixels whose capture has each fault.
+
+    A share of 0 switches a fault off.
+
+    Attributes:
+        min_lights, max_lights, usual_lights: see draw_light_counts.
+        light_direction_error_share: pixels with errors of the light directions.
+        light_intensity_error_share: pixels with errors of the light intensities.
+        saturated_share: pixels that are clipped.
+        sensor_noise: whether there are noise and quantisation.
+        eight_bit_share: pixels with 8 bits; the others have 16.
     """
 
     min_lights: int = 4
@@ -35,8 +44,12 @@ class CaptureConfig:
 
 
 class DenseMap(NamedTuple):
-    """values (P, 1, w, w); known and filled, of the same shape, are 1 where values are true and where they
-    are usable: measured, or interpolated from measured neighbours. Zero elsewhere, as outside the unit disc.
+    """True dense maps.
+
+    Attributes:
+        values: (P, 1, w, w), zero where nothing is known, such as outside the unit disc.
+        known: of the same shape, 1 where values are measured.
+        filled: of the same shape, 1 where values are measured or interpolated from measured neighbours.
     """
 
     values: Tensor
@@ -44,12 +57,12 @@ class DenseMap(NamedTuple):
     filled: Tensor
 
     def flip_y(self) -> DenseMap:
-        """The maps of the mirrored scenes (cells' centres lie symmetrically, so rows are turned over)."""
+        """Return the maps of the mirrored pixels. The cells lie symmetrically, so this reverses the rows."""
         return DenseMap(*(cells.flip(2) for cells in self))
 
 
-class Scene(Protocol):
-    """The truth behind P pixels."""
+class PixelTruth(Protocol):
+    """What is known of P pixels beside their observations."""
 
     @property
     def normals(self) -> Tensor:
@@ -57,42 +70,47 @@ class Scene(Protocol):
         ...
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Self:
-        """Each pixel turned about the view axis by an angle of its own; cosine and sine (P,)."""
+        """Turn each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
         ...
 
     def dense_truth(self, size: int) -> DenseMap:
-        """The complete maps at the scale of the scene's radiance."""
+        """Return the complete maps at the scale of the radiance."""
         ...
 
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """What a capture holds of P pixels: observations, valid (bool) (P, F) and light_directions (P, F, 3).
+    """P pixels as a capture shows them, and their truth.
 
-    `scene` is the truth behind them and `exposure` (P, 1) the factor from its radiance to the observations.
+    Attributes:
+        observations: (P, F), linear, divided by the light intensities.
+        light_directions: (P, F, 3), unit, as calibrated.
+        valid: (P, F) bool; false for padding.
+        truth: the normals and dense maps.
+        exposure: (P, 1), the factor from the radiance of the truth to the observations.
     """
 
     observations: Tensor
     light_directions: Tensor
     valid: Tensor
-    scene: Scene
+    truth: PixelTruth
     exposure: Tensor
 
 
 @dataclass(frozen=True)
-class JoinedScene:
-    """The pixels of several scenes after one another."""
+class JoinedTruth:
+    """The truth of several batches after one another."""
 
-    parts: tuple[Scene, ...]
+    parts: tuple[PixelTruth, ...]
 
     @property
     def normals(self) -> Tensor:
         return torch.cat([part.normals for part in self.parts])
 
-    def rotate(self, cosine: Tensor, sine: Tensor) -> JoinedScene:
+    def rotate(self, cosine: Tensor, sine: Tensor) -> JoinedTruth:
         counts = [len(part.normals) for part in self.parts]
         angles = zip(self.parts, torch.split(cosine, counts), torch.split(sine, counts), strict=True)
-        return JoinedScene(tuple(part.rotate(c, s) for part, c, s in angles))
+        return JoinedTruth(tuple(part.rotate(c, s) for part, c, s in angles))
 
     def dense_truth(self, size: int) -> DenseMap:
         maps = zip(*(part.dense_truth(size) for part in self.parts), strict=True)
@@ -100,7 +118,7 @@ class JoinedScene:
 
 
 def join_batches(batches: Sequence[PixelBatch]) -> PixelBatch:
-    """One batch of all pixels; those with fewer lights get further ones that are not valid."""
+    """Join batches into one. Pixels with fewer lights get further ones that are not valid."""
     if len(batches) == 1:
         return batches[0]
     lights = max(batch.valid.shape[1] for batch in batches)
@@ -120,20 +138,20 @@ def join_batches(batches: Sequence[PixelBatch]) -> PixelBatch:
         join("observations"),
         join("light_directions"),
         join("valid"),
-        JoinedScene(tuple(batch.scene for batch in batches)),
+        JoinedTruth(tuple(batch.truth for batch in batches)),
         torch.cat([batch.exposure for batch in batches]),
     )
 
 
 def photograph(
-    scene: Scene,
+    truth: PixelTruth,
     radiance: Tensor,
     directions: Tensor,
     valid: Tensor,
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """What a camera and a calibration with faults make of radiance (P, F) under directions (P, F, 3)."""
+    """Photograph radiance (P, F) under directions (P, F, 3) with the faults of a camera and of a calibration."""
     radiance = radiance * valid
     exposure = draw_exposure(radiance, config.saturated_share, generator)
     observed = disturb_light_intensities(radiance * exposure, config.light_intensity_error_share, generator)
@@ -142,4 +160,4 @@ def photograph(
         observed = add_sensor_noise(observed, generator)
         observed = quantise(observed, config.eight_bit_share, generator)
     calibrated = disturb_light_directions(directions, config.light_direction_error_share, generator)
-    return PixelBatch(observed * valid, calibrated, valid, scene, exposure)
+    return PixelBatch(observed * valid, calibrated, valid, truth, exposure)

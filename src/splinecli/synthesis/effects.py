@@ -1,8 +1,7 @@
-"""What real captures do to a pixel, each effect a function with its distribution stated.
+"""Effects of real captures on a pixel. Each function states the distribution that it draws from.
 
-Effects of the scene (walls that shade and reflect, ambient light) are functions of the light direction and so
-shape the dense map too; effects of the capture (errors of the lights, the camera) touch the sparse
-observations alone.
+Effects of the scene, such as walls and ambient light, depend on the light direction, so they also shape the dense
+map. Effects of the capture, such as errors of the lights and of the camera, change the sparse observations alone.
 """
 
 from __future__ import annotations
@@ -23,12 +22,18 @@ def _uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: fl
 
 @dataclass(frozen=True)
 class Wall:
-    """A neighbouring surface of each pixel, which hides a sector of low lights and reflects the others.
+    """A surface beside each pixel that hides a sector of low lights and reflects the others.
 
-    azimuth (P, 3): unit vector in the image plane towards the wall; tan_height, tan_half_width, softness,
-    strength (P, 1); facing (P, 3): the wall's normal; towards (P, 3): unit vector to the part of the wall that
-    reflects; same (P, 1) bool: whether it is of the pixel's own material, else it is matte. A pixel without a wall has
-    tan_height = strength = 0.
+    A pixel without a wall has tan_height = reflectance = 0.
+
+    Attributes:
+        azimuth: (P, 3), unit vector in the image plane towards the wall.
+        tan_height, tan_half_width: (P, 1), tangents of the wall's elevation and of half its width.
+        softness: (P, 1), width of the shadow's edge in l_z.
+        facing: (P, 3), the wall's normal.
+        reflectance: (P, 1), share of the light on the wall that reaches the pixel.
+        towards: (P, 3), unit vector to the part of the wall that reflects.
+        same: (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte.
     """
 
     azimuth: Tensor
@@ -36,12 +41,12 @@ class Wall:
     tan_half_width: Tensor
     softness: Tensor
     facing: Tensor
-    strength: Tensor
+    reflectance: Tensor
     towards: Tensor
     same: Tensor
 
     def visibility(self, directions: Tensor) -> Tensor:
-        """Share of each light that passes the wall (P, D): cast shadow over one connected sector of the map.
+        """Return the share of each light that passes the wall (P, D): a cast shadow over one sector of the map.
 
         A direction is hidden where its elevation is under the wall's, l_z < tan(height) l_along, and it falls
         within the wall's width, |l_across| < tan(half width) l_along; the edge is `softness` wide in l_z.
@@ -55,16 +60,15 @@ class Wall:
         return 1 - (depth / self.softness).clamp(0, 1)
 
     def reflected(self, normals: Tensor, material: Material, directions: Tensor) -> Tensor:
-        """Radiance (P, D) that pixels of these normals (P, 3) and material show of light thrown back by the wall.
+        """Return the radiance (P, D) that light from the wall adds to pixels of these normals (P, 3) and material.
 
-        What the wall throws back comes from one direction, `towards`, and meets the pixel's material from there: on a
-        metal it is a highlight of its own. As both are wide in truth, neither reflects more than three times what
-        matte white would.
+        The reflected light comes from one direction, `towards`. On a metal it makes a highlight. Real walls and
+        reflections are wide, so neither may reflect more than three times what matte white would.
         """
         returned = directions.new_zeros(len(normals), directions.shape[-2])
         facing_cosine = -dot(self.facing, self.towards[:, None])
         for same in (False, True):
-            pixels = ((self.strength[:, 0] > 0) & (self.same[:, 0] == same)).nonzero()[:, 0]
+            pixels = ((self.reflectance[:, 0] > 0) & (self.same[:, 0] == same)).nonzero()[:, 0]
             if not len(pixels):
                 continue
             lights = directions if directions.ndim == 2 else directions[pixels]
@@ -77,18 +81,18 @@ class Wall:
                 leaving = incident.clamp(min=0)
             seen = normals[pixels]
             response = own.shade(dot(seen, towards[:, None]), seen[:, 2:], towards[:, 2:])
-            returned[pixels] = leaving.clamp(max=3) * (response.clamp(max=3) * self.strength[pixels])
+            returned[pixels] = leaving.clamp(max=3) * (response.clamp(max=3) * self.reflectance[pixels])
         return returned
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Wall:
-        """The wall turned about the view axis."""
+        """Turn the wall about the view axis."""
         return Wall(
             rotate_about_view_axis(self.azimuth, cosine, sine),
             self.tan_height,
             self.tan_half_width,
             self.softness,
             rotate_about_view_axis(self.facing, cosine, sine),
-            self.strength,
+            self.reflectance,
             rotate_about_view_axis(self.towards, cosine, sine),
             self.same,
         )
@@ -102,13 +106,14 @@ def draw_wall(
     shadows: bool = True,
     interreflections: bool = True,
 ) -> Wall:
-    """A wall for a `share` of the pixels with these normals (P, 3).
+    """Draw walls for a share of the pixels with these normals (P, 3).
 
-    Azimuth: within N(0, 50 degrees) of the normal's for 60 % (in a hollow the surface looks at the wall that
-    faces it), else uniform. Height U(8, 75) degrees; half-width tan U(15, 88) degrees; edge U(0.01, 0.06).
-    The wall leans back by U(0, 60) degrees from upright. It reflects from U(0.2, 0.9) of its height, but not from
-    where it does not face the pixel, the share (1 - cos(height)) U(0, 1) U(0.5, 2); half of the walls are of the
-    pixel's own material, the others matte with albedo U(0.05, 0.9).
+    azimuth: within N(0, 50 degrees) of the normal's for 60 %, because a surface in a hollow faces a wall; else uniform.
+    height: U(8, 75) degrees. half-width: tan U(15, 88) degrees. softness: U(0.01, 0.06).
+    facing: the wall leans back by U(0, 60) degrees from upright.
+    towards: at U(0.2, 0.9) of the height, where the wall faces the pixel.
+    reflectance: (1 - cos(height)) U(0, 1) U(0.5, 2). Half of the walls have the pixel's material. The others are
+    matte, with an albedo of U(0.05, 0.9).
     """
     pixels = len(normals)
     spread = torch.randn(pixels, 1, generator=generator, device=generator.device) * math.radians(50)
@@ -122,35 +127,35 @@ def draw_wall(
     toward = torch.cat((azimuth.cos(), azimuth.sin(), torch.zeros_like(azimuth)), dim=1)
     up = torch.tensor((0.0, 0.0, 1.0), device=normals.device)
     same = _uniform(generator, pixels, 1) < 0.5
-    strength = (1 - height.cos()) * _uniform(generator, pixels, 1, low=0.5, high=2.0)
-    strength = strength * _uniform(generator, pixels, 1)
+    reflectance = (1 - height.cos()) * _uniform(generator, pixels, 1, low=0.5, high=2.0)
+    reflectance = reflectance * _uniform(generator, pixels, 1)
     albedo = _uniform(generator, pixels, 1, low=0.05, high=0.9)
-    strength = torch.where(same, strength, strength * albedo)
+    reflectance = torch.where(same, reflectance, reflectance * albedo)
     elevation = height * _uniform(generator, pixels, 1, low=0.2, high=0.9)
     elevation = torch.minimum(elevation, math.radians(85) - lean)
     return Wall(
         azimuth=toward,
-        # Without shadows the wall lies below every light, but still reflects.
+        # Without shadows the wall lies below every light but still reflects.
         tan_height=height.tan() if shadows else torch.zeros_like(height),
         tan_half_width=half_width.tan(),
         softness=_uniform(generator, pixels, 1, low=0.01, high=0.06),
         facing=-toward * lean.cos() + up * lean.sin(),
-        strength=strength if interreflections else torch.zeros_like(strength),
+        reflectance=reflectance if interreflections else torch.zeros_like(reflectance),
         towards=toward * elevation.cos() + up * elevation.sin(),
         same=same,
     )
 
 
 def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tensor:
-    """Light from everywhere (P, 1), to be scaled by albedo: 10^U(-3.5, -1.3) for a `share` of pixels, else 0."""
+    """Draw ambient light (P, 1), to be scaled by the albedo: 10^U(-3.5, -1.3) for a share of the pixels, else 0."""
     present = _uniform(generator, pixels, 1) < share
     return 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Directions as calibrated (P, F, 3): Gaussian errors for a `share` of the pixels.
+    """Add Gaussian errors of calibration to the directions (P, F, 3) of a share of the pixels.
 
-    Their sigma on either axis is 8 U(0, 1)^3 degrees: 1 degree in the median, more than 4 for a fifth.
+    Their sigma on either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
     """
     pixels = len(directions)
     sigma = math.radians(8.0) * _uniform(generator, pixels, 1, 1) ** 3
@@ -161,7 +166,7 @@ def disturb_light_directions(directions: Tensor, share: float, generator: torch.
 
 
 def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Each light's strength off by a Gaussian factor, sigma U(0, 5 %), for a `share` of the pixels (P, F)."""
+    """Multiply observations (P, F) by Gaussian errors of intensity, sigma U(0, 5 %), for a share of the pixels."""
     sigma = _uniform(generator, len(observations), 1, high=0.05) * (
         _uniform(generator, len(observations), 1) < share
     )
@@ -170,9 +175,9 @@ def disturb_light_intensities(observations: Tensor, share: float, generator: tor
 
 
 def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
-    """Factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
+    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
 
-    The brightest observation lies at 10^U(-1.3, 0); for `saturated_share` of the pixels at U(1, 3), to be
+    The brightest observation lies at 10^U(-1.3, 0). For `saturated_share` of the pixels it lies at U(1, 3), to be
     clipped.
     """
     pixels = len(radiance)
@@ -183,7 +188,7 @@ def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Gen
 
 
 def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
-    """Read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, Gaussian."""
+    """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both Gaussian."""
     pixels = len(exposed)
     read = 10 ** _uniform(generator, pixels, 1, low=-4.0, high=-2.5)
     shot = 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-2.0)

@@ -1,4 +1,4 @@
-"""Random light rigs: how many lights a pixel has and where they stand."""
+"""Random light rigs: the number of lights of a pixel and their directions."""
 
 from __future__ import annotations
 
@@ -9,21 +9,29 @@ from torch import Tensor
 
 
 def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: torch.Generator) -> Tensor:
-    """Number of lights of each pixel (P,): `usual` for 30 %, else log-uniform over low..high."""
+    """Draw the number of lights of each pixel (P,). The numbers of one draw differ by a fifth, to save padding.
+
+    Each draw has a largest number. For half of the draws it is usual - 1 to usual + 2, else it is log-uniform over
+    low..high. The pixels have four fifths of that number or more.
+    """
     device = generator.device
-    exponent = torch.rand(pixels, generator=generator, device=device)
-    counts = (low * ((high + 1) / low) ** exponent).long().clamp(low, high)
-    plain = torch.rand(pixels, generator=generator, device=device) < 0.3
-    return torch.where(plain, torch.full_like(counts, usual), counts)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, device=device)
+
+    anywhere = low * ((high + 1) / low) ** uniform(1)
+    about = usual - 1 + 4 * uniform(1)
+    largest = torch.where(uniform(1) < 0.5, about, anywhere).floor().clamp(low, high)
+    return (largest * (1 - 0.2 * uniform(pixels))).round().long().clamp(low, high)
 
 
 def draw_light_directions(pixels: int, lights: int, generator: torch.Generator) -> Tensor:
-    """Unit light directions (P, F, 3), a rig of its own for each pixel.
+    """Draw unit light directions (P, F, 3), a rig for each pixel.
 
-    A rig's lights fall uniformly, by projected area, into an ellipse of the (x, y) disc: half-axis sin U(20,
-    88) degrees, the other U(0.5, 1) of it, turned at random. Half of the rigs lean: their centre is moved by
-    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp held above; what then lies
-    outside 0.996 of the disc is drawn in to its rim.
+    The lights of a rig fill an ellipse in the (x, y) disc uniformly, by projected area. One half-axis is sin U(20, 88)
+    degrees, the other U(0.5, 1) of it, and the ellipse is turned at random. The centre of half of the rigs is moved by
+    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp held above. Lights outside 0.996 of the
+    disc are moved to its rim.
     """
     device = generator.device
 

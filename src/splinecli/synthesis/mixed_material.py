@@ -1,4 +1,4 @@
-"""Pixels whose reflectances are of several kinds."""
+"""Pixels with reflectances of several kinds."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from splinecli.synthesis.principled import PrincipledMaterial
 
 @dataclass(frozen=True)
 class MixedMaterial:
-    """P pixels of several kinds: pixel p is the reflectance `row[p]` of `parts[kind[p]]`; kind, row (P,) int64."""
+    """P pixels: pixel p has the reflectance `row[p]` of `parts[kind[p]]`. kind and row are (P,) int64."""
 
     parts: tuple[Material, ...]
     kind: Tensor
     row: Tensor
 
     def take(self, pixels: slice | Tensor) -> MixedMaterial:
-        """The reflectances of some of the pixels; the parts stay whole."""
+        """Return the reflectances of some of the pixels. The parts are not copied."""
         return MixedMaterial(self.parts, self.kind[pixels], self.row[pixels])
 
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
-        """pi times the reflected radiance (P, D); arguments as in Material.shade."""
+        """Return pi times the reflected radiance (P, D). Arguments as in Material.shade."""
         shaded = torch.empty_like(n_dot_l)
         for pixels, material in self._of_each_kind():
             own = l_dot_v if l_dot_v.ndim == 1 else l_dot_v[pixels]
@@ -32,7 +32,7 @@ class MixedMaterial:
         return shaded
 
     def albedo(self) -> Tensor:
-        """Each pixel's own (P, 1)."""
+        """Return the albedo of each pixel (P, 1)."""
         albedo = torch.empty(len(self.kind), 1, device=self.kind.device)
         for pixels, material in self._of_each_kind():
             albedo[pixels] = material.albedo()
@@ -42,16 +42,16 @@ class MixedMaterial:
         found = []
         for kind, part in enumerate(self.parts):
             pixels = (self.kind == kind).nonzero()[:, 0]
-            # Most parts can do nothing with no pixels at all.
+            # Most parts cannot handle an empty selection.
             if len(pixels):
                 found.append((pixels, part.take(self.row[pixels])))
         return found
 
 
 def choose(condition: Tensor, first: Material, second: Material) -> Material:
-    """The reflectances of `first` where condition (P, 1) holds, of `second` elsewhere; both of P pixels."""
+    """Return the reflectances of `first` where condition (P, 1) is true, else of `second`. Both have P pixels."""
     if isinstance(first, PrincipledMaterial) and isinstance(second, PrincipledMaterial):
-        # All parameters are tensors, and one pass shades what would take a mixture two.
+        # All parameters are tensors, so one pass shades both. A mixture would need two.
         pairs = zip(vars(first).values(), vars(second).values(), strict=True)
         return PrincipledMaterial(*(torch.where(condition, one, other) for one, other in pairs))
     kind = (~condition[:, 0]).long()

@@ -1,9 +1,8 @@
-"""The online pixel generator: pixels made one by one, in batches, on the device of its random generator.
+"""The online pixel generator: it makes training pixels in batches, on the device of its random generator.
 
-Each pixel is a scene of its own (normal, material, neighbouring walls, ambient light) that can be asked for
-its radiance under any light: under a random rig for the sparse observations, under every cell's direction for
-the complete dense map. After PX-Net (Logothetis et al., ICCV 2021), which trains a per-pixel network without
-rendered objects.
+Each pixel has its own normal, material, walls and ambient light, and gives its radiance under any light. A random
+rig gives the sparse observations, and the directions of all cells give the complete dense map. PX-Net (Logothetis et
+al., ICCV 2021) trains a per-pixel network in this way, without rendered objects.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from splinecli.synthesis.principled import draw_material
 
 @dataclass(frozen=True)
 class PixelGeneratorConfig(CaptureConfig):
-    """Switches and shares of the pixel generator (a share of 0 switches an effect off), beside its captures'."""
+    """Switches and shares of the pixel generator and of its captures. A share of 0 switches an effect off."""
 
     cast_shadows: bool = True
     interreflections: bool = True
@@ -46,7 +45,7 @@ class PixelGeneratorConfig(CaptureConfig):
 
 @dataclass(frozen=True)
 class PixelScene:
-    """P pixels seen from +z. `mixed` is a second surface of the first M of them (an edge, two materials)."""
+    """P pixels seen from +z. `mixed` is a second surface of the first M pixels: an edge, or a second material."""
 
     normals: Tensor
     material: Material
@@ -56,7 +55,7 @@ class PixelScene:
     mixed_weight: Tensor | None = None
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Radiance (P, D) under unit lights (D, 3) or (P, D, 3); matte white that faces its light is 1."""
+        """Return the radiance (P, D) under unit lights (D, 3) or (P, D, 3). Matte white that faces its light has 1."""
         visible = torch.ones((), device=self.normals.device)
         returned = self.material.albedo() * self.ambient
         for wall in self.walls:
@@ -74,7 +73,7 @@ class PixelScene:
         return total
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> PixelScene:
-        """Each pixel's scene turned about the view axis by an angle of its own; cosine and sine (P,)."""
+        """Turn each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
         mixed = self.mixed
         if mixed is not None:
             mixed = mixed.rotate(cosine[: len(mixed.normals)], sine[: len(mixed.normals)])
@@ -88,7 +87,7 @@ class PixelScene:
         )
 
     def dense_map(self, size: int = MAP_SIZE) -> Tensor:
-        """The complete map (P, 1, size, size): radiance at the cells' centres, zero outside the unit disc."""
+        """Return the complete map (P, 1, size, size): radiance at the cells' centres, zero outside the unit disc."""
         directions, inside = cell_directions(size)
         directions, inside = directions.to(self.normals.device), inside.to(self.normals.device)
         dense = self.normals.new_zeros(len(self.normals), 1, size, size)
@@ -96,28 +95,28 @@ class PixelScene:
         return dense
 
     def dense_truth(self, size: int) -> DenseMap:
-        """The complete map, known in the whole disc."""
+        """Return the complete map, which is known in the whole disc."""
         _, inside = cell_directions(size)
         known = inside.to(self.normals).expand(len(self.normals), 1, size, size)
         return DenseMap(self.dense_map(size), known, known)
 
 
 def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
-    """Unit normals (P, 3) towards the camera, uniform by projected area: as a sphere's pixels show them."""
+    """Draw unit normals (P, 3) towards the camera, uniform by projected area as on the pixels of a sphere."""
     radius = 0.997 * torch.sqrt(torch.rand(pixels, generator=generator, device=generator.device))
     azimuth = 2 * torch.pi * torch.rand(pixels, generator=generator, device=generator.device)
     return torch.stack((radius * azimuth.cos(), radius * azimuth.sin(), (1 - radius**2).sqrt()), dim=-1)
 
 
 def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tensor:
-    """Normals across an edge: each moved by a Gaussian of sigma 0.5 and kept towards the camera."""
+    """Draw normals across an edge: add a Gaussian of sigma 0.5 to each and keep it towards the camera."""
     moved = normals + 0.5 * torch.randn(normals.shape, generator=generator, device=normals.device)
     moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
     return torch.nn.functional.normalize(moved, dim=1)
 
 
 def read_library(config: PixelGeneratorConfig, device: torch.device) -> MeasuredLibrary | None:
-    """The measured materials that a configuration asks for; none where their share is 0.
+    """Read the measured materials of a configuration; None where their share is 0.
 
     Raises ModelError where it names no file, InputError where the file cannot be used.
     """
@@ -134,7 +133,7 @@ def read_library(config: PixelGeneratorConfig, device: torch.device) -> Measured
 def draw_reflectance(
     pixels: int, share: float, library: MeasuredLibrary | None, generator: torch.Generator
 ) -> Material:
-    """Random materials, each with probability `share` from the library, else from the principled model."""
+    """Draw random materials, with probability `share` from the library, else from the principled model."""
     material = draw_material(pixels, generator)
     if library is None or not share:
         return material
@@ -149,10 +148,13 @@ def draw_scene(
     generator: torch.Generator,
     library: MeasuredLibrary | None = None,
 ) -> PixelScene:
-    """Random pixels. Of the mixed ones half lie on an edge (a second normal), half blend two materials.
+    """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials.
 
-    `library` saves reading the file of measured materials anew. Where their share is 0, no random number is
-    drawn for them. Raises ModelError, InputError as read_library.
+    Args:
+        library: the measured materials; read from the configuration's file where it is None.
+
+    Raises:
+        ModelError, InputError: as read_library does.
     """
     library = library or read_library(config, generator.device)
     normals = draw_visible_normals(pixels, generator)
@@ -168,7 +170,7 @@ def draw_scene(
     count = round(config.mixed_share * pixels)
     if not count:
         return PixelScene(normals, material, walls, ambient)
-    # Every second mixed pixel is an edge, with one material on two normals; the others are two materials.
+    # Every second mixed pixel is an edge, with one material on two normals. The others have two materials.
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
     other = draw_reflectance(count, config.measured_share, library, generator)
     second = choose(edge, material.take(slice(count)), other)
@@ -179,7 +181,7 @@ def draw_scene(
 
 
 class PixelGenerator:
-    """Draws batches of pixels; reproducible from the seed of `generator`, on whose device all is made."""
+    """Draws batches of pixels on the device of `generator`, reproducible from its seed."""
 
     def __init__(self, config: PixelGeneratorConfig, generator: torch.Generator) -> None:
         """Read the measured materials, if any. Raises ModelError, InputError."""
@@ -188,7 +190,7 @@ class PixelGenerator:
         self.library = read_library(config, generator.device)
 
     def draw(self, pixels: int) -> PixelBatch:
-        """A batch of P pixels, each with lights of its own number and spread; F is the largest number."""
+        """Draw a batch of P pixels, each with its own rig. F is the largest number of lights."""
         config, generator = self.config, self.generator
         scene = draw_scene(pixels, config, generator, self.library)
         counts = draw_light_counts(

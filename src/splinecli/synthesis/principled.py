@@ -18,13 +18,16 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PrincipledMaterial:
-    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges (specular to 4, as in CyclesPS).
+    """Parameters of the principled BRDF, each (P, 1), in Burley's ranges; specular reaches 4, as in CyclesPS.
 
-    Three are not Burley's. interface_loss: where above 0, the diffuse light loses this share at grazing angles, on its
-    way in and on its way out, as through the smooth surface of a plastic or a glaze; Burley's retro-reflection is then
-    left out. minnaert: kappa of Minnaert's law, by which the diffuse light is multiplied by (n.l n.v)^(kappa - 1):
-    under 1 flat as dust, over 1 steep as marble. tail_exponent: gamma of the highlight's distribution, generalised
-    Trowbridge-Reitz, over 1 and up to 2, which is GGX; the tails grow as gamma falls.
+    Three are not Burley's.
+
+    interface_loss: where above 0, the diffuse light loses this share at grazing angles, on its way in and on its way
+        out, as through the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
+    minnaert: kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): under 1 it is flat
+        as on dust, over 1 steep as on marble.
+    tail_exponent: gamma of the highlight's distribution, generalised Trowbridge-Reitz, over 1 and up to 2, which is
+        GGX. The tails grow as gamma falls.
     """
 
     base: Tensor
@@ -39,13 +42,13 @@ class PrincipledMaterial:
     tail_exponent: Tensor
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
-        """The materials of some of the pixels."""
+        """Return the materials of some of the pixels."""
         return PrincipledMaterial(*(getattr(self, field.name)[pixels] for field in fields(self)))
 
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
-        """pi times the reflected radiance (P, D); arguments as in Material.shade."""
+        """Return pi times the reflected radiance (P, D). Arguments as in Material.shade."""
         lit = n_dot_l.clamp(min=0)
-        # Light from behind what is seen has no half vector; rounding would make it NaN.
+        # Light from behind the surface has no half vector. Rounding would make it NaN.
         l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
         n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
         n_dot_h_squared = n_dot_h * n_dot_h
@@ -80,18 +83,20 @@ class PrincipledMaterial:
         return radiance * lit
 
     def albedo(self) -> Tensor:
-        """The diffuse albedo and, averaged over its lobe, the mirror (P, 1)."""
+        """Return the diffuse albedo plus the mean specular reflectance (P, 1)."""
         return self.base + 0.08 * self.specular * (1 - self.metallic)
 
 
 def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial:
-    """Random materials. Classes: 35 % matte, 30 % specular, 25 % metallic, 10 % half metallic.
+    """Draw random materials: 35 % matte, 30 % specular, 25 % metallic, 10 % half metallic.
 
-    base U(0.05, 1), of half of what is no metal 10^U(-1.7, 0), for many real surfaces are dark; roughness U(0.05,
-    1), of metals U(0.1, 0.9); specular U(0, 1), of the specular class U(0, 1) with half of them U(1, 4); metallic
-    0, 1 or U(0, 1); sheen U(0, 1) on a fifth of the dielectrics; clearcoat U(0, 1) on 10 %, U(1, 4), a full coat
-    of lacquer, on 10 %, with gloss U(0, 1); interface_loss U(0, 1) on 60 %; minnaert U(0.85, 1.5) on 70 %;
-    tail_exponent U(1.1, 2) on 50 %.
+    base: U(0.05, 1); 10^U(-1.7, 0) for half of what is no metal, because many real surfaces are dark.
+    roughness: U(0.05, 1); U(0.1, 0.9) for metals.
+    specular: U(0, 1); U(1, 4) for half of the specular class.
+    metallic: 0, 1 or U(0, 1).
+    sheen: U(0, 1) on a fifth of the dielectrics.
+    clearcoat: U(0, 1) on 10 %, and U(1, 4), a full coat of lacquer, on 10 %; gloss U(0, 1).
+    interface_loss: U(0, 1) on 60 %. minnaert: U(0.85, 1.5) on 70 %. tail_exponent: U(1.1, 2) on 50 %.
 
     MERL's measured materials fall faster than by the cosine: as (n.l)^1.14 in the median of those that are no metal,
     nine tenths of them between 0.86 and 1.47. The ranges of base and minnaert were chosen to come near that.

@@ -1,4 +1,4 @@
-"""Everything that decides a training run, in one frozen record, and the presets by name."""
+"""The settings of a training run in one frozen record, and the presets by name."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ GENERATOR = "generator"
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Everything that decides a training run.
+    """The settings of a training run.
 
     Attributes:
-        sources: where pixels come from, with weights: the share of each in the batches.
-        start_from: shipped name or file of the weights that the run begins with; empty for random ones.
-        held_share: share of the scenes of a pixel set that are held back for validation.
+        sources: the sources of pixels and their weights. A weight is the source's share of the batches.
+        start_from: name or file of the weights that the run starts from; empty for random ones.
+        held_share: share of the scenes of a pixel set that is for validation.
         batch_size: pixels a step.
-        shards: parts of a batch, drawn each from a random stream of its own; so many processes can share the
-            drawing, and any number that divides `shards` sees the same batches.
-        updates: "joint", both networks at each step, or "alternating", the paper's way: `ne_net_updates` steps
-            for NE-Net, then one for LI-Net, while the other is fixed; or "error_head", which fixes both and trains
-            NE-Net's guess of its own error alone.
-        learning_rate: the schedule's top; it rises over `warmup_steps` and then falls, by a cosine to a
-            hundredth, or ("stepped", the authors' way) to a tenth over the last tenth.
-        steps, minutes: the run's length; minutes wins where it is above 0.
-        beta1, beta2, weight_decay: of AdamW, which is Adam where weight_decay is 0.
+        shards: parts of a batch. Each has its own random stream and about one number of lights. The number of
+            processes must divide it.
+        updates: "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates`
+            steps for NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and
+            trains the error head alone.
+        learning_rate: the highest rate. It rises over `warmup_steps` and then falls.
+        schedule: "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth
+            for the last tenth of the run.
+        steps, minutes: the length of the run. minutes counts where it is above 0.
+        beta1, beta2, weight_decay: settings of AdamW, which is Adam where weight_decay is 0.
         gradient_limit: largest norm of the gradient; 0 for none.
-        average_decay: decay of the running average of the weights, which is what gets saved; 0 for none.
-        turn_jitter_deg: canonical networks see each pixel turned further by up to this, either way, and half
-            of the batches mirrored, so that estimates from several views can be averaged.
-        angle_weight, map_weight, masked_weight: of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
-        symmetric_weight, asymmetric_weight: lambda_s and lambda_a, of Ls and La.
-        eta, lambda_c: of La.
-        li_net_norm, ne_net_norm: whether a map's cells are averaged or summed, in all of LI-Net's terms and
-            in NE-Net's Ls and La; eta is in summed cells in either case.
-        precision: "bfloat16" runs the convolutions so where the device has it, "float32" never.
+        average_decay: decay of the running average of the weights, which is saved; 0 for none.
+        turn_jitter_deg: canonical networks see each pixel turned by up to this angle, either way, and half of the
+            batches mirrored. Estimates from several views can then be averaged.
+        angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
+        symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La.
+        eta, lambda_c: settings of La.
+        li_net_norm, ne_net_norm: whether the cells of a map are averaged or summed, in all terms of LI-Net and in
+            NE-Net's Ls and La. eta is in summed cells in either case.
+        precision: "bfloat16" runs the convolutions in bfloat16 where the device computes in it, "float32" never.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -91,27 +92,25 @@ class TrainingConfig:
             )
         if self.network.grid != "even":
             raise ModelError(
-                f"network setting 'grid' is {self.network.grid!r}; training knows true maps on the grid 'even' alone"
+                f"network setting 'grid' is {self.network.grid!r}; training has true maps on the grid 'even' only"
             )
         if self.updates == "alternating" and not self.network.interpolates:
-            raise ModelError(
-                "training setting 'updates' is 'alternating'; without a LI-Net there is nothing to alternate with"
-            )
+            raise ModelError("training setting 'updates' is 'alternating', which needs a LI-Net")
         if (self.updates == "error_head") != self.network.error_head:
             raise ModelError(
                 f"training settings 'updates' and 'network.error_head' are {self.updates!r} and"
-                f" {self.network.error_head}; an error head is trained by 'error_head' alone, which needs one"
+                f" {self.network.error_head}; the updates 'error_head' need an error head, and only they train one"
             )
         if not sum(self.sources.values()) > 0:
-            raise ModelError("training setting 'sources' gives no source a weight above 0")
+            raise ModelError("training setting 'sources' has no weight above 0")
 
     def to_dict(self) -> dict[str, Any]:
-        """Nested plain values, as stored in checkpoints and config.json."""
+        """Return nested plain values, as stored in checkpoints and config.json."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainingConfig:
-        """Rebuild a configuration. Raises ModelError for an unknown key or a value that cannot be."""
+        """Rebuild a configuration from plain values. Raises ModelError for an unknown key or an impossible value."""
         values = dict(values)
         network, pixels = values.pop("network", {}), values.pop("pixels", {})
         sources = values.pop("sources", {GENERATOR: 1.0})
@@ -151,7 +150,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGeneratorConfig) -> None:
-    """Raise ModelError for a setting that `defaults` does not have, or of another kind than there."""
+    """Raise ModelError for a setting that `defaults` lacks, or whose type or range differs."""
     known = vars(defaults)
     for name, value in values.items():
         if name not in known or name in ("network", "pixels", "sources"):
@@ -200,7 +199,7 @@ PRESETS = {
         asymmetric_weight=2e-5,
         li_net_norm="sum",
     ),
-    # CNN-PS (Ikehata, ECCV 2018) for ten lights: its own layers on the sparse map alone.
+    # CNN-PS (Ikehata, ECCV 2018) for ten lights: its layers on the sparse map alone.
     "cnn-ps": TrainingConfig(
         network=NetworkConfig(size="paper", interpolates=False),
         pixels=PixelGeneratorConfig(min_lights=10, max_lights=10, usual_lights=10),
@@ -210,7 +209,7 @@ PRESETS = {
 
 
 def preset(name: str, **changes: Any) -> TrainingConfig:
-    """A preset with some settings changed. Raises UsageError for an unknown name."""
+    """Return a preset with some settings changed. Raises UsageError for an unknown name."""
     if name not in PRESETS:
         raise UsageError(f"no preset named {name!r}; expected one of {', '.join(PRESETS)}")
     return replace(PRESETS[name], **changes)

@@ -1,4 +1,4 @@
-"""The training loop: batches in, updates of LI-Net and NE-Net together or in alternation, files out."""
+"""The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ from splinecli.training.sources import open_sources
 from splinecli.training.validation import sample_maps, validation_deg
 
 VALIDATION_PIXELS = 2048
+_VALIDATION_DRAW = 64  # pixels at a time: a draw has one source
 
-# Random streams of a step, beside those of its shards, which are numbered from 0.
-# The last is that of process 0; the others' follow it.
+# Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
+# other processes follow it.
 _BATCH_STREAM, _VALIDATION_STREAM, _DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 + 2
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
-    """The rate at a step; progress in 0..1 is how much of the run is over. A pure function."""
+    """Return the learning rate at a step. Progress, in 0..1, is the finished share of the run."""
     rise = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
     if config.schedule == "stepped":
         return config.learning_rate * rise * (0.1 if progress >= 0.9 else 1.0)
@@ -44,18 +45,19 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def stream_seed(seed: int, step: int, stream: int) -> int:
-    """The seed of one of a step's random streams.
+    """Return the seed of one of a step's random streams.
 
-    What a step draws follows from these three numbers alone: not from what was drawn before, nor by whom. A
-    run that is taken up, or cut among processes in another way, sees the same batches.
+    A step's batch depends on these three numbers alone. A resumed run, or one that is shared among processes in
+    another way, therefore sees the same batches.
     """
     return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
+    """Copy the weights into the network. Raises ModelError where they belong to another kind of network."""
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
-    # A network may grow an error head, and loses the one it has where it is trained further.
+    # A network may get an error head, and loses its own when it is trained further.
     differing = [name for name in wanted if wanted[name] != found[name] and name != "error_head"]
     if differing:
         name = differing[0]
@@ -67,9 +69,9 @@ def _start_from(weights: str, network: SplineNet) -> None:
 
 
 class Trainer:
-    """A run in a folder: checkpoint, weights, config.json and the records.
+    """A run and its folder: checkpoint, weights, config.json, log and pictures.
 
-    Of several processes the leader alone writes.
+    With several processes, only the leader writes.
     """
 
     def __init__(
@@ -82,7 +84,7 @@ class Trainer:
         workers: Workers | None = None,
         tensorboard: bool = False,
     ) -> None:
-        """Start a run, or take one up. Raises ModelError, OutputError, InputError, UsageError."""
+        """Start a run, or resume one. Raises ModelError, OutputError, InputError, UsageError."""
         check_writable(folder)
         self.config = config
         self.folder = folder
@@ -111,7 +113,7 @@ class Trainer:
             betas=(config.beta1, config.beta2),
             weight_decay=config.weight_decay,
         )
-        # Where it is emulated, bfloat16 is slower than float32 and gains nothing.
+        # Emulated bfloat16 is slower than float32.
         self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
         self.counters = RunCounters()
         if resume:
@@ -120,20 +122,23 @@ class Trainer:
             )
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
-            self.validation = sources.validation.draw(VALIDATION_PIXELS)
+            pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
+            draws = [sources.validation.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
+            self.validation = join_batches(draws)
             write_text(folder / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")
 
     @property
     def progress(self) -> float:
-        """How much of the run is over, 0 to 1."""
+        """The finished share of the run, 0 to 1."""
         if self.config.minutes > 0:
             return min(1.0, self.counters.seconds / (60 * self.config.minutes))
         return min(1.0, self.counters.step / self.config.steps)
 
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
-        """Train to the end and save on the way; `report` is called with progress and metrics now and then.
+        """Train to the end, save on the way, and return the last metrics on the leader.
 
-        Returns the last metrics, on the leader.
+        Args:
+            report: called with progress and metrics at each entry of the log.
 
         Raises:
             ModelError: the loss or its gradient is no longer finite, or the run is at its end already; the
@@ -171,43 +176,50 @@ class Trainer:
             losses, count = {}, 0
         return metrics
 
-    def draw(self) -> tuple[PixelBatch, Tensor, bool]:
-        """This process's part of the step's batch, the pixels' further turns in degrees, whether mirrored."""
+    def draw(self) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
+        """Draw this process's shards of the step's batch.
+
+        Returns:
+            Each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
+        """
         canonical = self.network.config.is_canonical
         self.generator.manual_seed(stream_seed(self.config.seed, self.counters.step, _BATCH_STREAM))
         mirrored = canonical and bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
+        jitter_deg = self.config.turn_jitter_deg if canonical else 0.0
         pixels = self.config.batch_size // self.config.shards
-        batches, turns = [], []
+        shards = []
         for shard in self.shards:
             self.generator.manual_seed(stream_seed(self.config.seed, self.counters.step, shard))
-            batches.append(self.source.draw(pixels))
-            turns.append(2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1)
-        jitter_deg = self.config.turn_jitter_deg if canonical else 0.0
-        return join_batches(batches), torch.cat(turns) * jitter_deg, mirrored
+            batch = self.source.draw(pixels)
+            turn = 2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1
+            shards.append((batch, turn * jitter_deg))
+        return shards, mirrored
 
     def step(self) -> Tensor:
-        """One update on a fresh batch; returns the losses (6,), as in Losses, averaged over all processes."""
+        """Update once on a new batch; return the losses (6,), as in Losses, averaged over all processes."""
         config = self.config
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, self.counters.step, self.progress)
-        batch, turn_deg, mirrored = self.draw()
-        # Dropout draws from the global generator; seeded by the step, it is the same in a resumed run.
+        shards, mirrored = self.draw()
+        # Dropout draws from the global generator. Its seed is that of the step, so a resumed run drops the same.
         torch.manual_seed(stream_seed(config.seed, self.counters.step, _DROPOUT_STREAM + self.workers.rank))
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
-        losses = compute_losses(
-            self.network,
-            batch,
-            config,
-            part=part_of_step(config, self.counters.step),
-            turn_deg=turn_deg,
-            mirrored=mirrored,
-            bfloat16=self.bfloat16,
-        )
-        torch.autograd.backward(losses.total)
-        numbers = self.workers.average(
-            self.network.parameters(), torch.stack([loss.detach().double() for loss in losses])
-        ).cpu()
+        total = torch.zeros(len(Losses._fields), dtype=torch.float64, device=self.device)
+        # One shard at a time: its pixels have about equally many lights, so hardly any padding is computed.
+        for batch, turn_deg in shards:
+            losses = compute_losses(
+                self.network,
+                batch,
+                config,
+                part=part_of_step(config, self.counters.step),
+                turn_deg=turn_deg,
+                mirrored=mirrored,
+                bfloat16=self.bfloat16,
+            )
+            torch.autograd.backward(losses.total / len(shards))
+            total += torch.stack([loss.detach().double() for loss in losses]) / len(shards)
+        numbers = self.workers.average(self.network.parameters(), total).cpu()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit or math.inf)
         for name, value in (("loss", numbers[0]), ("gradient", norm)):
             if not torch.isfinite(value):
@@ -233,20 +245,20 @@ class Trainer:
         self.log.draw(sample_maps(self.average, self.validation))
 
     def _check_weights(self) -> None:
-        """Raise ModelError before anything that is not finite is saved."""
+        """Raise ModelError where a weight is not finite, before it is saved."""
         for name, tensor in self.network.state_dict().items():
             if not torch.isfinite(tensor).all():
                 raise self._not_finite(f"the tensor {name} is no longer finite")
 
     def _not_finite(self, problem: str) -> ModelError:
-        lower = "a lower rate, such as --param learning_rate=1e-4"
-        hint = f"Begin anew with {lower}"
+        lower = "a lower learning rate, such as --param learning_rate=1e-4"
+        hint = f"Start again with {lower}"
         if (self.folder / CHECKPOINT).exists():
-            hint = f"The last checkpoint is kept: --resume goes on from it with {lower}"
+            hint = f"The last checkpoint is kept. Use --resume with {lower}"
         return ModelError(f"{problem} at step {self.counters.step}", path=self.folder, hint=hint)
 
     def _follow(self) -> None:
-        # A young average would remember the start for too long: its decay grows with the steps.
+        # The decay grows with the steps, because a young average would depend on the start for too long.
         decay = min(self.config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
         with torch.no_grad():
             pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
@@ -254,8 +266,8 @@ class Trainer:
                 averaged.lerp_(current, 1 - decay)
 
     def _metrics(self, means: Tensor, *, check: bool) -> Metrics:
-        """From the means (N, 6) over the steps of each part: of "both", or of NE-Net and LI-Net."""
-        # Each network has a loss of its own, and those are added up; the errors are of one kind.
+        """Return the metrics of means (N, 6) over the steps of each part: of both, or of NE-Net and LI-Net."""
+        # Each network has its own loss, so losses are added. Errors are averaged.
         summed, averaged = Losses(*means.sum(dim=0).tolist()), Losses(*means.mean(dim=0).tolist())
         checked_deg = validation_deg(self.average, self.validation, bfloat16=self.bfloat16) if check else None
         return Metrics(

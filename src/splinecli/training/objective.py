@@ -1,4 +1,4 @@
-"""What is minimised: the losses of a batch, for both networks or for one while the other is fixed."""
+"""The losses of a batch, for both networks or for one while the other is fixed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from splinecli.networks.error_head import error_surprise
+from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
@@ -28,10 +28,12 @@ Part = Literal["both", "ne_net", "li_net", "error_head"]
 
 
 class Losses(NamedTuple):
-    """The whole loss and its terms, unweighted, each a scalar; NaN for a term that was not computed.
+    """The total loss and its unweighted terms. Each is a scalar, NaN where it was not computed.
 
-    angle in radians; on_map, masked: means over cells; symmetric, asymmetric: of LI-Net's and NE-Net's terms
-    together, each in its norm.
+    Attributes:
+        angle: in radians.
+        on_map, masked: means over cells.
+        symmetric, asymmetric: the terms of LI-Net and of NE-Net added, each in its norm.
     """
 
     total: Tensor
@@ -43,7 +45,7 @@ class Losses(NamedTuple):
 
 
 def part_of_step(config: TrainingConfig, step: int) -> Part:
-    """Which networks a step updates."""
+    """Return which networks a step updates."""
     if config.updates == "joint":
         return "both"
     if config.updates == "error_head":
@@ -65,21 +67,21 @@ def compute_losses(
 
     LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
     NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). Where both are updated, the sum,
-    with the angle once. The error head: minus the log-likelihood of the angle.
+    with the angle once. The loss of the error head is minus the log-likelihood of the angle.
     """
     maps = network.build_maps(
         batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg, mirror=mirrored
     )
-    normal_truth = to_pixel_frame(batch.scene.normals, maps)
+    normal_truth = to_pixel_frame(batch.truth.normals, maps)
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     if part == "error_head":
         with _fixed(network, part), autocast:
             normals, error = network.estimate(maps, network.interpolate(maps))
         assert error is not None, "TrainingConfig asks for an error head"
         angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
-        return Losses(error_surprise(error, angle).mean(), angle.mean(), *[missing] * 4)
+        return Losses(error_negative_log_likelihood(error, angle).mean(), angle.mean(), *[missing] * 4)
     with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
-    # Half of the work of a batch; CNN-PS has no use for it.
+    # The maps are half of the work of a batch, and CNN-PS does not use them.
     dense_truth = dense_truth_in_frame(batch, maps, size=network.config.map_size) if with_maps else None
     with _fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
@@ -132,8 +134,8 @@ def _special(
 
 
 def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> DenseMap:
-    """D_gt in the pixels' frames, at the sparse map's scale, cut at 1."""
-    dense = batch.scene.rotate(maps.cosine, maps.sine).dense_truth(size)
+    """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values above 1 cut off."""
+    dense = batch.truth.rotate(maps.cosine, maps.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
     dense = DenseMap(values, dense.known, dense.filled)
     return dense.flip_y() if maps.mirrored else dense
@@ -141,8 +143,13 @@ def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> De
 
 @contextmanager
 def _fixed(network: SplineNet, part: Part) -> Iterator[None]:
-    """All but `part` takes no gradients inside; gradients still pass through it."""
-    inside = {"both": "", "ne_net": "ne_net.", "li_net": "li_net.", "error_head": "ne_net.error_head."}[part]
+    """Compute no gradients for parameters outside `part`. Gradients still pass through them."""
+    inside = {
+        "both": ("",),
+        "ne_net": ("ne_net.",),
+        "li_net": ("li_net.",),
+        "error_head": ("ne_net.error_head.",),
+    }[part]
     fixed = [
         parameter
         for name, parameter in network.named_parameters()

@@ -13,7 +13,7 @@ import torch
 from splinecli.errors import InputError
 from splinecli.pixel_sets.source import PixelSetSource
 from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
-from splinecli.synthesis.batches import PixelBatch, join_batches
+from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 from splinecli.training.config import GENERATOR, TrainingConfig
 
@@ -27,7 +27,7 @@ class PixelSource(Protocol):
 
 
 class MixedSource:
-    """Draws each pixel from one of several sources, with probabilities proportional to their weights."""
+    """Draws each batch from one of several sources, with probabilities proportional to their weights."""
 
     def __init__(
         self, sources: Sequence[PixelSource], weights: Sequence[float], generator: torch.Generator
@@ -37,15 +37,10 @@ class MixedSource:
         self.generator = generator
 
     def draw(self, pixels: int) -> PixelBatch:
-        """Draw a batch of P pixels, ordered by source."""
-        device = self.generator.device
-        chosen = torch.multinomial(
-            self.weights.to(device), pixels, replacement=True, generator=self.generator
-        )
-        counts = chosen.bincount(minlength=len(self.sources)).tolist()
-        return join_batches(
-            [source.draw(count) for source, count in zip(self.sources, counts, strict=True) if count]
-        )
+        """Draw a batch of P pixels."""
+        weights = self.weights.to(self.generator.device)
+        chosen = int(torch.multinomial(weights, 1, generator=self.generator))
+        return self.sources[chosen].draw(pixels)
 
 
 def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:

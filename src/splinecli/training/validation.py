@@ -22,7 +22,7 @@ SHOWN_PIXELS = 8
 def validation_deg(network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False) -> float:
     """Return the mean angular error over the batch, in degrees."""
     maps, _, normals = _estimate(network, batch, bfloat16=bfloat16)
-    return math.degrees(angular_loss(normals, to_pixel_frame(batch.scene.normals, maps)).item())
+    return math.degrees(angular_loss(normals, to_pixel_frame(batch.truth.normals, maps)).item())
 
 
 class SampleMaps(NamedTuple):
@@ -46,7 +46,7 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
     step = max(1, len(batch.observations) // SHOWN_PIXELS)
     maps, dense, normals = _estimate(network, batch)
     truth = dense_truth_in_frame(batch, maps, size=network.config.map_size)
-    normal_truth = to_pixel_frame(batch.scene.normals, maps)
+    normal_truth = to_pixel_frame(batch.truth.normals, maps)
 
     def picture(values: Tensor, known: Tensor) -> NDArray[np.float32]:
         values = values.float().masked_fill(known == 0, torch.nan)
