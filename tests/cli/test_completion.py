@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from splinecli.cli.options import complete_list
+from splinecli.cli.options.values import complete_list
 from splinecli.methods import method_names
 from splinecli.networks.weights import shipped_names
 from splinecli.results.files import MAPS, NORMALS

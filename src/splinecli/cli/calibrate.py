@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import JsonOption, OverwriteOption, QuietOption
+from splinecli.cli.options import inputs, outputs
 from splinecli.errors import UsageError
 from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
@@ -18,43 +16,17 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    balls: Annotated[
-        list[Path], typer.Argument(metavar="BALL", help="Folders of images of one mirror ball each.")
-    ],
-    circle: Annotated[
-        list[str] | None,
-        typer.Option(metavar="X,Y,R", help="Outline of the ball in pixels, y down. Once for each BALL."),
-    ] = None,
-    mask: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE", help="Mask image: non-zero pixels belong to the ball. Once for each BALL."
-        ),
-    ] = None,
-    gray_ball: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Images of a matte gray ball under the same lights.")
-    ] = None,
-    gray_card: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Images of a matte gray card that faces the camera.")
-    ] = None,
-    transfer: Annotated[
-        str,
-        typer.Option(
-            metavar="CURVE",
-            help="Transfer curve of the gray target's images: linear, srgb or gamma:G.",
-            autocompletion=lambda: ["linear", "srgb", "gamma:2.2"],
-        ),
-    ] = "linear",
-    compare: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Compare the result with the light directions in a text file."),
-    ] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder of the results.")
-    ] = Path("calibration"),
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    balls: inputs.Balls,
+    circle: inputs.Circles = None,
+    mask: inputs.BallMasks = None,
+    gray_ball: inputs.GrayBall = None,
+    gray_card: inputs.GrayCard = None,
+    transfer: inputs.GrayTransfer = "linear",
+    compare: outputs.Compare = None,
+    output: outputs.CalibrationFolder = Path("calibration"),
+    overwrite: outputs.Overwrite = False,
+    as_json: outputs.Json = False,
+    quiet: outputs.Quiet = False,
 ) -> None:
     """Measure light directions from images of mirror balls.
 

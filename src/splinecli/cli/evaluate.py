@@ -5,27 +5,11 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import (
-    AsStoredOption,
-    BatchSizeOption,
-    Device,
-    DeviceOption,
-    JsonOption,
-    Precision,
-    PrecisionOption,
-    QuietOption,
-    RotationsOption,
-    SeedOption,
-    WeightsOption,
-    WhiteLevelOption,
-    complete_methods,
-    parse_indices,
-)
+from splinecli.cli.options import computing, inputs, outputs
+from splinecli.cli.options.values import Device, Precision, parse_indices
 from splinecli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -34,81 +18,29 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    datasets: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="DATASET", help="Folders of captures with ground truth, or the captures themselves."
-        ),
-    ],
-    method: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="M",
-            help="Method to score, or all. May be repeated. [default: spline-net]",
-            autocompletion=lambda: [*complete_methods(), "all"],
-        ),
-    ] = None,
-    weights: WeightsOption = None,
-    n_lights: Annotated[
-        list[str] | None,
-        typer.Option(metavar="K|all", help="Number of lights in each draw. May be repeated. [default: 10]"),
-    ] = None,
-    trials: Annotated[
-        int | None, typer.Option(metavar="T", min=1, help="Number of random draws. [default: 100]")
-    ] = None,
-    seed: SeedOption = 0,
-    draws: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draws of lights: each line has light indices, counted from 0."),
-    ] = None,
-    light_noise_deg: Annotated[
-        list[float] | None,
-        typer.Option(
-            metavar="SIGMA",
-            min=0,
-            help="Tilt the lights at random, with this standard deviation. May be repeated. [default: 0]",
-        ),
-    ] = None,
-    as_stored: AsStoredOption = False,
-    white_level: WhiteLevelOption = None,
-    max_pixels: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Score N random pixels of each capture.")
-    ] = None,
-    skip_first: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[CAPTURE=]N",
-            help="Leave out the first N images of one capture, or of all. May be repeated.",
-        ),
-    ] = None,
-    rotations: RotationsOption = None,
-    batch_size: BatchSizeOption = None,
-    device: DeviceOption = Device.auto,
-    precision: PrecisionOption = Precision.auto,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]"
-        ),
-    ] = None,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw every method's maps for the first draw of each capture.")
-    ] = False,
-    pixel: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ROW,COLUMN",
-            help="With --figures: show the observation maps of this pixel. May be repeated.",
-        ),
-    ] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")
-    ] = Path("evaluation"),
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Compute trials again that OUT already has.")
-    ] = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    datasets: inputs.Datasets,
+    method: computing.Methods = None,
+    weights: computing.Weights = None,
+    n_lights: inputs.NumbersOfLights = None,
+    trials: inputs.Trials = None,
+    seed: inputs.Seed = 0,
+    draws: inputs.Draws = None,
+    light_noise_deg: inputs.LightNoise = None,
+    as_stored: inputs.AsStored = False,
+    white_level: inputs.WhiteLevel = None,
+    max_pixels: inputs.MaxPixels = None,
+    skip_first: inputs.SkipFirst = None,
+    rotations: computing.Rotations = None,
+    batch_size: computing.BatchSize = None,
+    device: computing.Device = Device.auto,
+    precision: computing.Precision = Precision.auto,
+    jobs: computing.Jobs = None,
+    figures: outputs.Figures = False,
+    pixel: outputs.FigurePixels = None,
+    output: outputs.EvaluationFolder = Path("evaluation"),
+    overwrite: outputs.OverwriteTrials = False,
+    as_json: outputs.Json = False,
+    quiet: outputs.Quiet = False,
 ) -> int:
     """Compare methods by their mean angular error over random draws of K lights.
 

@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
-from splinecli.cli.options import QuietOption
+from splinecli.cli.options import outputs, training
 from splinecli.errors import OutputError
 
 
 def import_weights(
-    li_net: Annotated[
-        Path, typer.Argument(metavar="G.ckpt", help="The authors' LI-Net, which they call the generator.")
-    ],
-    ne_net: Annotated[
-        Path, typer.Argument(metavar="D.ckpt", help="The authors' NE-Net, which they call the discriminator.")
-    ],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="FILE.safetensors", help="The weight file to write."),
-    ],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
-    quiet: QuietOption = False,
+    li_net: training.OfficialLiNet,
+    ne_net: training.OfficialNeNet,
+    output: outputs.WeightFile,
+    overwrite: outputs.OverwriteFile = False,
+    quiet: outputs.Quiet = False,
 ) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 

@@ -8,34 +8,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from splinecli.cli import choices
 from splinecli.cli.console import Messages
-from splinecli.cli.options import (
-    AmbientOption,
-    AsStoredOption,
-    BatchSizeOption,
-    Device,
-    DeviceOption,
-    FlatFieldOption,
-    NormalConvention,
-    OverwriteOption,
-    Precision,
-    PrecisionOption,
-    QuietOption,
-    RotationsOption,
-    SeedOption,
-    TransferOption,
-    UpdateOption,
-    WeightsOption,
-    WhiteLevelOption,
-    complete_list,
-    parse_indices,
-    split_commas,
-)
+from splinecli.cli.options import computing, inputs, outputs
+from splinecli.cli.options.values import Device, NormalConvention, Precision, parse_indices, split_commas
 from splinecli.errors import SplinecliError, UsageError
 
 if TYPE_CHECKING:
@@ -54,91 +32,36 @@ _WORDS = {
 
 
 def infer(
-    captures: Annotated[
-        list[Path], typer.Argument(metavar="CAPTURE", help="Folders of images, each of one object.")
-    ],
-    lights: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Light directions: a line x y z for each image, z to the camera."),
-    ] = None,
-    intensities: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE|equal",
-            help="Light intensities: a line r g b for each image. [default: estimated where they are unequal]",
-        ),
-    ] = None,
-    mask: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Mask image: non-zero pixels belong to the object. [default: all pixels]"
-        ),
-    ] = None,
-    auto_mask: Annotated[
-        bool,
-        typer.Option("--auto-mask", help="Find the object if there is no mask, and write found_mask.png."),
-    ] = False,
-    ground_truth: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."),
-    ] = None,
-    transfer: TransferOption = "linear",
-    ambient: AmbientOption = None,
-    flat_field: FlatFieldOption = None,
-    white_level: WhiteLevelOption = None,
-    as_stored: AsStoredOption = False,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/.")
-    ] = Path("out"),
-    method: Annotated[
-        str, typer.Option(metavar="METHOD", help="{methods}.", autocompletion=choices.methods)
-    ] = "spline-net",
-    weights: WeightsOption = None,
-    n_lights: Annotated[
-        int | None, typer.Option(metavar="K", help="Use K lights drawn at random. [default: all]")
-    ] = None,
-    seed: SeedOption = 0,
-    light_indices: Annotated[
-        str | None, typer.Option(metavar="I,J,...", help="Use these lights, counted from 0.")
-    ] = None,
-    rotations: RotationsOption = None,
-    batch_size: BatchSizeOption = None,
-    device: DeviceOption = Device.auto,
-    precision: PrecisionOption = Precision.auto,
-    formats: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            metavar="LIST",
-            help="Files of the normal map: any of {formats}. png has 16 bits, png8 has 8, npy and tiff are float32.",
-            autocompletion=complete_list(choices.normal_formats),
-        ),
-    ] = "png,npy",
-    maps: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LIST",
-            help="Further maps to write: any of {maps} (a shaded image).",
-            autocompletion=complete_list(choices.maps),
-        ),
-    ] = None,
-    html: Annotated[
-        bool, typer.Option("--html", help="Also write page.html: images and a view under a movable light.")
-    ] = False,
-    surface: Annotated[
-        bool,
-        typer.Option("--surface", help="Also write mesh.ply, depth.npy and depth.tiff, as integrate does."),
-    ] = False,
-    convention: Annotated[
-        NormalConvention,
-        typer.Option(help="Green channel of the PNG files: opengl is y up, directx is y down."),
-    ] = NormalConvention.opengl,
-    overwrite: OverwriteOption = False,
-    update: UpdateOption = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a JSON list of the reports on stdout, and nothing else.")
-    ] = False,
-    quiet: QuietOption = False,
+    captures: inputs.Captures,
+    lights: inputs.Lights = None,
+    intensities: inputs.Intensities = None,
+    mask: inputs.Mask = None,
+    auto_mask: inputs.AutoMask = False,
+    ground_truth: inputs.GroundTruth = None,
+    transfer: inputs.Transfer = "linear",
+    ambient: inputs.Ambient = None,
+    flat_field: inputs.FlatField = None,
+    white_level: inputs.WhiteLevel = None,
+    as_stored: inputs.AsStored = False,
+    output: outputs.InferFolder = Path("out"),
+    method: computing.Method = "spline-net",
+    weights: computing.Weights = None,
+    n_lights: inputs.NumberOfLights = None,
+    seed: inputs.Seed = 0,
+    light_indices: inputs.LightIndices = None,
+    rotations: computing.Rotations = None,
+    batch_size: computing.BatchSize = None,
+    device: computing.Device = Device.auto,
+    precision: computing.Precision = Precision.auto,
+    formats: outputs.NormalFormats = "png,npy",
+    maps: outputs.Maps = None,
+    html: outputs.Html = False,
+    surface: outputs.Surface = False,
+    convention: outputs.Convention = NormalConvention.opengl,
+    overwrite: outputs.Overwrite = False,
+    update: outputs.Update = False,
+    as_json: outputs.JsonList = False,
+    quiet: outputs.Quiet = False,
 ) -> int:
     """Estimate the normal map of each CAPTURE.
 

@@ -3,50 +3,26 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import (
-    AmbientOption,
-    FlatFieldOption,
-    JsonOption,
-    QuietOption,
-    TransferOption,
-    WhiteLevelOption,
-)
+from splinecli.cli.options import inputs, outputs
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
 
 def info(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of images of one object.")],
-    lights: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Light directions, a line x y z for each image (z to the camera)."),
-    ] = None,
-    intensities: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE|equal", help="Light intensities, a line r g b for each image."),
-    ] = None,
-    mask: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Mask image: non-zero pixels belong to the object. [default: all]"),
-    ] = None,
-    ground_truth: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF).")
-    ] = None,
-    transfer: TransferOption = "linear",
-    ambient: AmbientOption = None,
-    flat_field: FlatFieldOption = None,
-    white_level: WhiteLevelOption = None,
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also plot the light directions to a PNG file.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier plot.")] = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    capture: inputs.Capture,
+    lights: inputs.InfoLights = None,
+    intensities: inputs.InfoIntensities = None,
+    mask: inputs.InfoMask = None,
+    ground_truth: inputs.InfoGroundTruth = None,
+    transfer: inputs.Transfer = "linear",
+    ambient: inputs.Ambient = None,
+    flat_field: inputs.FlatField = None,
+    white_level: inputs.WhiteLevel = None,
+    plot: outputs.LightPlot = None,
+    overwrite: outputs.OverwritePlot = False,
+    as_json: outputs.Json = False,
+    quiet: outputs.Quiet = False,
 ) -> None:
     """Show what `infer` would read from CAPTURE, without running it.
 

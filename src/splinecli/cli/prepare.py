@@ -5,19 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import (
-    AsStoredOption,
-    JsonOption,
-    QuietOption,
-    SeedOption,
-    UpdateOption,
-    WhiteLevelOption,
-)
+from splinecli.cli.options import inputs, outputs, training
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -25,41 +16,20 @@ if TYPE_CHECKING:
 
 
 def prepare(
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="SET", help="Folder of the pixel set."),
-    ],
-    sources: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="SOURCE", help="Captures with ground truth, folders of them, CyclesPS trees."),
-    ] = None,
-    as_stored: AsStoredOption = False,
-    white_level: WhiteLevelOption = None,
-    update: UpdateOption = False,
-    scenes: Annotated[int, typer.Option(metavar="N", min=0, help="Render N random scenes.")] = 0,
-    mesh: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...). Repeatable."),
-    ] = None,
-    size: Annotated[
-        int | None,
-        typer.Option(metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"),
-    ] = None,
-    lights: Annotated[
-        int | None,
-        typer.Option(metavar="F", min=16, help="Number of lights of a rendered scene. [default: 500]"),
-    ] = None,
-    measured: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also use these measured materials (.npz)."),
-    ] = None,
-    measured_share: Annotated[
-        float,
-        typer.Option(metavar="SHARE", min=0, max=1, help="Share of the materials that are measured."),
-    ] = 0.5,
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
+    output: outputs.PixelSet,
+    sources: training.Sources = None,
+    as_stored: inputs.AsStored = False,
+    white_level: inputs.WhiteLevel = None,
+    update: outputs.Update = False,
+    scenes: training.Scenes = 0,
+    mesh: training.Meshes = None,
+    size: training.ImageSize = None,
+    lights: training.SceneLights = None,
+    measured: training.Measured = None,
+    measured_share: training.MeasuredShare = 0.5,
+    seed: inputs.Seed = 0,
+    as_json: outputs.Json = False,
+    quiet: outputs.Quiet = False,
 ) -> int:
     """Make a pixel set, the training data of `splinecli train SET`.
 

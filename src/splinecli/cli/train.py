@@ -5,17 +5,13 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import Device, DeviceOption, QuietOption, complete_weights
+from splinecli.cli.options import computing, outputs, training
+from splinecli.cli.options.values import Device
 from splinecli.errors import UsageError
 from splinecli.training.defaults import (
-    CHECKPOINT_SECONDS,
-    DEFAULT_PRESET,
-    PRESET_NAMES,
     WEIGHTS,
 )
 
@@ -26,70 +22,21 @@ if TYPE_CHECKING:
 
 
 def train(
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="RUN",
-            help=f"Folder of the run. Its files are renewed every {CHECKPOINT_SECONDS} seconds.",
-        ),
-    ],
-    sets: Annotated[
-        list[Path] | None, typer.Argument(metavar="SET", help="Pixel sets made by 'splinecli prepare'.")
-    ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help=f"Settings to begin with: {', '.join(PRESET_NAMES)}. [default: {DEFAULT_PRESET}]",
-            autocompletion=lambda: list(PRESET_NAMES),
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Settings from a TOML file or a run's config.json."),
-    ] = None,
-    param: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. Repeatable."),
-    ] = None,
-    start_from: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Begin with these weights instead of random ones.",
-            autocompletion=complete_weights,
-        ),
-    ] = None,
-    generator_weight: Annotated[
-        float | None,
-        typer.Option(
-            metavar="W",
-            min=0,
-            help="Weight of generated pixels, where each SET has weight 1. [default: 0; 1 without SET]",
-        ),
-    ] = None,
-    n_lights: Annotated[
-        str | None,
-        typer.Option(metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]"),
-    ] = None,
-    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Train for N steps.")] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option(metavar="M", min=0.01, help="Train for M minutes."),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue from the run's checkpoint.")] = False,
-    seed: Annotated[
-        int | None,
-        typer.Option(metavar="S", min=0, max=2**32 - 1, help="Seed of the run. [default: 0]"),
-    ] = None,
-    tensorboard: Annotated[
-        bool,
-        typer.Option("--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard')."),
-    ] = False,
-    device: DeviceOption = Device.auto,
-    quiet: QuietOption = False,
+    output: outputs.Run,
+    sets: training.Sets = None,
+    preset: training.Preset = None,
+    config: training.Config = None,
+    param: training.Parameters = None,
+    start_from: training.StartFrom = None,
+    generator_weight: training.GeneratorWeight = None,
+    n_lights: training.LightCounts = None,
+    steps: training.Steps = None,
+    minutes: training.Minutes = None,
+    resume: training.Resume = False,
+    seed: training.RunSeed = None,
+    tensorboard: outputs.Tensorboard = False,
+    device: computing.Device = Device.auto,
+    quiet: outputs.Quiet = False,
 ) -> None:
     """Train LI-Net and NE-Net.
 

@@ -1,0 +1,80 @@
+"""The values of options: those that are allowed, their completion, and their parsing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from enum import StrEnum
+from importlib import resources
+
+from splinecli.errors import UsageError
+
+
+class Device(StrEnum):
+    """Device to compute on."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+class NormalConvention(StrEnum):
+    """Direction of the green channel of a normal map: up in opengl, down in directx."""
+
+    opengl = "opengl"
+    directx = "directx"
+
+
+class Precision(StrEnum):
+    """Number format to compute in."""
+
+    auto = "auto"
+    float32 = "float32"
+    bfloat16 = "bfloat16"
+
+
+def complete_curves() -> list[str]:
+    """Return transfer curves, the last of them as an example."""
+    return ["linear", "srgb", "gamma:2.2"]
+
+
+def complete_weights() -> list[str]:
+    """Return the names of the shipped weights. If none begins with the typed text, the shell completes file names."""
+    # The module that reads this file imports torch, which takes too long for a completion.
+    return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
+
+
+def complete_list(*items: str | Callable[[], list[str]]) -> Callable[[str], list[str]]:
+    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma.
+
+    Args:
+        items: the items, or functions that return them.
+    """
+
+    def complete(incomplete: str) -> list[str]:
+        *typed, _ = incomplete.split(",")
+        names = [name for item in items for name in ([item] if isinstance(item, str) else item())]
+        return [",".join([*typed, name]) for name in names if name not in typed]
+
+    return complete
+
+
+def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
+    """Return the items of "a,b". Raises UsageError for an item that is not allowed."""
+    items = [item.strip() for item in text.split(",") if item.strip()]
+    for item in items:
+        if item not in allowed:
+            raise UsageError(
+                f"{option} has {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}"
+            )
+    if not items:
+        raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
+    return items
+
+
+def parse_indices(text: str, option: str) -> list[int]:
+    """Return the whole numbers of "0,5,12". Raises UsageError."""
+    try:
+        return [int(item) for item in text.split(",")]
+    except ValueError:
+        raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
