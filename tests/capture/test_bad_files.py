@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from splinecli.capture import find_capture_files, open_capture, read_capture
+from splinecli.capture import Overrides, find_capture_files, open_capture, read_capture
 from splinecli.capture.formats.header import is_display_encoded, stated_white_level
 from splinecli.errors import InputError
 
@@ -114,4 +114,4 @@ def test_an_image_that_vanishes(folder: Path) -> None:
 def test_a_folder_in_place_of_a_named_file(folder: Path) -> None:
     (folder / "sub").mkdir()
     with pytest.raises(InputError, match="sub: found a folder, expected a file"):
-        find_capture_files(folder, mask=folder / "sub")
+        find_capture_files(folder, Overrides(mask=folder / "sub"))

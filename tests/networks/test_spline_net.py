@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splinecli.fits.lambertian import fit_lambertian
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet, to_capture_frame, to_pixel_frame
+from splinecli.networks.spline_net import Rotation, SplineNet, to_capture_frame, to_pixel_frame
 from splinecli.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
@@ -161,11 +161,11 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
     observations, lights = pixels
     network = random_network().double()
     with torch.no_grad():
-        mirrored = network(observations, lights, turn_deg=7.0, mirror=True).normals
-        expected = network(observations, lights * FLIP, turn_deg=-7.0).normals * FLIP
+        mirrored = network(observations, lights, rotation=Rotation(7.0, mirror=True)).normals
+        expected = network(observations, lights * FLIP, rotation=Rotation(-7.0)).normals * FLIP
     torch.testing.assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
     with torch.no_grad():
-        plain = network(observations, lights, turn_deg=7.0).normals
+        plain = network(observations, lights, rotation=Rotation(7.0)).normals
     assert (mirrored - plain).abs().max() > 1e-4
 
 
@@ -173,7 +173,9 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
 def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
     observations, lights = pixels
     network = random_network().double()
-    views = network.build_maps(observations, lights, turn_deg=torch.linspace(-15, 15, 64), mirror=mirror)
+    views = network.build_maps(
+        observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror)
+    )
     vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
     torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
     # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or not.

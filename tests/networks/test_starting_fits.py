@@ -7,7 +7,7 @@ import torch
 
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.spline_net import Rotation, SplineNet
 from splinecli.networks.starting_fits import STARTING_FITS, fit_normals
 
 NAMES = tuple(STARTING_FITS)
@@ -71,7 +71,7 @@ def test_the_network_can_take_any_fit() -> None:
         with torch.no_grad():
             weigh.bias.copy_(torch.arange(len(NAMES) + 1) == place)
             for mirror in (False, True):
-                found = network(observations, directions, turn_deg=20.0, mirror=mirror).normals
+                found = network(observations, directions, rotation=Rotation(20.0, mirror=mirror)).normals
                 torch.testing.assert_close(found, fit_normals([name], observations, directions)[:, 0])
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import SplineNet, to_pixel_frame
+from splinecli.networks.spline_net import Rotation, SplineNet, to_pixel_frame
 from splinecli.observation_map import cell_directions, sparse_map
 from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.synthesis.pixels import PixelGenerator
@@ -241,7 +241,9 @@ def test_truth_and_views_share_any_turn(tiny: TrainingConfig) -> None:
     network = SplineNet(replace(tiny.network, map_size=16))
     batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(5)
     turn_deg = torch.tensor([0.0, 10.0, -35.0, 90.0, 200.0])
-    views = network.build_maps(batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg)
+    views = network.build_maps(
+        batch.observations, batch.light_directions, batch.valid, rotation=Rotation(turn_deg)
+    )
     dense = dense_truth_in_frame(batch, views, size=16)
     normals = to_pixel_frame(batch.truth.normals, views)
     azimuth = torch.atan2(batch.truth.normals[:, 1], batch.truth.normals[:, 0])

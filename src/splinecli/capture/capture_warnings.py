@@ -61,22 +61,19 @@ def white_level(level: WhiteLevel | None) -> CaptureWarning | None:
 
 def saturated(share: float) -> CaptureWarning | None:
     """Warn of too many saturated observations."""
-    if share <= SATURATED_SHARE:
-        return None
-    return CaptureWarning(
-        SATURATED,
-        f"{100 * share:.1f} % of the observations are saturated; a shorter exposure gives better normals.",
-    )
+    text = "of the observations are saturated; a shorter exposure gives better normals."
+    return _large_share(SATURATED, share, SATURATED_SHARE, text)
 
 
 def black_pixels(share: float) -> CaptureWarning | None:
     """Warn of too many pixels that no light reaches."""
-    if share <= BLACK_SHARE:
-        return None
-    return CaptureWarning(
-        BLACK_PIXELS,
-        f"{100 * share:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1).",
-    )
+    text = "of the pixels are black under every light; they get the normal (0, 0, 1)."
+    return _large_share(BLACK_PIXELS, share, BLACK_SHARE, text)
+
+
+def _large_share(code: str, share: float, limit: float, text: str) -> CaptureWarning | None:
+    """Return a warning that begins with the share in percent, or None for a share up to the limit."""
+    return CaptureWarning(code, f"{100 * share:.1f} % {text}") if share > limit else None
 
 
 def eight_bit() -> CaptureWarning:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.header import is_display_encoded
-from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
+from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights import named_lights
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
@@ -54,13 +55,8 @@ def open_capture(
     if white_level is not None and not 0 < white_level < math.inf:
         raise UsageError(f"the white level is {white_level:g}, expected a number above 0")
     equal = intensities is not None and str(intensities) == EQUAL
-    files = find_capture_files(
-        folder,
-        lights=lights,
-        intensities=None if equal else intensities,
-        mask=mask,
-        ground_truth=ground_truth,
-    )
+    named = (lights, None if equal else intensities, mask, ground_truth)
+    files = find_capture_files(folder, Overrides(*(None if file is None else Path(file) for file in named)))
     source = _read_lights(files, radiometry, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     ambient = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)

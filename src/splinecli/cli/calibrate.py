@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from splinecli.cli.console import Messages
+from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
-from splinecli.errors import UsageError
+from splinecli.cli.options.values import parse_circle
 from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
-
-if TYPE_CHECKING:
-    from splinecli.calibration.circle import Circle
 
 
 def calibrate(
@@ -39,7 +34,7 @@ def calibrate(
     """
     options = CalibrateOptions(
         balls=tuple(balls),
-        circles=tuple(_parse_circle(text) for text in circle or ()),
+        circles=tuple(parse_circle(text) for text in circle or ()),
         masks=tuple(mask or ()),
         gray_ball=gray_ball,
         gray_card=gray_card,
@@ -49,19 +44,4 @@ def calibrate(
         overwrite=overwrite,
     )
     report = calibrate_lights(options, Messages(quiet=quiet))
-    if as_json:
-        print(json.dumps(report, indent=2))
-    elif not quiet:
-        print(output / DIRECTIONS)
-
-
-def _parse_circle(text: str) -> Circle:
-    from splinecli.calibration.circle import Circle
-
-    try:
-        x, y, radius = (float(word) for word in text.split(","))
-        if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
-            return Circle(x, y, radius)
-    except ValueError:
-        pass
-    raise UsageError(f"--circle is {text!r}; expected X,Y,R in pixels, such as 512,384,200")
+    print_report(report, str(output / DIRECTIONS), as_json=as_json, quiet=quiet)

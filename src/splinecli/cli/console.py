@@ -1,16 +1,26 @@
-"""Messages, warnings, tables and progress of the commands, on stderr."""
+"""Printing: the reports of the commands on stdout; messages, warnings, tables and progress on stderr."""
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from splinecli.pipeline.observer import Advance, Observer
 
 LINE_SECONDS = 30.0
 """Seconds between two lines of progress where stderr is not a terminal."""
+
+
+def print_report(report: dict[str, Any], text: str, *, as_json: bool, quiet: bool) -> None:
+    """Print a report on stdout: as JSON, or its text unless `quiet` or empty."""
+    if as_json:
+        print(json.dumps(report, indent=2))
+    elif text and not quiet:
+        print(text)
 
 
 class Messages(Observer):

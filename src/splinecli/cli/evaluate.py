@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from splinecli.cli.console import Messages
 from splinecli.cli.options import computing, inputs, outputs
-from splinecli.cli.options.values import Device, Precision, parse_indices
-from splinecli.errors import InputError, UsageError
+from splinecli.cli.options.values import Device, Precision, parse_light_count, parse_pixel, parse_skip
+from splinecli.errors import InputError
 
 if TYPE_CHECKING:
     from splinecli.evaluation.outcome import Evaluation
@@ -60,18 +60,18 @@ def evaluate(
             for name in (method_names() if text == "all" else [text])
         ),
         method_options=MethodOptions(weights, rotations, batch_size, device.value, precision.value),
-        n_lights=tuple(_light_count(text) for text in n_lights or []),
+        n_lights=tuple(parse_light_count(text) for text in n_lights or []),
         light_noise_deg=tuple(light_noise_deg or [0.0]),
         trials=trials,
         seed=seed,
         draws=None if draws is None else str(draws),
         max_pixels=max_pixels,
-        skip_first=dict(_skip(text) for text in skip_first or []),
+        skip_first=dict(parse_skip(text) for text in skip_first or []),
         as_stored=as_stored,
         white_level=white_level,
         jobs=jobs,
         figures=figures,
-        pixels=tuple(_pixel(text) for text in pixel or []),
+        pixels=tuple(parse_pixel(text) for text in pixel or []),
         output=str(output),
         overwrite=overwrite,
     )
@@ -96,35 +96,6 @@ def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
         talk.warn(warning)
     for note in outcome.document["notes"]:
         talk.say(f"splinecli: note: {note}")
-
-
-def _skip(text: str) -> tuple[str, int]:
-    """Return ("bearPNG", 20) for "bearPNG=20" and ("*", 20) for "20". Raises UsageError."""
-    from splinecli.evaluation.protocol import EVERY_CAPTURE
-
-    name, equals, count = text.rpartition("=")
-    if not count.isdecimal() or bool(name) != bool(equals):
-        raise UsageError(
-            f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20"
-        )
-    return name or EVERY_CAPTURE, int(count)
-
-
-def _pixel(text: str) -> tuple[int, int]:
-    indices = parse_indices(text, "--pixel")
-    if len(indices) != 2 or min(indices) < 0:
-        raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
-    return indices[0], indices[1]
-
-
-def _light_count(text: str) -> int | None:
-    """Return a number of lights, or None for "all". Raises UsageError."""
-    if text == "all":
-        return None
-    try:
-        return int(text)
-    except ValueError:
-        raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
 
 
 def _print_table(evaluation: Evaluation) -> None:

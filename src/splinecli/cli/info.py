@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-
-from splinecli.cli.console import Messages
+from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
@@ -43,7 +41,4 @@ def info(
         overwrite=overwrite,
     )
     report = describe_capture(options, Messages(quiet=quiet))
-    if as_json:
-        print(json.dumps(report, indent=2))
-    elif not quiet:
-        print("\n".join(summary_lines(report)))
+    print_report(report, "\n".join(summary_lines(report)), as_json=as_json, quiet=quiet)

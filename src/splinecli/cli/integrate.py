@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
-from splinecli.cli.console import Messages
+from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import NormalConvention, split_commas
 from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
+
+_DEFAULT_FORMATS = ",".join(DEFAULT_FORMATS)
 
 
 def integrate(
@@ -20,7 +20,7 @@ def integrate(
     stiffness: computing.Stiffness = 2.0,
     largest_step: computing.LargestStep = None,
     output: outputs.SurfaceFolder = None,
-    formats: outputs.SurfaceFormats = ",".join(DEFAULT_FORMATS),
+    formats: outputs.SurfaceFormats = _DEFAULT_FORMATS,
     overwrite: outputs.Overwrite = False,
     as_json: outputs.Json = False,
     quiet: outputs.Quiet = False,
@@ -46,7 +46,4 @@ def integrate(
         overwrite=overwrite,
     )
     report = integrate_normal_map(options, Messages(quiet=quiet))
-    if as_json:
-        print(json.dumps(report, indent=2))
-    elif not quiet:
-        print(summary_line(options, report))
+    print_report(report, summary_line(options, report), as_json=as_json, quiet=quiet)

@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 SPEED = ("--device", "--precision", "--batch-size")
+VALUES = ("--transfer", "--ambient", "--flat-field", "--white-level")
 REPEAT = ("--overwrite", "--json", "--quiet")
 
 PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     "infer": {
-        "Input": (
-            "--mask",
-            "--auto-mask",
-            "--ground-truth",
-            "--transfer",
-            "--ambient",
-            "--flat-field",
-            "--white-level",
-            "--as-stored",
-        ),
+        "Input": ("--mask", "--auto-mask", "--ground-truth", *VALUES, "--as-stored"),
         "Lights": ("--lights", "--intensities", "--n-lights", "--seed", "--light-indices"),
         "Method": ("--method", "--weights", "--rotations"),
         "Output": (
@@ -32,15 +24,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Speed": SPEED,
     },
     "info": {
-        "Input": (
-            "--mask",
-            "--ground-truth",
-            "--transfer",
-            "--ambient",
-            "--flat-field",
-            "--white-level",
-            "--as-stored",
-        ),
+        "Input": ("--mask", "--ground-truth", *VALUES),
         "Lights": ("--lights", "--intensities"),
         "Output": ("--plot", *REPEAT),
     },

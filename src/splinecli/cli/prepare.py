@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splinecli.cli.console import Messages
+from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs, training
 from splinecli.errors import UsageError
 
@@ -54,10 +53,7 @@ def prepare(
         update=update,
     )
     summary = prepare_pixel_set(options, Messages(quiet=quiet))
-    if as_json:
-        print(json.dumps(summary, indent=2))
-    elif not quiet and summary["entries"]:
-        print(_in_words(summary))
+    print_report(summary, _in_words(summary), as_json=as_json, quiet=quiet)
     return worst_exit_code(capture["exit_code"] for capture in summary["skipped"])
 
 
@@ -84,6 +80,9 @@ def _plan(
 
 
 def _in_words(summary: dict[str, Any]) -> str:
+    """Return the summary as a line, empty for an empty set."""
+    if not summary["entries"]:
+        return ""
     return (
         f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes, {summary['n_pixels']} pixels,"
         f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
-from splinecli.methods.estimator import Progress
+from splinecli.methods.estimator import Directions, Observations, Progress
 from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.observation_map import map_scale
 
@@ -53,11 +53,7 @@ class BatchedEstimator:
         return f"{self.name} {self.precision}"
 
     def estimate(
-        self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
-        *,
-        progress: Progress | None = None,
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
 
@@ -82,8 +78,8 @@ class BatchedEstimator:
 @torch.inference_mode()
 def estimate_in_batches(
     solve: Solve,
-    observations: NDArray[np.float32],
-    light_directions: NDArray[np.float64],
+    observations: Observations,
+    light_directions: Directions,
     *,
     batch_size: int,
     device: str,

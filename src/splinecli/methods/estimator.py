@@ -8,6 +8,12 @@ from typing import Protocol, TypeGuard, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+Observations = NDArray[np.float32]
+"""(P, F): linear, already divided by the light intensities."""
+
+Directions = NDArray[np.float64]
+"""(F, 3): unit vectors towards the lights; x right, y up, z to the camera."""
+
 Progress = Callable[[int], object]
 """A function that an estimator calls with the number of pixels that it has just finished."""
 
@@ -32,19 +38,13 @@ class Estimator(Protocol):
     def fingerprint(self) -> str: ...
 
     def estimate(
-        self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
-        *,
-        progress: Progress | None = None,
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.floating]:
         """Estimate unit normals (P, 3); x right, y up, z to the camera.
 
         A pixel that is dark under every light has no normal. It gets (0, 0, 1).
 
         Args:
-            observations: (P, F) linear, already divided by the light intensities.
-            light_directions: (F, 3) unit vectors towards the lights.
             progress: called after each batch with the number of its pixels.
         """
         ...
@@ -65,11 +65,7 @@ class ConfidentEstimator(Estimator, Protocol):
     def tells_confidence(self) -> bool: ...
 
     def estimate_with_confidence(
-        self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
-        *,
-        progress: Progress | None = None,
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Estimate normals (P, 3) as `estimate` does, and the probability (P,) that each is within CONFIDENT_DEG.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.methods.estimator import Progress
+from splinecli.methods.estimator import Directions, Observations, Progress
 from splinecli.normals import unit
 
 TOWARDS_CAMERA = (0.0, 0.0, 1.0)
@@ -28,11 +28,7 @@ class LeastSquares:
     fingerprint: str = "ls"
 
     def estimate(
-        self,
-        observations: NDArray[np.floating],
-        light_directions: NDArray[np.float64],
-        *,
-        progress: Progress | None = None,
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float64]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
         # All pixels have the same lights, so one pseudo-inverse is enough.

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
-from splinecli.methods.estimator import CONFIDENT_DEG, Progress
+from splinecli.methods.estimator import CONFIDENT_DEG, Directions, Observations, Progress
 from splinecli.networks.error_head import probability_within
+from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
 
@@ -67,11 +68,7 @@ class NetworkEstimator:
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
 
     def estimate(
-        self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
-        *,
-        progress: Progress | None = None,
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
         return self._in_batches(observations, light_directions, progress)[:, :3]
@@ -81,11 +78,7 @@ class NetworkEstimator:
         return self.network.config.error_head
 
     def estimate_with_confidence(
-        self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
-        *,
-        progress: Progress | None = None,
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the probability (P,) that each is within CONFIDENT_DEG.
 
@@ -101,8 +94,8 @@ class NetworkEstimator:
 
     def _in_batches(
         self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
+        observations: Observations,
+        light_directions: Directions,
         progress: Progress | None,
     ) -> NDArray[np.float32]:
         return estimate_in_batches(
@@ -120,8 +113,8 @@ class NetworkEstimator:
         """Return normals and confidence (P, 4). The confidence is 0 without an error head."""
         total = batch.new_zeros(len(batch), 4)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            for turn, mirror in self._rotations:
-                normals, error = self.network(batch, lights, turn_deg=turn, mirror=mirror)
+            for rotation in self._rotations:
+                normals, error = self.network(batch, lights, rotation=rotation)
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3] += probability_within(error, CONFIDENT_DEG)
@@ -132,9 +125,9 @@ class NetworkEstimator:
     @torch.inference_mode()
     def maps(
         self,
-        observations: NDArray[np.float32],
-        light_directions: NDArray[np.float64],
-        all_observations: NDArray[np.float32],
+        observations: Observations,
+        light_directions: Directions,
+        all_observations: Observations,
         all_directions: NDArray[np.float64],
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return the observation maps of some pixels: the network's input, LI-Net's output, and all observations.
@@ -172,16 +165,16 @@ class NetworkEstimator:
         return known(maps.sparse, maps.holds), known(dense, inside), known(every.values, every.holds)
 
 
-def rotations_of(count: int, *, canonical: bool) -> list[tuple[float, bool]]:
-    """Return (angle in degrees, mirrored) of each of `count` rotations of the lights about the view axis.
+def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:
+    """Return `count` rotations of the lights about the view axis.
 
     A network without a canonical azimuth gets the angles 360 k / count, as CNN-PS does. Such angles change nothing for
     a network with a canonical azimuth. It gets small angles across ROTATION_SPAN_DEG, which move the lights over the
     borders of the cells, and each angle once more with mirrored lights.
     """
     if not canonical:
-        return [(360.0 * k / count, False) for k in range(count)]
+        return [Rotation(360.0 * k / count) for k in range(count)]
     turns = (count + 1) // 2
     span = ROTATION_SPAN_DEG if turns > 1 else 0.0
     step = span / max(turns - 1, 1)
-    return [(step * (k // 2) - span / 2, k % 2 == 1) for k in range(count)]
+    return [Rotation(step * (k // 2) - span / 2, mirror=k % 2 == 1) for k in range(count)]

@@ -36,6 +36,21 @@ from splinecli.observation_map import (
 RESIDUAL_LIMIT = 3.0
 
 
+class Rotation(NamedTuple):
+    """A turn of the lights about the view axis, and a reflection.
+
+    Attributes:
+        turn_deg: angle in degrees, a number or (P,).
+        mirror: whether y is flipped after the turn. An isotropic pixel looks the same under its mirrored lights.
+    """
+
+    turn_deg: float | Tensor = 0.0
+    mirror: bool = False
+
+
+NO_ROTATION = Rotation()
+
+
 class PixelMaps(NamedTuple):
     """Observation maps of P pixels and what belongs to them, in each pixel's own frame.
 
@@ -103,16 +118,13 @@ class SplineNet(nn.Module):
         observations: Tensor,
         light_directions: Tensor,
         valid: Tensor | None = None,
-        *,
-        turn_deg: float | Tensor = 0.0,
-        mirror: bool = False,
+        rotation: Rotation = NO_ROTATION,
     ) -> PixelMaps:
         """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
 
         Args:
             valid: (P, F) bool, all by default; the others are left out.
-            turn_deg: a further turn of the lights about the view axis, a number or (P,).
-            mirror: flip y after the turn. An isotropic pixel looks the same under its mirrored lights.
+            rotation: a further rotation of the lights, after that to the canonical azimuth.
         """
         scale = map_scale(observations, valid)
         observed = observations / scale
@@ -124,7 +136,7 @@ class SplineNet(nn.Module):
         # A fit that points away from the camera is moved to the rim, where the closest visible normal is.
         z = torch.maximum(z, 0.02 * torch.hypot(x, y))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
-        angle = torch.as_tensor(turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
+        angle = torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
         cosine, sine = angle.cos(), angle.sin()
         lights = rotate_about_view_axis(
             light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
@@ -132,7 +144,7 @@ class SplineNet(nn.Module):
         scaled_normals = rotate_about_view_axis(torch.stack((x, y, z), dim=-1), cosine, sine)
         fitted = fit_normals(self.config.fits, observed, light_directions, valid)
         fitted = rotate_about_view_axis(fitted, cosine[:, None], sine[:, None])
-        if mirror:
+        if rotation.mirror:
             flip = lights.new_tensor((1.0, -1.0, 1.0))
             lights, scaled_normals, fitted = lights * flip, scaled_normals * flip, fitted * flip
         albedo = scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-3)
@@ -152,7 +164,7 @@ class SplineNet(nn.Module):
             fitted,
             cosine,
             sine,
-            mirror,
+            rotation.mirror,
         )
 
     def interpolate(self, maps: PixelMaps) -> Tensor | None:
@@ -182,9 +194,7 @@ class SplineNet(nn.Module):
         observations: Tensor,
         light_directions: Tensor,
         valid: Tensor | None = None,
-        *,
-        turn_deg: float | Tensor = 0.0,
-        mirror: bool = False,
+        rotation: Rotation = NO_ROTATION,
     ) -> Estimate:
         """Return normals in the capture's frame, and their errors.
 
@@ -192,11 +202,11 @@ class SplineNet(nn.Module):
             observations: (P, F), linear, divided by the light intensities; any scale.
             light_directions: (F, 3) or (P, F, 3), unit; x right, y up, z to the camera.
             valid: (P, F) bool, all by default; the others are left out.
-            turn_deg, mirror: see build_maps.
+            rotation: see build_maps.
         """
         # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):
-            maps = self.build_maps(observations, light_directions, valid, turn_deg=turn_deg, mirror=mirror)
+            maps = self.build_maps(observations, light_directions, valid, rotation)
         normals, error = self.estimate(maps, self.interpolate(maps))
         return Estimate(to_capture_frame(normals, maps), error)
 

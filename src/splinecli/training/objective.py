@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splinecli.networks.error_head import error_negative_log_likelihood
-from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
+from splinecli.networks.spline_net import PixelMaps, Rotation, SplineNet, to_pixel_frame
 from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig
@@ -70,7 +70,7 @@ def compute_losses(
     with the angle once. The loss of the error head is minus the log-likelihood of the angle.
     """
     maps = network.build_maps(
-        batch.observations, batch.light_directions, batch.valid, turn_deg=turn_deg, mirror=mirrored
+        batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored)
     )
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.capture import capture_name, find_capture_files, find_captures
+from splinecli.capture import Overrides, capture_name, find_capture_files, find_captures
 from splinecli.errors import InputError
 
 
@@ -100,10 +100,12 @@ def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
     other = fill(tmp_path, "other.txt", "brightness.txt")
     files = find_capture_files(
         folder,
-        lights=other / "other.txt",
-        intensities=other / "brightness.txt",
-        mask=folder / "outline.png",
-        ground_truth=str(folder / "gt.tif"),
+        Overrides(
+            lights=other / "other.txt",
+            intensities=other / "brightness.txt",
+            mask=folder / "outline.png",
+            ground_truth=folder / "gt.tif",
+        ),
     )
     assert [path.name for path in files.images] == ["a.png", "b.png"]
     assert files.light_directions == other / "other.txt"
@@ -144,12 +146,13 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
         " 'splinecli calibrate' makes the file from images of a mirror ball."
     )
     assert (
-        find_capture_files(tmp_path / "dark", lights=tmp_path / "file").light_directions == tmp_path / "file"
+        find_capture_files(tmp_path / "dark", Overrides(lights=tmp_path / "file")).light_directions
+        == tmp_path / "file"
     )
     with pytest.raises(InputError, match=r"none\.png: the file does not exist\."):
-        find_capture_files(tmp_path / "dark", lights=tmp_path / "file", mask=tmp_path / "none.png")
+        find_capture_files(tmp_path / "dark", Overrides(lights=tmp_path / "file", mask=tmp_path / "none.png"))
     with pytest.raises(InputError, match=r"found a folder, expected a file\."):
-        find_capture_files(tmp_path / "dark", lights=tmp_path)
+        find_capture_files(tmp_path / "dark", Overrides(lights=tmp_path))
 
 
 @pytest.mark.parametrize("lights", ["lights.txt", "light_directions.txt"])
@@ -233,8 +236,8 @@ def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
         for call in (
             lambda path: find_capture_files(path),
             lambda path: find_captures(path),
-            lambda path: find_capture_files(folder, lights=path),
-            lambda path: find_capture_files(folder, mask=path),
+            lambda path: find_capture_files(folder, Overrides(lights=path)),
+            lambda path: find_capture_files(folder, Overrides(mask=path)),
         ):
             with pytest.raises(InputError) as caught:
                 call(path)

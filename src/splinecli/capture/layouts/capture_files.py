@@ -96,6 +96,30 @@ class Overrides:
         return files
 
 
+NO_OVERRIDES = Overrides()
+
+
+def gather_files(
+    layout: str,
+    folder: Path,
+    images: tuple[Path, ...],
+    lights: Path,
+    overrides: Overrides,
+    ground_truth_names: Sequence[str] = GROUND_TRUTH,
+) -> CaptureFiles:
+    """Return the images and lights with the other files of the folder. Files named by the user replace those."""
+    return CaptureFiles(
+        layout=layout,
+        name=folder_name(folder),
+        folder=folder,
+        images=images,
+        light_directions=lights,
+        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
+        mask=overrides.mask or find_named(folder, MASK),
+        ground_truth=overrides.ground_truth or find_named(folder, ground_truth_names),
+    )
+
+
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names that the folder holds, ignoring case; None for none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}

@@ -8,14 +8,12 @@ from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     GROUND_TRUTH,
     LIGHT_FILES,
-    LIGHT_INTENSITIES,
-    MASK,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
     find_lights,
     find_named,
-    folder_name,
+    gather_files,
 )
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
@@ -48,14 +46,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
             hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball",
         )
-    names = _DILIGENT_GROUND_TRUTH if is_diligent else GROUND_TRUTH
-    return CaptureFiles(
-        layout="DiLiGenT" if is_diligent else "plain folder",
-        name=folder_name(folder),
-        folder=folder,
-        images=images,
-        light_directions=lights,
-        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
-        mask=overrides.mask or find_named(folder, MASK),
-        ground_truth=overrides.ground_truth or find_named(folder, names),
+    layout, ground_truth = (
+        ("DiLiGenT", _DILIGENT_GROUND_TRUTH) if is_diligent else ("plain folder", GROUND_TRUTH)
     )
+    return gather_files(layout, folder, images, lights, overrides, ground_truth)

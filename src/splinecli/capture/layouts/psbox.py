@@ -6,14 +6,11 @@ from collections.abc import Collection
 from pathlib import Path
 
 from splinecli.capture.layouts.capture_files import (
-    GROUND_TRUTH,
-    LIGHT_INTENSITIES,
-    MASK,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
     find_named,
-    folder_name,
+    gather_files,
 )
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images
 from splinecli.capture.paths import is_folder
@@ -29,16 +26,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     if lights is None or images is None:
         return None
     check_not_empty(images, folder / _OBJECTS)
-    return CaptureFiles(
-        layout="PSBox",
-        name=folder_name(folder),
-        folder=folder,
-        images=images,
-        light_directions=lights,
-        light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
-        mask=overrides.mask or find_named(folder, MASK),
-        ground_truth=overrides.ground_truth or find_named(folder, GROUND_TRUTH),
-    )
+    return gather_files("PSBox", folder, images, lights, overrides)
 
 
 def list_objects(

@@ -8,6 +8,7 @@ from splinecli.capture.layouts import cyclesps, plain_folder, psbox
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     LIGHT_FILES,
+    NO_OVERRIDES,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
@@ -23,22 +24,13 @@ from splinecli.errors import InputError
 _LAYOUTS = (psbox.find, cyclesps.find, plain_folder.find)
 
 
-def find_capture_files(
-    folder: StrPath,
-    *,
-    lights: StrPath | None = None,
-    intensities: StrPath | None = None,
-    mask: StrPath | None = None,
-    ground_truth: StrPath | None = None,
-) -> CaptureFiles:
-    """Return the files of the capture in the folder; files named here replace those that the folder holds.
+def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
+    """Return the files of the capture in the folder. The overrides replace those that the folder holds.
 
     Raises:
         InputError: the folder is missing, is a file or holds no images; filenames.txt names an image that
-            does not exist; there is no light file; or a file named here does not exist.
+            does not exist; there is no light file; or a file of the overrides does not exist.
     """
-    named = (lights, intensities, mask, ground_truth)
-    overrides = Overrides(*(None if file is None else Path(file) for file in named))
     list_folder(Path(folder))  # raises where it is no folder
     overrides.named()
     for find in _LAYOUTS:

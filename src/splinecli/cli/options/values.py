@@ -6,8 +6,12 @@ import json
 from collections.abc import Callable
 from enum import StrEnum
 from importlib import resources
+from typing import TYPE_CHECKING
 
 from splinecli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splinecli.calibration.circle import Circle
 
 
 class Device(StrEnum):
@@ -78,3 +82,46 @@ def parse_indices(text: str, option: str) -> list[int]:
         return [int(item) for item in text.split(",")]
     except ValueError:
         raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
+
+
+def parse_circle(text: str) -> Circle:
+    """Return the circle of "X,Y,R". Raises UsageError."""
+    from splinecli.calibration.circle import Circle
+
+    try:
+        x, y, radius = (float(word) for word in text.split(","))
+        if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
+            return Circle(x, y, radius)
+    except ValueError:
+        pass
+    raise UsageError(f"--circle is {text!r}; expected X,Y,R in pixels, such as 512,384,200")
+
+
+def parse_skip(text: str) -> tuple[str, int]:
+    """Return ("bearPNG", 20) for "bearPNG=20" and ("*", 20) for "20". Raises UsageError."""
+    from splinecli.evaluation.protocol import EVERY_CAPTURE
+
+    name, equals, count = text.rpartition("=")
+    if not count.isdecimal() or bool(name) != bool(equals):
+        raise UsageError(
+            f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20"
+        )
+    return name or EVERY_CAPTURE, int(count)
+
+
+def parse_pixel(text: str) -> tuple[int, int]:
+    """Return the row and the column of "120,85". Raises UsageError."""
+    indices = parse_indices(text, "--pixel")
+    if len(indices) != 2 or min(indices) < 0:
+        raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
+    return indices[0], indices[1]
+
+
+def parse_light_count(text: str) -> int | None:
+    """Return a number of lights, or None for "all". Raises UsageError."""
+    if text == "all":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
