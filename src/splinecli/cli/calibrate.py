@@ -11,17 +11,17 @@ from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate
 
 
 def calibrate(
-    balls: inputs.Balls,
-    circle: inputs.Circles = None,
-    mask: inputs.BallMasks = None,
-    gray_ball: inputs.GrayBall = None,
-    gray_card: inputs.GrayCard = None,
-    transfer: inputs.GrayTransfer = "linear",
-    compare: outputs.Compare = None,
-    output: outputs.CalibrationFolder = Path("calibration"),
-    overwrite: outputs.Overwrite = False,
-    as_json: outputs.Json = False,
-    quiet: outputs.Quiet = False,
+    balls: list[Path] = inputs.BALLS,
+    circle: list[str] | None = inputs.CIRCLES,
+    mask: list[Path] | None = inputs.BALL_MASKS,
+    gray_ball: Path | None = inputs.GRAY_BALL,
+    gray_card: Path | None = inputs.GRAY_CARD,
+    transfer: str = inputs.GRAY_TRANSFER,
+    compare: Path | None = outputs.COMPARE,
+    output: Path = outputs.CALIBRATION_FOLDER,
+    overwrite: bool = outputs.OVERWRITE,
+    as_json: bool = outputs.JSON,
+    quiet: bool = outputs.QUIET,
 ) -> None:
     """Measure light directions from images of mirror balls.
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from splinecli.cli.options import outputs, training
 from splinecli.errors import OutputError
 
 
 def import_weights(
-    li_net: training.OfficialLiNet,
-    ne_net: training.OfficialNeNet,
-    output: outputs.WeightFile,
-    overwrite: outputs.OverwriteFile = False,
-    quiet: outputs.Quiet = False,
+    li_net: Path = training.OFFICIAL_LI_NET,
+    ne_net: Path = training.OFFICIAL_NE_NET,
+    output: Path = outputs.WEIGHT_FILE,
+    overwrite: bool = outputs.OVERWRITE_FILE,
+    quiet: bool = outputs.QUIET,
 ) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 

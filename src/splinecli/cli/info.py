@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
 
 def info(
-    capture: inputs.Capture,
-    lights: inputs.InfoLights = None,
-    intensities: inputs.InfoIntensities = None,
-    mask: inputs.InfoMask = None,
-    ground_truth: inputs.InfoGroundTruth = None,
-    transfer: inputs.Transfer = "linear",
-    ambient: inputs.Ambient = None,
-    flat_field: inputs.FlatField = None,
-    white_level: inputs.WhiteLevel = None,
-    plot: outputs.LightPlot = None,
-    overwrite: outputs.OverwritePlot = False,
-    as_json: outputs.Json = False,
-    quiet: outputs.Quiet = False,
+    capture: Path = inputs.CAPTURE,
+    lights: Path | None = inputs.INFO_LIGHTS,
+    intensities: Path | None = inputs.INFO_INTENSITIES,
+    mask: Path | None = inputs.INFO_MASK,
+    ground_truth: Path | None = inputs.INFO_GROUND_TRUTH,
+    transfer: str = inputs.TRANSFER,
+    ambient: Path | None = inputs.AMBIENT,
+    flat_field: Path | None = inputs.FLAT_FIELD,
+    white_level: float | None = inputs.WHITE_LEVEL,
+    plot: Path | None = outputs.LIGHT_PLOT,
+    overwrite: bool = outputs.OVERWRITE_PLOT,
+    as_json: bool = outputs.JSON,
+    quiet: bool = outputs.QUIET,
 ) -> None:
     """Show what `infer` would read from CAPTURE, without running it.
 

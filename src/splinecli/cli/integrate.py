@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import NormalConvention, split_commas
 from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
-from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
-
-_DEFAULT_FORMATS = ",".join(DEFAULT_FORMATS)
+from splinecli.surface.surface_files import SURFACE_FILES
 
 
 def integrate(
-    normals: inputs.Normals,
-    mask: inputs.NormalsMask = None,
-    camera_matrix: inputs.CameraMatrix = None,
-    convention: inputs.NormalsConvention = NormalConvention.opengl,
-    colours: inputs.Colours = None,
-    stiffness: computing.Stiffness = 2.0,
-    largest_step: computing.LargestStep = None,
-    output: outputs.SurfaceFolder = None,
-    formats: outputs.SurfaceFormats = _DEFAULT_FORMATS,
-    overwrite: outputs.Overwrite = False,
-    as_json: outputs.Json = False,
-    quiet: outputs.Quiet = False,
+    normals: Path = inputs.NORMALS,
+    mask: Path | None = inputs.NORMALS_MASK,
+    camera_matrix: Path | None = inputs.CAMERA_MATRIX,
+    convention: NormalConvention = inputs.NORMALS_CONVENTION,
+    colours: Path | None = inputs.COLOURS,
+    stiffness: float = computing.STIFFNESS,
+    largest_step: float | None = computing.LARGEST_STEP,
+    output: Path | None = outputs.SURFACE_FOLDER,
+    formats: str = outputs.SURFACE_FORMATS,
+    overwrite: bool = outputs.OVERWRITE,
+    as_json: bool = outputs.JSON,
+    quiet: bool = outputs.QUIET,
 ) -> None:
     """Integrate a normal map to a depth map and a mesh.
 

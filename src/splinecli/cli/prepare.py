@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 
 
 def prepare(
-    output: outputs.PixelSet,
-    sources: training.Sources = None,
-    as_stored: inputs.AsStored = False,
-    white_level: inputs.WhiteLevel = None,
-    update: outputs.Update = False,
-    scenes: training.Scenes = 0,
-    mesh: training.Meshes = None,
-    size: training.ImageSize = None,
-    lights: training.SceneLights = None,
-    measured: training.Measured = None,
-    measured_share: training.MeasuredShare = 0.5,
-    seed: inputs.Seed = 0,
-    as_json: outputs.Json = False,
-    quiet: outputs.Quiet = False,
+    output: Path = outputs.PIXEL_SET,
+    sources: list[Path] | None = training.SOURCES,
+    as_stored: bool = inputs.AS_STORED,
+    white_level: float | None = inputs.WHITE_LEVEL,
+    update: bool = outputs.UPDATE,
+    scenes: int = training.SCENES,
+    mesh: list[Path] | None = training.MESHES,
+    size: int | None = training.IMAGE_SIZE,
+    lights: int | None = training.SCENE_LIGHTS,
+    measured: Path | None = training.MEASURED,
+    measured_share: float = training.MEASURED_SHARE,
+    seed: int = inputs.SEED,
+    as_json: bool = outputs.JSON,
+    quiet: bool = outputs.QUIET,
 ) -> int:
     """Make a pixel set, the training data of `splinecli train SET`.
 

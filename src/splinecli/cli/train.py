@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 
 def train(
-    output: outputs.Run,
-    sets: training.Sets = None,
-    preset: training.Preset = None,
-    config: training.Config = None,
-    param: training.Parameters = None,
-    start_from: training.StartFrom = None,
-    generator_weight: training.GeneratorWeight = None,
-    n_lights: training.LightCounts = None,
-    steps: training.Steps = None,
-    minutes: training.Minutes = None,
-    resume: training.Resume = False,
-    seed: training.RunSeed = None,
-    tensorboard: outputs.Tensorboard = False,
-    device: computing.Device = Device.auto,
-    quiet: outputs.Quiet = False,
+    output: Path = outputs.RUN,
+    sets: list[Path] | None = training.SETS,
+    preset: str | None = training.PRESET,
+    config: Path | None = training.CONFIG,
+    param: list[str] | None = training.PARAMETERS,
+    start_from: str | None = training.START_FROM,
+    generator_weight: float | None = training.GENERATOR_WEIGHT,
+    n_lights: str | None = training.LIGHT_COUNTS,
+    steps: int | None = training.STEPS,
+    minutes: float | None = training.MINUTES,
+    resume: bool = training.RESUME,
+    seed: int | None = training.RUN_SEED,
+    tensorboard: bool = outputs.TENSORBOARD,
+    device: Device = computing.DEVICE,
+    quiet: bool = outputs.QUIET,
 ) -> None:
     """Train LI-Net and NE-Net.
 

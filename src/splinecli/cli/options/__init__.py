@@ -1,1 +1,1 @@
-"""The options of the commands: each is declared once, with its type, its help and its completion."""
+"""The options of the commands. Each is declared once, with its default, its help and its completion."""
