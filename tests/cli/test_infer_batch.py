@@ -19,8 +19,8 @@ from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
-from splinecli.pipeline.options import InferOptions
 
 
 def read_report(folder: Path) -> dict:

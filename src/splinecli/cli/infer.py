@@ -18,7 +18,7 @@ from splinecli.errors import SplinecliError, UsageError
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome, Redo
-    from splinecli.pipeline.options import InferOptions
+    from splinecli.pipeline.infer_options import InferOptions
 
 
 _WORDS = {
@@ -73,7 +73,7 @@ def infer(
     its results, unless --update or --overwrite is given. A capture that fails does not stop the others. The exit code
     is that of the worst capture.
     """
-    from splinecli.pipeline.options import InferOptions
+    from splinecli.pipeline.infer_options import InferOptions
 
     with _json_documents(as_json) as documents:
         if overwrite and update:

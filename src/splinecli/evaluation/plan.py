@@ -12,9 +12,9 @@ from splinecli.capture.lights.draws import Draw, DrawsFile, draw_lights, read_dr
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.stamp import stamp_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.evaluation.capture_notes import capture_notes
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
-from splinecli.evaluation.quirks import describe_quirks
 from splinecli.evaluation.scored_pixels import scored_rows
 from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trial_capture import TrialSource
@@ -135,7 +135,7 @@ class CaptureJob:
         except OSError as error:
             raise as_input_error(error, self.source.files.folder) from error
         for task in self.tasks:
-            task.notes[self.name] = describe_quirks(stored.capture, self.name, task.protocol)
+            task.notes[self.name] = capture_notes(stored.capture, self.name, task.protocol)
         # All protocols of an evaluation score the same pixels.
         protocol = self.tasks[0].protocol
         rows = scored_rows(stored.capture, max_pixels=protocol.max_pixels, seed=protocol.seed)

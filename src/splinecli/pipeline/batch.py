@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
 from splinecli.pipeline.finished import find_earlier
 from splinecli.pipeline.infer import infer_capture, make_method
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.options import InferOptions
 
 if TYPE_CHECKING:
     from splinecli.methods import Estimator

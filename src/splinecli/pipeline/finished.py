@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import SplinecliError
-from splinecli.pipeline.options import InferOptions
+from splinecli.pipeline.infer_options import InferOptions
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
 from splinecli.pipeline.finished import inputs_sha256
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.options import InferOptions
 
 if TYPE_CHECKING:
     import numpy as np

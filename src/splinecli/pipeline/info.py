@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
+from splinecli.pipeline.infer_options import radiometric_calibration
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.options import radiometric_calibration
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource

@@ -12,7 +12,7 @@ DAMAGED_IMAGES = {"bearPNG": 20}
 """The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
 
 
-def describe_quirks(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
+def capture_notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
     """Return sentences about a capture with all its pixels; none for an ordinary one."""
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
