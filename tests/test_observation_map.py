@@ -74,8 +74,8 @@ def test_cell_of_a_known_direction(x: float, y: float, row: int, column: int) ->
 def test_cell_of_a_known_direction_on_the_grid_of_cnn_ps(x: float, y: float, row: int, column: int) -> None:
     direction = torch.tensor((x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64)
     assert light_cells(direction, grid="cnn-ps").item() == row * 32 + column
-    holds = sparse_map(torch.ones(1, 1), direction[None], grid="cnn-ps").holds
-    assert holds.flatten().nonzero().item() == row * 32 + column
+    occupied = sparse_map(torch.ones(1, 1), direction[None], grid="cnn-ps").occupied
+    assert occupied.flatten().nonzero().item() == row * 32 + column
 
 
 def test_the_disc_of_both_grids() -> None:
@@ -111,7 +111,7 @@ def test_values_stand_on_their_cells_and_nowhere_else() -> None:
     expected = torch.zeros(1, 1, 32, 32)
     expected[0, 0, 11, 25], expected[0, 0, 16, 15] = 0.5, 0.25
     assert torch.equal(maps.values, expected)
-    assert torch.equal(maps.holds, (expected > 0).float())
+    assert torch.equal(maps.occupied, (expected > 0).float())
 
 
 def test_lights_in_one_cell_are_averaged() -> None:
@@ -119,8 +119,8 @@ def test_lights_in_one_cell_are_averaged() -> None:
     values = torch.tensor([[[1.0, 10.0], [0.0, 20.0], [0.5, 60.0], [0.3, 7.0]]])
     maps = sparse_map(values, directions)
     torch.testing.assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
-    assert maps.holds.sum() == 2
-    assert maps.holds[0, 0, 15, 16] == 1
+    assert maps.occupied.sum() == 2
+    assert maps.occupied[0, 0, 15, 16] == 1
 
 
 def test_lights_that_are_not_valid_leave_no_trace() -> None:
@@ -129,14 +129,14 @@ def test_lights_that_are_not_valid_leave_no_trace() -> None:
     with_flags = sparse_map(observations, directions, valid.expand(3, 12))
     without = sparse_map(observations[:, valid], directions[valid])
     torch.testing.assert_close(with_flags.values, without.values)
-    assert torch.equal(with_flags.holds, without.holds)
+    assert torch.equal(with_flags.occupied, without.occupied)
     bright = torch.where(valid, observations, 100.0)
     assert torch.equal(map_scale(bright, valid.expand(3, 12)), map_scale(observations[:, valid]))
 
 
 def test_a_zero_observation_still_holds_its_cell() -> None:
     maps = sparse_map(torch.zeros(1, 1), torch.tensor([[0.0, 0.0, 1.0]]))
-    assert maps.holds.sum() == 1
+    assert maps.occupied.sum() == 1
     assert not maps.values.any()
 
 
@@ -157,7 +157,7 @@ def test_order_of_lights_does_not_matter(seed: int) -> None:
     order = torch.randperm(40, generator=torch.Generator().manual_seed(seed))
     one, other = sparse_map(observations, directions), sparse_map(observations[:, order], directions[order])
     torch.testing.assert_close(one.values, other.values)
-    assert torch.equal(one.holds, other.holds)
+    assert torch.equal(one.occupied, other.occupied)
 
 
 @quick
@@ -199,7 +199,7 @@ def test_lights_of_each_pixel_s_own_are_like_shared_ones() -> None:
     shared = sparse_map(observations, directions)
     own = sparse_map(observations, directions.expand(5, 10, 3))
     assert torch.equal(shared.values, own.values)
-    assert torch.equal(shared.holds, own.holds)
+    assert torch.equal(shared.occupied, own.occupied)
     # And they are looked at pixel by pixel.
     others = random_rig(4, 1, 10)[1]
     mixed = sparse_map(observations[:2], torch.stack((directions, others)))

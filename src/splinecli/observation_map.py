@@ -25,10 +25,10 @@ Grid = Literal["even", "cnn-ps"]
 
 
 class SparseMap(NamedTuple):
-    """values: (P, C, size, size), zero in empty cells. holds: (P, 1, size, size), one in cells with an observation."""
+    """values: (P, C, size, size), zero in empty cells. occupied: (P, 1, size, size), one in cells with an observation."""
 
     values: Tensor
-    holds: Tensor
+    occupied: Tensor
 
 
 def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
@@ -95,8 +95,8 @@ def sparse_map(
     sums.scatter_add_(2, cells[:, None].expand_as(stacked), stacked)
     count = sums[:, -1:]
     maps = sums[:, :-1] / count.clamp(min=1)
-    holds = (count > 0).to(values.dtype)
-    return SparseMap(maps.view(pixels, channels, size, size), holds.view(pixels, 1, size, size))
+    occupied = (count > 0).to(values.dtype)
+    return SparseMap(maps.view(pixels, channels, size, size), occupied.view(pixels, 1, size, size))
 
 
 def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:

@@ -149,8 +149,8 @@ def test_sparse_and_dense_map_agree_where_a_light_is_in_its_cell_s_centre() -> N
     observed = batch.truth.radiance(lights) * batch.exposure
     sparse = sparse_map(observed, lights)
     dense = batch.truth.dense_map() * batch.exposure[..., None, None]
-    assert sparse.holds[0].sum() == len(lights)
-    torch.testing.assert_close(sparse.values, dense * sparse.holds, rtol=1e-3, atol=1e-6)
+    assert sparse.occupied[0].sum() == len(lights)
+    torch.testing.assert_close(sparse.values, dense * sparse.occupied, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"])

@@ -75,13 +75,13 @@ def test_map_loss_is_over_the_known_cells_of_each_pixel(norm: Norm, expected: fl
 
 @pytest.mark.parametrize(("norm", "expected"), [("mean", (0.15 + 0.6) / 2), ("sum", (0.3 + 0.6) / 2)])
 def test_masked_map_loss_is_over_observed_cells_of_known_truth(norm: Norm, expected: float) -> None:
-    holds, truth = torch.zeros(2, 1, 4, 4), torch.zeros(2, 1, 4, 4)
-    holds[0, 0, 0, 1] = holds[0, 0, 2, 2] = holds[1, 0, 3, 3] = holds[1, 0, 1, 1] = 1
-    known = torch.ones_like(holds)
+    occupied, truth = torch.zeros(2, 1, 4, 4), torch.zeros(2, 1, 4, 4)
+    occupied[0, 0, 0, 1] = occupied[0, 0, 2, 2] = occupied[1, 0, 3, 3] = occupied[1, 0, 1, 1] = 1
+    known = torch.ones_like(occupied)
     known[1, 0, 1, 1] = 0
     dense = torch.full((2, 1, 4, 4), 5.0)
     dense[0, 0, 0, 1], dense[0, 0, 2, 2], dense[1, 0, 3, 3] = 0.1, -0.2, 0.6
-    assert masked_map_loss(dense, truth, known, holds, norm).item() == pytest.approx(expected)
+    assert masked_map_loss(dense, truth, known, occupied, norm).item() == pytest.approx(expected)
     assert masked_map_loss(dense, truth, known, torch.zeros(2, 1, 4, 4), norm) == 0
 
 
@@ -296,7 +296,7 @@ def test_halves_of_a_batch_have_its_loss_as_their_mean() -> None:
     maps, truth = random_maps(8, 1, 16, 16, seed=1), random_maps(8, 1, 16, 16, seed=2)
     known = (random_maps(8, 1, 16, 16, seed=3) < 0.7).double()
     known[:4] *= known[4:].flip(0)  # fewer cells in one half than in the other
-    holds = (random_maps(8, 1, 16, 16, seed=4) < 0.2).double()
+    occupied = (random_maps(8, 1, 16, 16, seed=4) < 0.2).double()
     normals = torch.nn.functional.normalize(random_maps(8, 3, seed=5), dim=1)
     others = torch.nn.functional.normalize(random_maps(8, 3, seed=6), dim=1)
 
@@ -310,7 +310,7 @@ def test_halves_of_a_batch_have_its_loss_as_their_mean() -> None:
         norms: tuple[Norm, ...] = ("mean", "sum")
         for norm in norms:
             found.append(map_loss(maps[part], truth[part], known[part], norm))
-            found.append(masked_map_loss(maps[part], truth[part], known[part], holds[part], norm))
+            found.append(masked_map_loss(maps[part], truth[part], known[part], occupied[part], norm))
         return torch.stack(found)
 
     torch.testing.assert_close((losses(slice(4)) + losses(slice(4, 8))) / 2, losses(slice(8)))

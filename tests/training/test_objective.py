@@ -152,8 +152,8 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
         # Each term by the paper's formulas (eqs. 5 and 8).
         error = (dense - dense_truth.values).abs()
         on_map = (error * dense_truth.known).sum((1, 2, 3))
-        masked = (error * dense_truth.known * views.holds).sum((1, 2, 3))
-        seen = (dense_truth.known * views.holds).sum((1, 2, 3))
+        masked = (error * dense_truth.known * views.occupied).sum((1, 2, 3))
+        seen = (dense_truth.known * views.occupied).sum((1, 2, 3))
         angle = (normals * normal_truth).sum(1).clamp(-1, 1).acos().mean()
         special = {}
         for name, maps, axes, norm in (
@@ -228,8 +228,8 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
             vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals)
         )
     sparse = sparse_map(observations / views.scale, turned)
-    assert sparse.holds[0].sum() == len(lights)
-    torch.testing.assert_close(dense.values * sparse.holds, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
+    assert sparse.occupied[0].sum() == len(lights)
+    torch.testing.assert_close(dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
     torch.testing.assert_close(normals, expected_normals)
     assert dense.values.max() == 1  # highlights that no light has hit are cut
     assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))

@@ -55,9 +55,9 @@ def test_the_maps_of_some_pixels(network: SplineNet, batch: PixelBatch) -> None:
     cosine = (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1)
     for index in range(SHOWN_PIXELS):
         pixel = 5 * index  # spread over the 40
-        holds = views.holds[pixel, 0].numpy() > 0
-        np.testing.assert_array_equal(np.isfinite(shown.sparse[index]), holds)
-        np.testing.assert_array_equal(shown.sparse[index][holds], views.sparse[pixel, 0].numpy()[holds])
+        occupied = views.occupied[pixel, 0].numpy() > 0
+        np.testing.assert_array_equal(np.isfinite(shown.sparse[index]), occupied)
+        np.testing.assert_array_equal(shown.sparse[index][occupied], views.sparse[pixel, 0].numpy()[occupied])
         np.testing.assert_array_equal(np.isfinite(shown.dense[index]), inside)
         np.testing.assert_allclose(shown.dense[index][inside], dense[pixel, 0].numpy()[inside], atol=1e-6)
         np.testing.assert_array_equal(np.isfinite(shown.truth[index]), inside)

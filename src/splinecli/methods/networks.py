@@ -158,11 +158,11 @@ class NetworkEstimator:
         config = network.config
         every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
 
-        def known(values: Tensor, holds: Tensor) -> NDArray[np.float32]:
-            return np.asarray(values.masked_fill(holds == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
+        def known(values: Tensor, occupied: Tensor) -> NDArray[np.float32]:
+            return np.asarray(values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32)
 
         inside = network.inside.expand_as(dense)
-        return known(maps.sparse, maps.holds), known(dense, inside), known(every.values, every.holds)
+        return known(maps.sparse, maps.occupied), known(dense, inside), known(every.values, every.occupied)
 
 
 def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:

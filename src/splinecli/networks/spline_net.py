@@ -55,7 +55,7 @@ class PixelMaps(NamedTuple):
     """Observation maps of P pixels and what belongs to them, in each pixel's own frame.
 
     Attributes:
-        sparse, holds, residual, lambertian_map: (P, 1, w, w); holds is 1 in cells with an observation.
+        sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation.
         lambertian_normals: (P, 3), unit.
         scale: (P, 1), the largest observation, which is 1 in the maps.
         fitted_normals: (P, K, 3), of the further fits in the configuration.
@@ -64,7 +64,7 @@ class PixelMaps(NamedTuple):
     """
 
     sparse: Tensor
-    holds: Tensor
+    occupied: Tensor
     residual: Tensor
     lambertian_map: Tensor
     lambertian_normals: Tensor
@@ -156,7 +156,7 @@ class SplineNet(nn.Module):
         lambertian_map = (scaled_normals @ self.cells.T).clamp(0, 1).view(-1, 1, side, side)
         return PixelMaps(
             maps.values[:, :1],
-            maps.holds,
+            maps.occupied,
             maps.values[:, 1:],
             lambertian_map,
             scaled_normals / scaled_normals.norm(dim=-1, keepdim=True).clamp(min=1e-12),
@@ -174,7 +174,7 @@ class SplineNet(nn.Module):
         if self.config.size == "paper":
             dense: Tensor = self.li_net(maps.sparse)
         else:
-            inputs = torch.cat((maps.sparse, maps.holds, maps.residual, maps.lambertian_map), dim=1)
+            inputs = torch.cat((maps.sparse, maps.occupied, maps.residual, maps.lambertian_map), dim=1)
             dense = maps.lambertian_map + self.li_net(inputs)
         return dense * self.inside
 
@@ -184,7 +184,7 @@ class SplineNet(nn.Module):
         if self.config.size == "paper":
             raw, error = self.ne_net(torch.cat((maps.sparse, *interpolated), dim=1)), None
         else:
-            channels = (maps.sparse, maps.holds, maps.residual, maps.lambertian_map)
+            channels = (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map)
             normals = torch.cat((maps.lambertian_normals[:, None], maps.fitted_normals), dim=1)
             raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals)
         return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)

@@ -49,8 +49,8 @@ class SampledPixels:
     def dense_truth(self, size: int) -> DenseMap:
         """Return the observation maps (P, 1, size, size) of all lights, with gaps interpolated."""
         sampled = sparse_map(self.radiance, self.light_directions, self.known, size=size)
-        inside = cell_directions(size)[1].to(sampled.holds)
-        return fill_gaps(sampled.values, sampled.holds * inside, inside)
+        inside = cell_directions(size)[1].to(sampled.occupied)
+        return fill_gaps(sampled.values, sampled.occupied * inside, inside)
 
 
 class PixelSetSource:

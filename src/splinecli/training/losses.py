@@ -46,15 +46,15 @@ def map_loss(dense: Tensor, truth: Tensor, known: Tensor, norm: Norm = "mean") -
 
 
 def masked_map_loss(
-    dense: Tensor, truth: Tensor, known: Tensor, holds: Tensor, norm: Norm = "mean"
+    dense: Tensor, truth: Tensor, known: Tensor, occupied: Tensor, norm: Norm = "mean"
 ) -> Tensor:
     """Return |M_s o (D - D_gt)|, over the cells of the sparse map alone.
 
     Args:
         dense, truth, known, norm: as for map_loss.
-        holds: 1 in cells of the sparse map that have an observation, else 0, (P, 1, w, w).
+        occupied: 1 in cells of the sparse map that have an observation, else 0, (P, 1, w, w).
     """
-    return _over(known * holds, (dense - truth).abs(), norm)
+    return _over(known * occupied, (dense - truth).abs(), norm)
 
 
 def _over(cells: Tensor, values: Tensor, norm: Norm) -> Tensor:

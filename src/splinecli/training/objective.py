@@ -92,7 +92,7 @@ def compute_losses(
     if dense is not None and dense_truth is not None:
         dense = dense.float()
         on_map = map_loss(dense, dense_truth.values, dense_truth.known)
-        masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, maps.holds)
+        masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, maps.occupied)
     symmetric = asymmetric = angle.new_full((), torch.nan)
     if dense_truth is not None and (config.symmetric_weight or config.asymmetric_weight):
         symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
@@ -100,7 +100,7 @@ def compute_losses(
     if part != "ne_net" and dense is not None and dense_truth is not None:
         against = (dense, dense_truth.values, dense_truth.known)
         total = total + config.map_weight * map_loss(*against, config.li_net_norm)
-        total = total + config.masked_weight * masked_map_loss(*against, maps.holds, config.li_net_norm)
+        total = total + config.masked_weight * masked_map_loss(*against, maps.occupied, config.li_net_norm)
     if config.symmetric_weight:
         total = total + config.symmetric_weight * symmetric
     if config.asymmetric_weight:

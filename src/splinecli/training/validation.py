@@ -55,7 +55,7 @@ def sample_maps(network: SplineNet, batch: PixelBatch) -> SampleMaps:
 
     error_deg = angle_between_deg(normals.cpu().numpy(), normal_truth.cpu().numpy())
     return SampleMaps(
-        picture(maps.sparse, maps.holds),
+        picture(maps.sparse, maps.occupied),
         None if dense is None else picture(dense, network.inside.expand_as(dense)),
         picture(truth.values, truth.filled),
         error_deg[::step][:SHOWN_PIXELS].astype(np.float32),
