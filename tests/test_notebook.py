@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import splinecli
+from splinecli.capture.arrays import capture_from_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
 from splinecli.surface.integration import integrate_normals
@@ -165,3 +166,18 @@ def test_importing_the_package_loads_neither_torch_nor_numpy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert json.loads(done.stdout) == []
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind):
+    """A gray edge at or below half of the largest value is outside; any value of a bool mask that is True counts."""
+    generator = np.random.default_rng(0)
+    images = generator.uniform(0.1, 1, (4, 2, 3))
+    directions = [(0.1, 0, 1), (0, 0.4, 1), (-0.5, 0, 1), (0, -0.6, 1)]
+    numbers = np.array([[0, 100, 101], [200, 50, 200]], kind)
+    capture = capture_from_arrays(images, directions, numbers, as_stored=True)
+    assert capture.mask.tolist() == [[False, False, True], [True, False, True]]
+    capture = capture_from_arrays(images, directions, numbers > 0, as_stored=True)
+    assert capture.n_pixels == 5
+    with pytest.raises(InputError, match="mask"):
+        capture_from_arrays(images, directions, np.zeros((2, 3), kind), as_stored=True)

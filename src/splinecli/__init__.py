@@ -49,7 +49,8 @@ def estimate_normals(
         images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the top. uint8 and
             uint16 values are scaled by their full range; floating-point values are taken as they are.
         light_directions: (F, 3), from the object towards the lights, of any length; x right, y up, z to the camera.
-        mask: (H, W), not zero at the pixels of the object. None takes all pixels.
+        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
+            None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown: they are estimated if the images show
             that they differ.
         method: "spline-net", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".

@@ -25,7 +25,7 @@ Grid = Literal["even", "cnn-ps"]
 
 
 class SparseMap(NamedTuple):
-    """values: (P, C, size, size), zero in empty cells. occupied: (P, 1, size, size), one in cells with an observation."""
+    """values: (P, C, size, size), zero in empty cells. occupied: (P, 1, size, size), one where an observation is."""
 
     values: Tensor
     occupied: Tensor

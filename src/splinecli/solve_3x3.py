@@ -22,8 +22,8 @@ SMALLEST_DETERMINANT = 1e-12
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
     """Invert symmetric positive matrices, given and returned as their xx, yy, zz, xy, xz, yz, each (P,).
 
-    The factors of A = L D L' are inverted. No pivot falls below `smallest` or, because rounding leaves no more of it,
-    below 1e-14 of the trace. The inverse is therefore positive definite even where the matrix has rank 1 or 2.
+    The factors of A = L D L' are inverted. Pivots are at least `smallest`, and at least 1e-14 of the trace, the
+    limit of rounding. The inverse is therefore positive definite even if the matrix has rank 1 or 2.
     """
     xx, yy, zz, xy, xz, yz = entries
     floor = smallest + 1e-14 * (xx + yy + zz)

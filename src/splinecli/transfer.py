@@ -38,7 +38,9 @@ def parse_transfer(text: str) -> float | None:
             gamma = 0.0
         if 0.1 <= gamma <= 10:
             return gamma
-    raise UsageError(f"the transfer curve is {text!r}; expected linear, srgb or gamma:G, such as gamma:2.2")
+    raise UsageError(
+        f"the transfer curve is {text!r}; expected linear, srgb, or gamma:G with G from 0.1 to 10"
+    )
 
 
 def decode_transfer(stored: NDArray[np.float32], gamma: float | None) -> NDArray[np.float32]:

@@ -38,7 +38,7 @@ def sphere_normals() -> np.ndarray:
 
 
 def write_capture(folder: Path) -> Path:
-    """A capture with ground truth; its disc-shaped mask holds 448 of 576 pixels."""
+    """A capture with ground truth; its disc-shaped mask has 448 of 576 pixels."""
     folder.mkdir(parents=True)
     normals = sphere_normals()
     lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)

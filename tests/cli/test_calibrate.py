@@ -93,6 +93,14 @@ def test_two_balls_and_intensities(run):
     assert np.loadtxt("calibration/light_intensities.txt").shape == (4, 3)
 
 
+def test_the_file_of_intensities_is_named(run):
+    write_balls(Path("ball"))
+    write_gray(Path("gray"), [1.0, 0.5, 0.75, 1.25])
+    result = run("calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray")
+    assert result.out == "calibration/light_directions.txt\n"
+    assert "The light intensities are in calibration/light_intensities.txt\n" in result.err
+
+
 def test_the_normals_are_not_the_lights(run):
     write_balls(Path("ball"))
     half = LIGHTS + np.array((0, 0, 1))

@@ -143,7 +143,7 @@ def test_update_keeps_files_of_others(capture, run):
     Path("out/sphere/normals.png").write_text("drawn by hand")
     result = run("infer", capture, "--method", "ls", "--update")
     assert result.code == 5
-    assert "out/sphere: holds normals.png, but no report.json. Add --overwrite" in result.err
+    assert "out/sphere: contains normals.png, but no report.json. Add --overwrite" in result.err
     assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
     both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
     assert (both.code, "exclude each other" in both.err) == (2, True)
@@ -155,7 +155,7 @@ def test_another_object_of_the_same_name(capture, make_capture, run):
     Path("others").mkdir()
     Path("others/sphere").symlink_to(Path("third").absolute())
     other = run("infer", "others/sphere", "--method", "ls")
-    assert (other.code, "out/sphere: holds results of other input files" in other.err) == (5, True)
+    assert (other.code, "out/sphere: contains results made from other input files" in other.err) == (5, True)
 
 
 def test_links_are_called_by_their_own_names(capture, run):

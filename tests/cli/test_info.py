@@ -21,9 +21,9 @@ def test_the_report_of_a_capture(run, capture):
     assert result.code == 0
     rows = {line[:13].strip(): line[13:] for line in result.out.splitlines()}
     assert rows["capture"] == f"{capture.name} (plain folder)"
-    assert rows["images"] == "8: 24 x 24, gray, 16 bits"
+    assert rows["images"] == "8 (image1.png ... image8.png): 24 x 24, gray, 16 bits"
     # (+-0.4, +-0.4, 1) are the lowest lights, 29.5 degrees from the view axis.
-    assert rows["lights"].endswith("light_directions.txt, 60 to 90 degrees above the image plane")
+    assert rows["lights"].endswith("light_directions.txt, 0 to 30 degrees from the camera axis")
     assert rows["mask"].endswith("mask.png (448 pixels)")
     assert rows["intensities"].startswith("none")
     assert rows["white level"] == "65535, the full scale of the files"
@@ -32,13 +32,13 @@ def test_the_report_of_a_capture(run, capture):
 def test_the_same_as_json(run, capture):
     report = json.loads(run("info", str(capture), "--json").out)
     assert report["image_kinds"] == [{"size": [24, 24], "channels": 1, "type": "uint16"}]
-    assert report["elevation_deg"] == [60.5, 90.0]
+    assert report["axis_angle_deg"] == [0.0, 29.5]
     assert report["light_intensities"] is None
     assert report["exposure"]["saturated"] == 0
     # 60000 of 65535 under the light from the camera, at the top of the sphere.
     assert report["exposure"]["bright"][1] == pytest.approx(60_000 / 65_535, abs=0.01)
     assert report["warnings"] == [
-        "All lights are within 30 degrees of the camera's direction; lower lights give better normals."
+        "All lights are within 30 degrees of the camera axis; lower lights give better normals."
     ]
 
 

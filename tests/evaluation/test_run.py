@@ -144,7 +144,7 @@ def test_a_draws_file_goes_before_random_draws(write_dome: WriteDome, tmp_path: 
     assert (evaluation.results[0].n_lights, evaluation.results[0].trials) == (3, 2)
     np.testing.assert_array_equal(fake.observations[0], whole.observations[:, [5, 0, 1]])
     np.testing.assert_array_equal(fake.lights[1], whole.light_directions[[2, 3, 7]])
-    with pytest.raises(UsageError, match=r"10 lights a draw wanted, the draws in .*draws\.txt have 3"):
+    with pytest.raises(UsageError, match=r"10 lights were requested, but the draws in .*draws\.txt have 3"):
         evaluate([folder], [fake], Protocol(n_lights=10, draws_file=tmp_path / "draws.txt"))
 
 
@@ -212,9 +212,9 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_p
     assert evaluation.captures == ("good",)
     assert [skipped.capture for skipped in evaluation.skipped] == ["untrue", "broken", "few", "missing"]
     reasons = [skipped.reason for skipped in evaluation.skipped]
-    assert reasons[0].startswith(f"{untrue}: no ground truth, so nothing to score against.")
+    assert reasons[0].startswith(f"{untrue}: the capture has no ground truth.")
     assert str(broken / "003.png") in reasons[1]
-    assert reasons[2] == "5 lights wanted, the capture has 4. Ask for at most 4 lights."
+    assert reasons[2] == "5 lights were requested, but the capture has 4. Ask for at most 4 lights."
     assert str(tmp_path / "missing") in reasons[3]
 
 
@@ -222,12 +222,13 @@ def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> No
     ls = make_estimator("ls")
     untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
     with pytest.raises(
-        InputError, match=r"none of the 2 captures could be scored; the first: .*untrue: no gro"
+        InputError,
+        match=r"none of the 2 captures could be scored; the first: .*untrue: the capture has no gro",
     ):
         evaluate([untrue, few], [ls], Protocol(n_lights=5))
-    with pytest.raises(InputError, match="untrue: no ground truth"):
+    with pytest.raises(InputError, match="untrue: the capture has no ground truth"):
         evaluate([untrue], [ls], Protocol())
-    with pytest.raises(UsageError, match="5 lights wanted, the capture has 4"):
+    with pytest.raises(UsageError, match="5 lights were requested, but the capture has 4"):
         evaluate([few], [ls], Protocol(n_lights=5))
 
 
@@ -427,12 +428,12 @@ def test_what_is_particular_is_noted(write_dome: WriteDome, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"n_lights": 2}, "2 lights wanted, expected at least 3."),
-        ({"trials": 0}, "0 trials wanted, expected at least 1."),
-        ({"seed": -3}, "the seed is -3, expected a whole number from 0."),
+        ({"n_lights": 2}, "--n-lights is 2; expected at least 3."),
+        ({"trials": 0}, "--trials is 0; expected at least 1."),
+        ({"seed": -3}, "--seed is -3; expected a whole number from 0."),
         ({"light_noise_deg": -1.0}, "light noise of -1 degrees, expected 0 to 30."),
         ({"light_noise_deg": float("nan")}, "light noise of nan degrees, expected 0 to 30."),
-        ({"max_pixels": 0}, "at most 0 pixels to score, expected at least 1."),
+        ({"max_pixels": 0}, "--max-pixels is 0; expected at least 1."),
     ],
 )
 def test_a_protocol_out_of_range(settings: dict[str, Any], message: str) -> None:
@@ -445,7 +446,7 @@ def test_what_to_score_is_needed_once(write_dome: WriteDome) -> None:
     folder, ls = write_dome(), make_estimator("ls")
     with pytest.raises(UsageError, match="method ls comes twice"):
         evaluate([folder], [ls, ls], Protocol())
-    with pytest.raises(UsageError, match="nothing to score"):
+    with pytest.raises(UsageError, match="there is nothing to score: give"):
         evaluate([], [ls], Protocol())
 
 

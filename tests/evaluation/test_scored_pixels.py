@@ -52,5 +52,5 @@ def test_more_than_there_are_is_all(capture: Capture) -> None:
 
 
 def test_without_ground_truth(capture: Capture) -> None:
-    with pytest.raises(InputError, match="c: no ground truth"):
+    with pytest.raises(InputError, match="c: the capture has no ground truth"):
         scored_rows(replace(capture, ground_truth=None))

@@ -92,12 +92,12 @@ def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
     with pytest.raises(
         ModelError,
-        match=r"'tiny' hold both networks, so the method cnn-ps .* Use them with --method spline-net",
+        match=r"'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net",
     ):
         make_estimator("cnn-ps", MethodOptions(weights=weights))
     with pytest.raises(
         ModelError,
-        match=r"'alone' hold one network, so the method spline-net .* Use them with --method cnn-ps",
+        match=r"'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps",
     ):
         make_estimator("spline-net", MethodOptions(weights=alone))
 

@@ -16,7 +16,7 @@ YELLOW, VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' 
 def draw(
     n_pixels: int, *, with_truth: bool = True, with_dense: bool = True, named: bool = True, grid: str = "even"
 ) -> NDArray[np.uint8]:
-    """RGB (H, W, 3). Sparse maps hold a one at row 1, column 5; dense maps are zeros; the truth is empty."""
+    """RGB (H, W, 3). Sparse maps have a one at row 1, column 5; dense maps are zeros; the truth is empty."""
     sparse = np.full((n_pixels, SIZE, SIZE), np.nan, np.float32)
     sparse[:, 1, 5] = 1
     png = observation_map_figure(

@@ -20,7 +20,7 @@ BALLS = (Path("one"), Path("two"))
     [
         ({"transfer": "srgb"}, "--transfer needs --gray-ball or --gray-card"),
         ({"transfer": "sRGB"}, "the transfer curve is 'sRGB'"),
-        ({"gray_ball": Path("a"), "gray_card": Path("b")}, "exclude each other"),
+        ({"gray_ball": Path("a"), "gray_card": Path("b")}, "contradict each other. Leave one out"),
         ({"circles": (Circle(1, 1, 1),)}, "--circle is given once for 2 balls"),
         ({"masks": (Path("a"),) * 3}, "--mask is given 3 times for 2 balls"),
     ],

@@ -1,4 +1,4 @@
-"""Batches from a pixel set hold the stored pixels, under drawn lights, and dense maps fill only gaps."""
+"""Batches from a pixel set contain the stored pixels, under drawn lights, and dense maps fill only gaps."""
 
 from __future__ import annotations
 

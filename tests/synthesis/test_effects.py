@@ -68,7 +68,7 @@ def test_walls_have_the_stated_shapes() -> None:
     assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
     assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
     assert not wall.reflectance[~present].any()
-    assert wall.same.float().mean().item() == pytest.approx(0.5, abs=SHARE)
+    assert wall.has_pixel_material.float().mean().item() == pytest.approx(0.5, abs=SHARE)
     # What reflects lies on the wall, on the side that faces the pixel.
     torch.testing.assert_close(wall.towards.norm(dim=1), torch.ones(N))
     along = (wall.towards * wall.azimuth).sum(dim=1)
@@ -95,7 +95,7 @@ def test_walls_reflect_what_they_see_of_the_sky() -> None:
     wall = draw_wall(draw_visible_normals(N, generator(1)), 1.0, generator())
     seen = 1 - (1 + wall.tan_height.double() ** 2) ** -0.5
     share = (wall.reflectance / seen).numpy().ravel()
-    same = wall.same.numpy().ravel()
+    same = wall.has_pixel_material.numpy().ravel()
     fresh = np.random.default_rng(0)
     expected = fresh.uniform(0.5, 2, N) * fresh.uniform(size=N)
     assert stats.ks_2samp(share[same], expected).pvalue > 1e-3
@@ -203,7 +203,7 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
         facing=wall.facing,
         reflectance=wall.reflectance,
         towards=wall.towards,
-        same=wall.same,
+        has_pixel_material=wall.has_pixel_material,
     )
 
     def towards(azimuth_deg: float, elevation_deg: float) -> list[float]:

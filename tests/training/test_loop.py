@@ -216,7 +216,7 @@ def test_dropout_is_the_same_in_every_run_of_a_seed(tiny: TrainingConfig, tmp_pa
 def test_a_folder_that_holds_a_run_is_left_alone(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(tiny, tmp_path, CPU).save()
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(OutputError, match="holds a run already"):
+    with pytest.raises(OutputError, match="already contains a run"):
         Trainer(replace(tiny, steps=9), tmp_path, CPU)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -294,7 +294,7 @@ def test_a_run_writes_its_files(
     rows = read_metrics(tmp_path / METRICS)
     assert [row.step for row in rows] == [4, 8, 10]
     assert [row.pixels for row in rows] == [64, 128, 160]
-    # Validated when saved: here at the end alone, on the averaged weights that the weight file holds.
+    # Validated when saved: here at the end alone, on the averaged weights in the weight file.
     assert [row.validation_deg is not None for row in rows] == [False, False, True]
     assert last.validation_deg is not None
     loaded = load_weights(tmp_path / WEIGHTS).network

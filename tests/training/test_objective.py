@@ -229,7 +229,9 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
         )
     sparse = sparse_map(observations / views.scale, turned)
     assert sparse.occupied[0].sum() == len(lights)
-    torch.testing.assert_close(dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(
+        dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4
+    )
     torch.testing.assert_close(normals, expected_normals)
     assert dense.values.max() == 1  # highlights that no light has hit are cut
     assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))

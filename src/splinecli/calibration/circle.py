@@ -122,7 +122,8 @@ def find_circle(image: NDArray[Any]) -> Circle:
     if best is None:
         raise InputError(
             "found no circle, expected a ball",
-            hint="Give a mask of the ball with --mask, or its circle with --circle X,Y,R",
+            hint="Is this a folder of images of a mirror ball? If so, give a mask of the ball with --mask, or its"
+            " circle with --circle X,Y,R",
         )
     return best
 

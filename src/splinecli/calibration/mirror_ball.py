@@ -60,7 +60,8 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
     if brightest <= MIN_CONTRAST * median or brightest <= 0:
         raise InputError(
             "found no highlight in the ball",
-            hint="The lamp must be by far the brightest spot in it; take the image with all other lights off",
+            hint="Is this a folder of images of a mirror ball? If so, take the images with all other lights off: the"
+            " lamp must be by far the brightest spot in the ball",
         )
     _, labels = cv2.connectedComponents((smooth >= HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
     # Of several patches, take the one with the most light rather than the one with the brightest pixel.

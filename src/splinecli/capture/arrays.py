@@ -36,7 +36,8 @@ def capture_from_arrays(
         images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by their full range;
             floating-point values are taken as they are.
         light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
-        mask: (H, W), not zero at the pixels of the object. None takes all pixels.
+        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
+            None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
         white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
             integer images; floating-point images then have none.
@@ -52,7 +53,7 @@ def capture_from_arrays(
     shape, n_lights = stack[0].shape[:2], len(stack)
     directions = _checked_directions(light_directions, n_lights)
     intensities = _checked_intensities(light_intensities, n_lights)
-    inside = np.ones(shape, np.bool_) if mask is None else np.asarray(mask) != 0
+    inside = np.ones(shape, np.bool_) if mask is None else _inside(np.asarray(mask))
     if inside.shape != shape:
         raise UsageError(f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images")
 
@@ -74,6 +75,14 @@ def capture_from_arrays(
     )
     stored = StoredCapture(capture, found.saturated, intensities_known=light_intensities is not None)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
+
+
+def _inside(mask: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return the pixels of the object, by the rule of mask files for numbers."""
+    if mask.dtype == np.bool_ or not mask.size:
+        return mask.astype(np.bool_)
+    inside: NDArray[np.bool_] = mask > max(mask.max() / 2, 0)
+    return inside
 
 
 def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:

@@ -55,7 +55,8 @@ def white_level(level: WhiteLevel | None) -> CaptureWarning | None:
         return None
     return CaptureWarning(
         WHITE_LEVEL,
-        f"The images look clipped at {level.value:g}, so this value counts as saturated; --white-level N sets another.",
+        f"The images look clipped at {level.value:g}, so this value counts as saturated. Use --white-level N to set"
+        " another value.",
     )
 
 
@@ -92,8 +93,8 @@ def estimated_intensities(intensities: NDArray[np.float64]) -> CaptureWarning:
     return CaptureWarning(
         ESTIMATED_INTENSITIES,
         "The light intensities were estimated from the images: they are unequal, from"
-        f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. --intensities FILE gives measured ones,"
-        " --intensities equal takes them for equal.",
+        f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. Use --intensities FILE if you have"
+        " measured them, or --intensities equal to assume equal ones.",
     )
 
 
@@ -114,8 +115,8 @@ def ambient_subtracted(ambient: str) -> CaptureWarning:
 def display_encoded() -> CaptureWarning:
     return CaptureWarning(
         DISPLAY_ENCODED,
-        "The images look display-encoded (JPEG, or PNG that says so) but are taken to be linear;"
-        " --transfer srgb undoes sRGB's curve.",
+        "The images look display-encoded (JPEG, or PNG that says so) but are read as linear."
+        " Add --transfer srgb if they are sRGB.",
     )
 
 
@@ -148,8 +149,8 @@ def few_lights(n_lights: int) -> CaptureWarning:
 
 
 def high_lights(limit_deg: float) -> CaptureWarning:
-    """Warn of lights that are all close to the camera's direction."""
+    """Warn of lights that are all close to the camera axis."""
     return CaptureWarning(
         HIGH_LIGHTS,
-        f"All lights are within {limit_deg:.0f} degrees of the camera's direction; lower lights give better normals.",
+        f"All lights are within {limit_deg:.0f} degrees of the camera axis; lower lights give better normals.",
     )

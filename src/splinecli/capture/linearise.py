@@ -38,10 +38,10 @@ AS_STORED = RadiometricCalibration()
 
 
 class Lineariser:
-    """Linearise the pixels of a mask (H, W). The images that all of a capture's images share are read once."""
+    """Linearise the pixels of a mask (H, W). Ambient image and common flat field are read once."""
 
     def __init__(self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int) -> None:
-        """Raises InputError: the ambient image cannot be read, or the number of flat fields does not fit."""
+        """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
         self.radiometry = radiometry
         self.mask = mask
         flats = radiometry.flat_field

@@ -28,12 +28,12 @@ def find_mode(path: Path) -> int | None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; also false where the system refuses to answer."""
+    """Return whether there is a file; False also if the system refuses to answer."""
     return stat.S_ISREG(_mode_or_zero(path))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder; also false where the system refuses to answer."""
+    """Return whether there is a folder; False also if the system refuses to answer."""
     return stat.S_ISDIR(_mode_or_zero(path))
 
 

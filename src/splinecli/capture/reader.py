@@ -39,7 +39,7 @@ def open_capture(
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
-    Files named here are used instead of those that the folder holds.
+    Files named here are used instead of those in the folder.
 
     Args:
         intensities: a file, or EQUAL.
@@ -49,7 +49,7 @@ def open_capture(
             is found from the files and their values (see white_level.py).
 
     Raises:
-        InputError: the folder holds no capture (see find_capture_files) or a light file is wrong.
+        InputError: the folder contains no capture (see find_capture_files) or a light file is wrong.
         UsageError: the white level is not a number above 0.
     """
     if white_level is not None and not 0 < white_level < math.inf:

@@ -66,7 +66,7 @@ class CaptureSource:
     ) -> Capture:
         """Return the capture under the chosen lights (None for all), in the order given.
 
-        Only the images of these lights are read. Memory holds at most one full image beside the result. Values outside
+        Only the images of these lights are read. At most one full image is in memory beside the result. Values outside
         the mask are ignored.
 
         Args:
@@ -87,7 +87,7 @@ class CaptureSource:
     def read_stored(
         self, light_indices: Sequence[int] | None = None, progress: Progress | None = None
     ) -> StoredCapture:
-        """Return the stored values under the chosen lights, and what restores them; see read."""
+        """Return the stored values under the chosen lights and the data needed to restore them; see read."""
         indices = (
             tuple(range(self.n_lights))
             if light_indices is None
@@ -185,7 +185,7 @@ class CaptureSource:
                 stored = decode_image(path)
             check_size(stored.shape, mask.shape, path, like=self.files.images[indices[0]].name)
             pixels = stored[mask]
-            stored = None  # let go before the next is decoded: one full image at a time
+            stored = None  # free this image before the next one is decoded
             yield StoredPixels(path, pixels, linearise(pixels, path, index), self.light_intensities[index])
 
     def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:

@@ -24,8 +24,8 @@ DARK = 0.05
 FEW_LIGHTS = 8
 """A capture with fewer lights carries a warning."""
 
-STEEP_DEG = 60.0
-"""A capture whose lights are all higher than this above the picture's plane carries a warning."""
+NARROW_DEG = 30.0
+"""A capture whose lights are all nearer than this to the camera axis carries a warning."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class ImageSummary:
         path: the file.
         shape: (H, W, C) as stored.
         dtype: as stored, such as "uint16".
-        bright: the 99 % quantile of the values, as a share of the white level (of floating-point images, as it is).
+        bright: the 99 % quantile of the values, as a share of the white level. For floating-point images, the
+            quantile itself.
         saturated: share of the pixels with a channel at the white level or above.
     """
 
@@ -49,7 +50,7 @@ class ImageSummary:
 
 @dataclass(frozen=True, eq=False)
 class CaptureSummary:
-    """What reading a capture found.
+    """Summary of a capture.
 
     Args:
         source: the capture.
@@ -64,9 +65,9 @@ class CaptureSummary:
     white_level: WhiteLevel | None
 
     @property
-    def elevations_deg(self) -> NDArray[np.float64]:
-        """Angles (F,) of the lights above the plane of the picture, 90 at the camera."""
-        degrees: NDArray[np.float64] = np.degrees(np.arcsin(self.source.light_directions[:, 2].clip(-1, 1)))
+    def axis_angles_deg(self) -> NDArray[np.float64]:
+        """Angles (F,) between the lights and the camera axis."""
+        degrees: NDArray[np.float64] = np.degrees(np.arccos(self.source.light_directions[:, 2].clip(-1, 1)))
         return degrees
 
     def warnings(self) -> list[CaptureWarning]:
@@ -84,7 +85,7 @@ class CaptureSummary:
             else capture_warnings.saturated_images(len(saturated), worst.path.name, worst.saturated),
             capture_warnings.dark_images(len(dark), dark[0].path.name, DARK) if dark else None,
             capture_warnings.few_lights(len(self.images)) if len(self.images) < FEW_LIGHTS else None,
-            capture_warnings.high_lights(90 - STEEP_DEG) if self.elevations_deg.min() > STEEP_DEG else None,
+            capture_warnings.high_lights(NARROW_DEG) if self.axis_angles_deg.max() < NARROW_DEG else None,
         ]
         return [*self.source.warnings, *(warning for warning in found if warning is not None)]
 
@@ -114,7 +115,7 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
                 stored.shape,
                 str(stored.dtype),
                 float(np.quantile(to_linear(pixels, path), 0.99)),
-                # Of an image of another size, which the finder does not take.
+                # This share is used if the image has another size, because the finder cannot take it.
                 float(find_saturated(pixels).mean()),
             )
         )

@@ -16,7 +16,7 @@ from splinecli.evaluation.protocol import Protocol, lights_value
 from splinecli.evaluation.statistics import compare
 
 SCHEMA = 1
-"""Number of the fields' meanings in results.json. It rises when a field changes its meaning."""
+"""Schema version of results.json. It rises when a field changes its meaning."""
 
 _DEGREE_DIGITS, _SECOND_DIGITS = 4, 4
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude

@@ -24,8 +24,8 @@ def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
     """Return a PNG of the error against the number of lights K, on a logarithmic axis.
 
     Each capture has a panel, and so has their average; with one capture, or more than MOST_CAPTURES, there is only the
-    panel of the average. "all" stands at the capture's number of lights, in the average at the mean number. Where the
-    light noise differs too, each of its values has its own dashes.
+    panel of the average. "all" is plotted at the capture's number of lights; in the panel of the average, at the
+    mean number. If the light noise differs too, each of its values has its own dashes.
     """
     return error_curves(
         _panels(

@@ -1,4 +1,4 @@
-"""Errors of light directions, as a careless calibration makes them."""
+"""Random errors of light directions, as from an inaccurate calibration."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class CaptureJob:
     def plan(
         cls, folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[Task]
     ) -> CaptureJob | None:
-        """Return the job of a capture. Returns None where no protocol can score it; the tasks then hold the reasons."""
+        """Return the job of a capture. Returns None if no protocol can score it; the tasks then contain the reasons."""
         try:
             source = open_capture(folder, white_level=tasks[0].protocol.white_level)
             stamp = stamp_capture(source)
@@ -144,7 +144,7 @@ class CaptureJob:
 
 
 def as_input_error(error: SplinecliError | OSError, folder: Path) -> SplinecliError:
-    """Return the error that names the file which the system refused to read; others as they are."""
+    """Convert a system error to an InputError that names the file. Return other errors unchanged."""
     if isinstance(error, SplinecliError):
         return error
     path = Path(error.filename) if error.filename else folder
@@ -170,8 +170,8 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     draws_file = read_draws(protocol.draws_file)
     if protocol.n_lights not in (None, draws_file.n_lights):
         raise UsageError(
-            f"{protocol.n_lights} lights a draw wanted,"
-            f" the draws in {draws_file.path} have {draws_file.n_lights}"
+            f"{protocol.n_lights} lights were requested, but the draws in {draws_file.path} have"
+            f" {draws_file.n_lights}"
         )
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
@@ -187,7 +187,7 @@ def draws_for(
     """
     if source.files.ground_truth is None:  # known before the images are read
         raise InputError(
-            "no ground truth, so nothing to score against",
+            "the capture has no ground truth",
             path=source.files.folder,
             hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
         )
@@ -196,8 +196,8 @@ def draws_for(
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)
     if skipped and left < fewest:
         raise UsageError(
-            f"{name}: {max(left, 0)} of {source.n_lights} images stay when the first {skipped} are left out,"
-            f" expected at least {fewest}"
+            f"{name}: {max(left, 0)} of {source.n_lights} images remain without the first {skipped}, expected at least"
+            f" {fewest}"
         )
     if draws_file is not None:
         draws_file.check_against(source.light_directions, skipped=skipped)

@@ -53,7 +53,7 @@ class Protocol:
                 f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}"
             )
         if self.max_pixels is not None and self.max_pixels < 1:
-            raise UsageError(f"at most {self.max_pixels} pixels to score, expected at least 1")
+            raise UsageError(f"--max-pixels is {self.max_pixels}; expected at least 1")
         for name, count in self.skip_first.items():
             if count < 0:
                 raise UsageError(f"{count} images of {name} to skip, expected a number from 0")

@@ -62,7 +62,7 @@ def evaluate_all(
     """
     check_methods(estimators)
     if not captures:
-        raise UsageError("nothing to score, expected at least one capture and one method")
+        raise UsageError("there is nothing to score: give at least one capture and one method")
     tasks = [Task.of(protocol) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
@@ -86,7 +86,7 @@ def evaluate_all(
 def check_methods(estimators: Sequence[Estimator]) -> None:
     """Raise UsageError where there are no estimators, or two have the same name."""
     if not estimators:
-        raise UsageError("nothing to score, expected at least one capture and one method")
+        raise UsageError("there is nothing to score: give at least one capture and one method")
     for method, count in Counter(estimator.name for estimator in estimators).items():
         if count > 1:
             raise UsageError(f"method {method} comes twice", hint="Name each method once")

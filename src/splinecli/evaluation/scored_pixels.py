@@ -20,7 +20,7 @@ def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 
         InputError: the capture has no ground truth.
     """
     if capture.ground_truth is None:
-        raise InputError(f"{capture.name}: no ground truth, so nothing to score against")
+        raise InputError(f"{capture.name}: the capture has no ground truth")
     rows = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
     if max_pixels is not None and len(rows) > max_pixels:
         generator = np.random.default_rng([PIXELS_STREAM, seed, len(rows)])

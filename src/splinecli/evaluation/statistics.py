@@ -3,7 +3,7 @@
 All methods see the same draws, and a draw that is hard for one method is usually hard for the others. The test
 therefore uses the differences trial by trial: a paired t-test (Student, Biometrika 1908), corrected for the number of
 pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979). The test covers the spread over draws
-only. A significant difference holds for other lights on this capture, not for other captures.
+only. A significant difference applies to other lights on this capture, not to other captures.
 """
 
 from __future__ import annotations

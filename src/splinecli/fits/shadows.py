@@ -7,8 +7,8 @@ from torch import Tensor
 
 UNSHADED = 0.6
 """The quantile of a pixel's observations that serves as the reference for its shadows. More than half of the
-observations may be shadows, and more than a third highlights. The largest observation is no good reference: beside the
-highlight of a metal, everything else is dark."""
+observations may be shadows, and more than a third highlights. The largest observation is a poor reference, because on
+a metal all others are dark beside the highlight."""
 
 FEWEST_LIT = 3
 """Number of brightest observations that never count as shadows, because a normal needs three."""

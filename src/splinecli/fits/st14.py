@@ -33,7 +33,10 @@ RANGE = 0.25
 """Divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible."""
 
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
-"""Order in which coefficients enter the model: that of (1 - n.h)^a (1 - l.h)^b is at 3 a + b. By degree, a first."""
+"""Order in which coefficients enter the model.
+
+Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b. Lower degrees come first; within a degree, those with larger a.
+"""
 
 FIRST_NOISE = 1e-3
 """Initial standard deviation of the noise, relative to the brightest kept observation."""

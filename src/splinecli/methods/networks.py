@@ -51,9 +51,9 @@ class NetworkEstimator:
     ) -> None:
         interpolates = loaded.network.config.interpolates
         if interpolates != (name == "spline-net"):
-            kind, fitting = ("both networks", "spline-net") if interpolates else ("one network", "cnn-ps")
+            kind, fitting = ("SPLINE-Net", "spline-net") if interpolates else ("CNN-PS", "cnn-ps")
             raise ModelError(
-                f"the weights {loaded.name!r} hold {kind}, so the method {name} cannot use them",
+                f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them",
                 hint=f"Use them with --method {fitting}",
             )
         if rotations < 1 or batch_size < 1:

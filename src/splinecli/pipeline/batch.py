@@ -31,12 +31,12 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one capture.
+    """Outcome of one capture.
 
     Args:
         capture: its name.
-        status: done, skipped (its results are still good), changed (they are not, and were kept), missing (there is
-            no such folder) or failed.
+        status: done, skipped (results are up to date), changed (results are out of date and were kept), missing
+            (there is no such folder) or failed.
         report: the report of the results, or the document {capture, error, exit_code}.
         exit_code: of this capture.
         trace: the Python traceback of an error that splinecli did not expect.

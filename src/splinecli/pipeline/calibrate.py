@@ -24,8 +24,8 @@ PICTURE, REPORT = "calibration.png", "calibration.json"
 OUTPUT_FILES = (DIRECTIONS, INTENSITIES, PICTURE, REPORT)
 
 DISPLAY_ENCODED = (
-    "The images of the gray target look display-encoded (JPEG, or PNG that says so), but they are read as linear"
-    " images. --transfer srgb reverses the curve of sRGB."
+    "The images of the gray target look display-encoded (JPEG, or PNG that says so), but are read as linear."
+    " Add --transfer srgb if they are sRGB."
 )
 
 
@@ -61,10 +61,10 @@ class CalibrateOptions:
         if self.gamma != 1 and not (self.gray_ball or self.gray_card):
             raise UsageError(
                 "--transfer needs --gray-ball or --gray-card",
-                hint="Leave it out: mirror balls give the same directions for any curve",
+                hint="Leave it out: the light directions do not depend on the curve",
             )
         if self.gray_ball and self.gray_card:
-            raise UsageError("--gray-ball and --gray-card exclude each other")
+            raise UsageError("--gray-ball and --gray-card contradict each other", hint="Leave one out")
         for option, values in (("--circle", self.circles), ("--mask", self.masks)):
             if values and len(values) != len(self.balls):
                 times = "once" if len(values) == 1 else f"{len(values)} times"
@@ -116,6 +116,8 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
     _write(options.output, lights, intensities, report)
     for line in summary_lines(report):
         observer.say(line)
+    if intensities is not None:
+        observer.say(f"The light intensities are in {options.output / INTENSITIES}")
     for warning in report["warnings"]:
         observer.warn(warning)
     return report

@@ -176,14 +176,16 @@ def _make_estimators(options: EvaluateOptions) -> list[Estimator]:
 
 
 def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> None:
-    """Raise UsageError where more lights are wanted than any capture has."""
+    """Raise UsageError if more lights are requested than any capture has."""
     most = 0
     for capture in captures:
         with suppress(InputError, OSError):  # the evaluation skips the capture and says why
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
-            raise UsageError(f"{protocol.n_lights} lights wanted, the captures have at most {most}")
+            raise UsageError(
+                f"{protocol.n_lights} lights were requested, but the captures have at most {most}"
+            )
 
 
 def _default_jobs(estimators: Sequence[Estimator]) -> int:

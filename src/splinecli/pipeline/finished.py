@@ -14,10 +14,13 @@ from splinecli.pipeline.infer_options import InferOptions
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
 
+_SINGULAR = {"formats": "format"}
+"""Fields of InferOptions whose option has another name."""
+
 
 @dataclass(frozen=True)
 class EarlierResults:
-    """What a folder of results holds before a run.
+    """What a folder of results contains before a run.
 
     Args:
         report: the report in the folder if these results are still good, else None.
@@ -44,17 +47,17 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
             return EarlierResults()
         # A report of another version may have other options, but it is one of ours.
         if found != REPORT and not (target / REPORT).is_file():
-            return EarlierResults(changed=f"holds {found}, but no {REPORT}", ours=False)
-        return EarlierResults(changed="holds results of another version")
+            return EarlierResults(changed=f"contains {found}, but no {REPORT}", ours=False)
+        return EarlierResults(changed="contains results made by another version")
     if version != __version__:
-        return EarlierResults(changed=f"holds results of version {version}")
+        return EarlierResults(changed=f"contains results made by version {version}")
     if earlier != options:
-        return EarlierResults(changed=f"holds results of other options ({_differences(earlier, options)})")
+        return EarlierResults(changed=f"contains results made with {_differences(earlier, options)}")
     missing = [name for name in names if not (target / name).is_file()]
     if missing:
-        return EarlierResults(changed=f"holds results without {missing[0]}")
+        return EarlierResults(changed=f"contains earlier results, but {missing[0]} is missing")
     if stamp != inputs_sha256(options.open(folder), options.weights):
-        return EarlierResults(changed="holds results of other input files")
+        return EarlierResults(changed="contains results made from other input files")
     return EarlierResults(report)
 
 
@@ -68,8 +71,10 @@ def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
 
 
 def _differences(earlier: InferOptions, options: InferOptions) -> str:
-    return ", ".join(
-        option.name
+    """Return words for the options that differ, such as "another --method"."""
+    names = [
+        "--" + _SINGULAR.get(option.name, option.name).replace("_", "-")
         for option in fields(options)
         if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
-    )
+    ]
+    return f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"

@@ -103,7 +103,7 @@ class InferOptions:
             _check_one_of("map", name, MAPS)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the options as values that JSON can hold."""
+        """Return the options as JSON values."""
         return {
             name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()
         }
@@ -122,7 +122,7 @@ class InferOptions:
         return MethodOptions(self.weights, self.rotations, self.batch_size, self.device, self.precision)
 
     def check_files(self) -> None:
-        """Raise InputError if a file that the options name does not exist, or --flat-field holds no images."""
+        """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
         from splinecli.capture.reader import EQUAL
 
         intensities = None if self.intensities == EQUAL else self.intensities

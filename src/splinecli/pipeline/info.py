@@ -109,20 +109,21 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         f" {types.get(kind['type'], kind['type'])}"
         for kind in report["image_kinds"]
     )
-    low, high = report["elevation_deg"]
+    nearest, farthest = report["axis_angle_deg"]
     exposure, level = report["exposure"], report["white_level"]
     dark, bright = exposure["bright"]
     rows = [
         ("capture", f"{report['capture']} ({report['layout']})"),
-        ("images", f"{report['images']}: {kinds}"),
-        ("lights", f"{report['light_directions']}, {low:.0f} to {high:.0f} degrees above the image plane"),
+        ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
+        ("lights", f"{report['light_directions']}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
         ("intensities", report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"),
         ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
         ("ground truth", report["ground_truth"] or "none"),
         ("white level", f"{level['value']:g}, {ORIGINS[level['origin']]}" if level else "none: floating-point"),
         ("exposure", f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of the white level, at most"
                      f" {100 * exposure['saturated']:.1f} % of an image saturated"),
-        ("expect", f"{report['expect']['memory_mib']} MiB, about {report['expect']['seconds']} s on a laptop"),
+        ("expect", f"{report['expect']['memory_mib']} MiB of memory and about {report['expect']['seconds']} s"
+                   " on a laptop"),
     ]  # fmt: skip
     return [f"{name:13}{text}" for name, text in rows]
 
@@ -143,7 +144,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
     kinds = sorted(
         {(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images}
     )
-    elevations, bright = summary.elevations_deg, [image.bright for image in summary.images]
+    angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
     if intensities is None and (source.light_intensities != 1).any():
         intensities = files.light_directions  # the light files of AliceVision have both
@@ -151,6 +152,8 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         "capture": files.name,
         "layout": files.layout,
         "images": len(summary.images),
+        "first_image": summary.images[0].path.name,
+        "last_image": summary.images[-1].path.name,
         "image_kinds": [
             {"size": [width, height], "channels": channels, "type": dtype}
             for width, height, channels, dtype in kinds
@@ -160,7 +163,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         "light_intensities": None if intensities is None else str(intensities),
         "mask": None if files.mask is None else str(files.mask),
         "ground_truth": None if files.ground_truth is None else str(files.ground_truth),
-        "elevation_deg": [round(float(elevations.min()), 1), round(float(elevations.max()), 1)],
+        "axis_angle_deg": [round(float(angles.min()), 1), round(float(angles.max()), 1)],
         "white_level": None if level is None else {"value": level.value, "origin": level.origin},
         "exposure": {
             "bright": [round(min(bright), 4), round(max(bright), 4)],

@@ -57,7 +57,7 @@ class PixelSetSource:
     """Draws pixels of some entries of a set, all with the same probability, under newly drawn lights.
 
     As in CNN-PS (Ikehata, ECCV 2018), the lights of a pixel are drawn within a cone about the view axis. Its
-    half-angle is random, U(20, 90) degrees. Where the cone holds too few lights, the closest others join them.
+    half-angle is random, U(20, 90) degrees. If the cone contains too few lights, the closest others are added.
 
     Args:
         pixel_set: the set.

@@ -105,7 +105,7 @@ class PixelSetWriter:
             checksums = {array: file_sha256(work / f"{array}.npy") for array in ARRAYS}
             work.chmod(0o777 & ~current_umask())
             if self._entries.pop(name, None):
-                # From here the manifest must not promise the earlier entry.
+                # Remove the earlier entry from the manifest before its files are replaced.
                 self._write_manifest(complete=False)
             if folder.exists():
                 shutil.rmtree(folder)

@@ -8,7 +8,7 @@ camera of focal length f. The normal n of a pixel fixes how h changes towards th
 Here r is the ray through the pixel, scaled to z = -1, and dr its change to the neighbour. Orthographic rays are all
 (0, 0, -1), and f dr is one pixel.
 
-Away from edges, the equation of a pixel holds towards both its neighbours on an axis. At an edge it holds towards one
+Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it applies to one
 of them. The method therefore weights the squared residual towards each side by
 
     sigmoid(stiffness * facing^2 * (gap towards the other side^2 - gap towards this side^2)).

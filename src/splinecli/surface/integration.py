@@ -1,4 +1,4 @@
-"""Bilateral normal integration: heights from normals, with discontinuities at the edges of things.
+"""Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022. `bilateral_equations` has the
 equations, `laplacian` the linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).

@@ -62,7 +62,7 @@ class DenseMap(NamedTuple):
 
 
 class PixelTruth(Protocol):
-    """What is known of P pixels beside their observations."""
+    """The true normals and dense maps of P pixels."""
 
     @property
     def normals(self) -> Tensor:

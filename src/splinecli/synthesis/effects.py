@@ -33,7 +33,7 @@ class Wall:
         facing: (P, 3), the wall's normal.
         reflectance: (P, 1), share of the light on the wall that reaches the pixel.
         towards: (P, 3), unit vector to the part of the wall that reflects.
-        same: (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte.
+        has_pixel_material: (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte.
     """
 
     azimuth: Tensor
@@ -43,7 +43,7 @@ class Wall:
     facing: Tensor
     reflectance: Tensor
     towards: Tensor
-    same: Tensor
+    has_pixel_material: Tensor
 
     def visibility(self, directions: Tensor) -> Tensor:
         """Return the share of each light that passes the wall (P, D): a cast shadow over one sector of the map.
@@ -68,7 +68,7 @@ class Wall:
         returned = directions.new_zeros(len(normals), directions.shape[-2])
         facing_cosine = -dot(self.facing, self.towards[:, None])
         for same in (False, True):
-            pixels = ((self.reflectance[:, 0] > 0) & (self.same[:, 0] == same)).nonzero()[:, 0]
+            pixels = ((self.reflectance[:, 0] > 0) & (self.has_pixel_material[:, 0] == same)).nonzero()[:, 0]
             if not len(pixels):
                 continue
             lights = directions if directions.ndim == 2 else directions[pixels]
@@ -94,7 +94,7 @@ class Wall:
             rotate_about_view_axis(self.facing, cosine, sine),
             self.reflectance,
             rotate_about_view_axis(self.towards, cosine, sine),
-            self.same,
+            self.has_pixel_material,
         )
 
 
@@ -142,7 +142,7 @@ def draw_wall(
         facing=-toward * lean.cos() + up * lean.sin(),
         reflectance=reflectance if interreflections else torch.zeros_like(reflectance),
         towards=toward * elevation.cos() + up * elevation.sin(),
-        same=same,
+        has_pixel_material=same,
     )
 
 

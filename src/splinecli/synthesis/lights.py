@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: torch.Generator) -> Tensor:
-    """Draw the number of lights of each pixel (P,). The numbers of one draw differ by a fifth, to save padding.
+    """Draw the number of lights of each pixel (P,). Within a draw they differ by at most a fifth.
 
     Each draw has a largest number. For half of the draws it is usual - 1 to usual + 2, else it is log-uniform over
-    low..high. The pixels have four fifths of that number or more.
+    low..high. The pixels have four fifths of that number or more, which saves padding.
     """
     device = generator.device
 
@@ -30,7 +30,7 @@ def draw_light_directions(pixels: int, lights: int, generator: torch.Generator) 
 
     The lights of a rig fill an ellipse in the (x, y) disc uniformly, by projected area. One half-axis is sin U(20, 88)
     degrees, the other U(0.5, 1) of it, and the ellipse is turned at random. The centre of half of the rigs is moved by
-    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp held above. Lights outside 0.996 of the
+    up to 0.35 (1 - 0.6 half-axis), as on a copy stand, a shelf, or with a lamp above. Lights outside 0.996 of the
     disc are moved to its rim.
     """
     device = generator.device

@@ -58,9 +58,9 @@ class MeasuredLibrary:
     def draw(self, pixels: int, generator: torch.Generator) -> MeasuredMaterial:
         """Draw materials uniformly from the library and vary their gray value and brightness.
 
-        The gray value is a random mix of the three channels, as another camera, light or pigment would give. The
+        The gray value is a random mix of the three channels. This imitates other cameras, lights and pigments. The
         weights are uniform over all that sum to 1. The scale is 2^U(-1, 1.5), because the whites of MERL reflect at
-        most a third of the light. It is limited so that no direction's light is reflected by more than 100 %.
+        most a third of the light. It is limited so that no material reflects more light than it receives.
         """
         device = self.albedos.device
         index = torch.randint(len(self.names), (pixels,), generator=generator, device=device)
@@ -118,8 +118,8 @@ def half_and_difference(n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Te
     The azimuth of the half vector is 0. Its y is not needed and is set to 1, the factor of the biases. The difference
     vector is the light direction after the rotation that brings the half vector to the z axis. An isotropic,
     reciprocal BRDF does not change when light and view, or left and right, are exchanged. So x <= 0 <= y is chosen:
-    the less grazing direction is taken as the light, because the training of the networks weighted errors by the
-    light's cosine.
+    of light and view, the direction nearer to the normal is used as the light, because the training of the networks
+    weighted errors by the light's cosine.
 
     Args:
         n_dot_l, n_dot_v, l_dot_v: cosines between normal, light and view, (P, D).

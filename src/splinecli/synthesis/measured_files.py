@@ -29,7 +29,7 @@ _LAYERS = ("W1", "b1", "W2", "b2", "W3", "b3")
 def read_measured(path: str | Path, device: torch.device | str = "cpu") -> MeasuredLibrary:
     """Read the plausible materials of a file (docs/files-and-frames.md), in float32 on `device`.
 
-    A material is left out, and named in `dropped`, if one of these holds:
+    A material is left out, and named in `dropped`, if one of these is true:
 
     - It reflects more than BRIGHTEST of the light from one direction, or a value is not finite.
     - Exchanging light and view changes the BRDF, |a - b| / (a + b), by more than MOST_ASYMMETRIC. This is the median

@@ -1,7 +1,7 @@
 """The principled BRDF (Burley, "Physically Based Shading at Disney", SIGGRAPH 2012) for pixels seen from +z.
 
-Isotropic and gray: a pixel's observation is the mean of its colour channels and the model is all but linear
-in the base colour, so one channel is enough. Every parameter is a tensor (P, 1).
+The BRDF is isotropic and gray. A pixel's observation is the mean of its colour channels, and the model is nearly
+linear in the base colour, so one channel is enough. Every parameter is a tensor (P, 1).
 
 As in Disney's own later code, Smith's shadowing takes the roughness as it is, without the remapping of 2012;
 and the lobe is never narrower than at roughness 0.1, which float32 still resolves.
@@ -26,8 +26,8 @@ class PrincipledMaterial:
         out, as through the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
     minnaert: kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): under 1 it is flat
         as on dust, over 1 steep as on marble.
-    tail_exponent: gamma of the highlight's distribution, generalised Trowbridge-Reitz, over 1 and up to 2, which is
-        GGX. The tails grow as gamma falls.
+    tail_exponent: gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2 is
+        GGX; smaller values give longer tails.
     """
 
     base: Tensor
@@ -127,23 +127,23 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
 
 
 def schlick_weight(cosine: Tensor) -> Tensor:
-    """(1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel approximation."""
+    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel approximation."""
     complement = (1 - cosine).clamp(0, 1)
     square = complement * complement
     return square * square * complement
 
 
 def _power(base: Tensor, exponent: Tensor) -> Tensor:
-    """base^exponent for base > 0: faster than torch.pow, and as good for pictures."""
+    """Return base^exponent for base > 0, faster than torch.pow and accurate enough for images."""
     return (base.log() * exponent).exp()
 
 
 def _tail_norm(alpha_squared: Tensor, gamma: Tensor) -> Tensor:
-    """pi times the factor that makes 1 / (1 + (a^2 - 1) (n.h)^2)^gamma a distribution of facets; a^2 at gamma = 2."""
+    """Return pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at gamma = 2."""
     alpha_squared = alpha_squared.clamp(max=0.999)
     return (gamma - 1) * (1 - alpha_squared) / (alpha_squared ** (1 - gamma) - 1)
 
 
 def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 - a^2)(n.x)^2))."""
+    """Return Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 - a^2)(n.x)^2))."""
     return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())

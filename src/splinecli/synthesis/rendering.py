@@ -7,8 +7,8 @@ Indirect light is gathered along random paths that start at the samples (Kajiya,
 lights illuminate each vertex of a path at once. Visibility does not depend on the material, so paths and shadows are
 traced once for all materials.
 
-Two approximations reduce noise, because caustics would otherwise appear as single bright pixels. First, at the ends of
-indirect light, reflectances are no sharper than roughness SOFTEST (path space regularization, Kaplanyan & Dachsbacher
+Two approximations reduce noise, because caustics would otherwise appear as single bright pixels. First, surfaces
+that emit or receive indirect light have at least roughness SOFTEST (path space regularization, Kaplanyan & Dachsbacher
 2013). Second, shadows beyond the first surface are those of the nearest vertex.
 """
 
@@ -221,7 +221,10 @@ def _gather(
 def _thin_out(
     vertices: _Vertices, weights: dict[str, Tensor], full: float, generator: torch.Generator
 ) -> tuple[_Vertices, dict[str, Tensor]]:
-    """Play Russian roulette: a path survives with the share that is left of its weight, in the best material."""
+    """Play Russian roulette.
+
+    A path survives with a probability equal to its remaining weight in the brightest material.
+    """
     left = torch.stack(list(weights.values())).amax(dim=0)[:, 0] / full
     chance = left.clamp(0.0, 1.0)
     rows = (torch.rand(len(chance), generator=generator) < chance).nonzero()[:, 0]

@@ -184,7 +184,7 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
 
 
 def draw_vessel(rng: np.random.Generator) -> Mesh | None:
-    """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees; half may have further solids."""
+    """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees. Up to half get further solids."""
     half_height = rng.uniform(0.3, 0.75)
     wall = np.float32(rng.uniform(0.05, 0.12))
     profile = _draw_profile(rng)

@@ -1,6 +1,7 @@
 """Checkpoints: one safetensors file from which a run continues exactly where it stopped.
 
-A checkpoint holds no state of a random generator. The draws of a step follow from the seed and the step number alone.
+A checkpoint contains no state of a random generator. The draws of a step follow from the seed and the step number
+alone.
 """
 
 from __future__ import annotations

@@ -24,16 +24,16 @@ class TrainingConfig:
         start_from: name or file of the weights that the run starts from; empty for random ones.
         held_share: share of the scenes of a pixel set that is for validation.
         batch_size: pixels a step.
-        shards: parts of a batch. Each has its own random stream and about one number of lights. The number of
-            processes must divide it.
+        shards: number of parts of a batch. The pixels of a shard come from one random stream and have nearly equal
+            numbers of lights. The number of processes must divide it.
         updates: "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates`
             steps for NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and
             trains the error head alone.
         learning_rate: the highest rate. It rises over `warmup_steps` and then falls.
         schedule: "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth
             for the last tenth of the run.
-        steps, minutes: the length of the run. minutes counts where it is above 0.
-        beta1, beta2, weight_decay: settings of AdamW, which is Adam where weight_decay is 0.
+        steps, minutes: the length of the run. If minutes is above 0, it replaces steps.
+        beta1, beta2, weight_decay: settings of AdamW. With weight_decay = 0, AdamW is Adam.
         gradient_limit: largest norm of the gradient; 0 for none.
         average_decay: decay of the running average of the weights, which is saved; 0 for none.
         turn_jitter_deg: canonical networks see each pixel turned by up to this angle, either way, and half of the

@@ -148,7 +148,7 @@ def configure_resumed(
     else:
         asked = configure(preset_name, file, changes)
     old, new = _flat(started.to_dict()), _flat(asked.to_dict())
-    # In the order of the configuration, where the most telling settings, such as the network's size, come first.
+    # In the order of the configuration, where the most important settings, such as the network's size, come first.
     for name in [*new, *(name for name in old if name not in new)]:
         if name not in CHANGEABLE and old.get(name) != new.get(name):
             raise ModelError(

@@ -96,7 +96,7 @@ class Trainer:
         validation_generator.manual_seed(stream_seed(config.seed, 0, _VALIDATION_STREAM))
         if not resume and (folder / CHECKPOINT).exists():
             raise OutputError(
-                "holds a run already", path=folder, hint="Go on with --resume, or choose another -o"
+                "already contains a run", path=folder, hint="Continue it with --resume, or choose another -o"
             )
         sources = open_sources(config, self.generator, validation_generator)
         self.source = sources.training

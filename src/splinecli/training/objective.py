@@ -63,11 +63,12 @@ def compute_losses(
     mirrored: bool = False,
     bfloat16: bool = False,
 ) -> Losses:
-    """The losses of the paper, eqs. 5 and 8 as field by field in docs/train.md.
+    """Compute the losses of a batch (eqs. 5 and 8 of the paper; docs/train.md lists the terms).
 
     LI-Net: arccos(n . n_gt) + |D - D_gt| + |M_s o (D - D_gt)| + lambda_s Ls(D, n_gt) + lambda_a La(D, n_gt);
-    NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). Where both are updated, the sum,
-    with the angle once. The loss of the error head is minus the log-likelihood of the angle.
+    NE-Net: arccos(n . n_gt) + lambda_s Ls(D_gt, n) + lambda_a La(D_gt, n). If both networks
+    are updated, the losses are added and the angle counts once. The loss of the error head is minus the log-likelihood
+    of the angle.
     """
     maps = network.build_maps(
         batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored)

@@ -19,7 +19,7 @@ from splinecli.training.config import GENERATOR, TrainingConfig
 
 
 class PixelSource(Protocol):
-    """Draws batches of pixels. The state of its generator decides what it draws."""
+    """Draws batches of pixels. Its random generator determines the batches."""
 
     def draw(self, pixels: int) -> PixelBatch:
         """Draw a batch of P pixels."""
@@ -125,7 +125,7 @@ def open_sources(
 def _split_sets(sets: dict[str, PixelSet], share: float) -> dict[str, tuple[list[Entry], list[Entry]]]:
     """Return training and validation entries of each set, where no shape is in both.
 
-    Two sets may hold the same shape. A shape that one of them uses for validation is then not trained on at all.
+    Two sets may contain the same shape. A shape that one of them uses for validation is not used for training.
     """
     parts = {name: split_scenes(pixel_set.entries, share) for name, pixel_set in sets.items()}
     shapes = {entry.sha256["normals"] for _, validation in parts.values() for entry in validation}

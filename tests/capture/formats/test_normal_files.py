@@ -158,7 +158,7 @@ def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArra
 
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="holds no array of numbers"):
+    with pytest.raises(InputError, match="contains no array of numbers"):
         read_normals(tmp_path / "a.npy", SHAPE, MASK)
 
 

@@ -135,12 +135,19 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         find_capture_files(tmp_path / "empty")
     assert str(caught.value) == (
-        f"{tmp_path / 'empty'}: the folder holds no images. PNG, TIFF, JPEG and RAW files count as images."
+        f"{tmp_path / 'empty'}: the folder contains no images. PNG, TIFF, JPEG and RAW files count as images."
+    )
+    fill(tmp_path / "dataset", "b/a.png", "b/lights.txt", "a/a.png", "a/lights.txt")
+    with pytest.raises(InputError) as caught:
+        find_capture_files(tmp_path / "dataset")
+    assert str(caught.value) == (
+        f"{tmp_path / 'dataset'}: the folder contains no images."
+        f" There are captures in {tmp_path / 'dataset'}, such as {tmp_path / 'dataset' / 'a'}: give these."
     )
     with pytest.raises(InputError) as caught:
         find_capture_files(tmp_path / "dark")
     assert str(caught.value) == (
-        f"{tmp_path / 'dark'}: the folder holds 2 images but no light file"
+        f"{tmp_path / 'dark'}: the folder contains 2 images but no light file"
         " (light_directions.txt, lights.txt, *.lp or lights.json)."
         " Pass --lights FILE, with one line x y z for each image."
         " 'splinecli calibrate' makes the file from images of a mirror ball."
@@ -214,7 +221,7 @@ def test_psbox_without_images(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         find_capture_files(folder)
     assert str(caught.value) == (
-        f"{folder / 'Objects'}: the folder holds no images. PNG, TIFF, JPEG and RAW files count as images."
+        f"{folder / 'Objects'}: the folder contains no images. PNG, TIFF, JPEG and RAW files count as images."
     )
 
 

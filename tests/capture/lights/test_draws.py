@@ -88,10 +88,10 @@ def test_no_draw_without_a_plane_is_an_error() -> None:
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [
-        ({"n_lights": 2}, "2 lights wanted, expected at least 3."),
-        ({"n_lights": 97}, "97 lights wanted, the capture has 96. Ask for at most 96 lights."),
-        ({"n_lights": 10, "trials": 0}, "0 trials wanted, expected at least 1."),
-        ({"n_lights": 10, "seed": -1}, "the seed is -1, expected a whole number from 0."),
+        ({"n_lights": 2}, "--n-lights is 2; expected at least 3."),
+        ({"n_lights": 97}, "97 lights were requested, but the capture has 96. Ask for at most 96 lights."),
+        ({"n_lights": 10, "trials": 0}, "--trials is 0; expected at least 1."),
+        ({"n_lights": 10, "seed": -1}, "--seed is -1; expected a whole number from 0."),
     ],
 )
 def test_what_cannot_be_drawn(wanted: dict[str, int], message: str) -> None:
@@ -122,7 +122,7 @@ def test_a_draws_file(tmp_path: Path) -> None:
         ("0 1 2\n4 5 4", ":2: light index 4 comes twice. Name each light once."),
         ("# two\n0 1", ":2: found 2 light indices, expected at least 3."),
         ("0 1 2\n0 1 2 3", ":2: found 4 light indices, expected 3 as in the first draw."),
-        ("# nothing\n", ": the file holds no draws, expected a line of light indices for each."),
+        ("# nothing\n", ": the file contains no draws, expected a line of light indices for each."),
     ],
 )
 def test_a_wrong_draws_file(tmp_path: Path, text: str, problem: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -101,11 +102,30 @@ def test_directions_round_trip(
             1,
             "found 6 columns, expected 3 (x y z). A comma separates columns; write decimals with a point.",
         ),
+        (
+            "0.1 0.2 1\n0,1 0,2 1\n0.1 0.2 1",
+            None,
+            2,
+            "found 5 columns, expected 3 as in the other lines."
+            " A comma separates columns; write decimals with a point.",
+        ),
+        (
+            "0.1 0.2 1\n0.1,0.2,0.3,1\n0.1 0.2 1",
+            None,
+            2,
+            "found 4 columns, expected 3 as in the other lines.",
+        ),
         ("# lights\n0 0 1\n0 one 1", None, 3, 'found "one", expected a number.'),
         ("0 0 1\n0 1_0 1", None, 2, 'found "1_0", expected a number.'),
         ("0 0 1\n0 nan 1", None, 2, 'found "nan", expected a finite number.'),
         ("0 0 1\n0 1e999 1", None, 2, 'found "1e999", expected a finite number.'),
-        ("0 0 1\n0 0 0", None, 2, "found a zero vector, expected a light direction."),
+        (
+            "0 0 1\n0 0 0",
+            None,
+            2,
+            "found a zero vector, expected a light direction."
+            " Write x y z towards the light, or remove the line and its image.",
+        ),
         (
             "0 0 1\n0 1 -0.5",
             None,
@@ -134,8 +154,8 @@ def test_directions_round_trip(
             "found 3 light directions, expected 5, one for each image."
             " The file needs one line for each image, in the order of the images.",
         ),
-        ("", None, None, "the file holds no numbers."),
-        ("# nothing\n", None, None, "the file holds no numbers."),
+        ("", None, None, "the file contains no numbers."),
+        ("# nothing\n", None, None, "the file contains no numbers."),
     ],
 )
 def test_wrong_directions(
@@ -152,10 +172,17 @@ def test_wrong_directions(
 def test_files_that_are_no_text(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.txt: the file does not exist\."):
         read_light_directions(tmp_path / "none.txt")
-    with pytest.raises(InputError, match=r"found a folder, expected a text file\."):
+    with pytest.raises(InputError, match=r"found a folder, expected a text file with a line x y z for"):
         read_light_directions(tmp_path)
     with pytest.raises(InputError, match=r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."):
         read_light_directions(write(tmp_path, "0 0 1", encoding="utf-16"))
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((3, 3), np.uint8))
+    with pytest.raises(
+        InputError, match=r"found an image, expected a text file with a line x y z for each image\."
+    ):
+        read_light_directions(tmp_path / "mask.png")
+    with pytest.raises(InputError, match=r"expected a text file with a line r g b for each image\."):
+        read_light_intensities(tmp_path / "mask.png", 3)
 
 
 @pytest.mark.parametrize(

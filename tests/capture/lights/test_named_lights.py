@@ -144,7 +144,7 @@ def test_a_folder_with_an_lp_file_is_a_capture(write_folder: WriteFolder) -> Non
         ("", "the file is empty, expected the number of lights on the first line"),
         ("many\na.png 0 0 1", '1: found "many", expected the number of lights'),
         (f"6\n{rows(NAMES)}", "1: the first line says 6 lights, but 5 lines follow"),
-        ("0\n", "1: the file holds no lights"),
+        ("0\n", "1: the file contains no lights"),
         ("1\n0 0 1", '2: found "0 0 1", expected a file name and x y z'),
         ("1\na.png 0 zero 1", '2: found "zero", expected a number'),
         ("1\na.png 0 0 0", "2: found a zero vector, expected a light direction"),

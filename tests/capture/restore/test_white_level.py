@@ -156,8 +156,7 @@ def test_a_given_level_is_used_as_it_is() -> None:
     with pytest.raises(InputError) as caught:
         find(images.astype(np.uint8), given=4095)
     assert str(caught.value) == (
-        "0.png: found uint8 pixels, which end at 255, expected the white level 4095 or more."
-        " Lower the white level, or leave it out."
+        "0.png: the white level is 4095, but 8-bit pixels end at 255. Lower the white level, or leave it out."
     )
 
 

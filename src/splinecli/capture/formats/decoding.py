@@ -152,7 +152,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
 
 @contextmanager
 def native_stderr() -> Iterator[list[str]]:
-    """Catch what C libraries print to stderr; after the block, the list holds it.
+    """Catch what C libraries print to stderr; after the block, the list contains it.
 
     This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
     around decoding.

@@ -13,8 +13,13 @@ _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_SAMPLE_VALUE, _WHITE_LEVEL = 281, 50717  # tags of TIFF and DNG
 
 
+def is_image(content: bytes) -> bool:
+    """Return whether the content of a file begins as PNG, JPEG or TIFF."""
+    return content.startswith((_PNG, _JPEG, *_TIFF))
+
+
 def is_display_encoded(path: Path) -> bool:
-    """Whether the file itself says that its values are meant for a screen: JPEG, or PNG with a chunk sRGB or gAMA.
+    """Return whether the file says that its values are display-encoded: JPEG, or PNG with a chunk sRGB or gAMA.
 
     Raises:
         InputError: the file cannot be read.
@@ -64,7 +69,7 @@ def _stated(path: Path) -> int | None:
 
 
 def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """Yield name and content of the chunks before a PNG's pixels, from a file that stands behind the signature."""
+    """Yield name and content of the chunks before a PNG's pixels, from a file positioned after the signature."""
     while len(header := file.read(8)) == 8 and header[4:] not in (b"IDAT", b"IEND"):
         length = int.from_bytes(header[:4], "big")
         # Those of interest are short; others, such as profiles, may be long.

@@ -20,7 +20,7 @@ def read_image(path: StrPath) -> NDArray[np.float32]:
     are kept. Alpha is dropped, and an EXIF orientation is ignored.
 
     Raises:
-        InputError: the file is missing, of another format, truncated or damaged, or holds floating-point
+        InputError: the file is missing, of another format, truncated or damaged, or contains floating-point
             values that are negative or not finite.
     """
     return to_linear(decode_image(Path(path)), Path(path))
@@ -32,7 +32,7 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     Raises:
         InputError: a floating-point value is negative or not finite.
     """
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused below
         values = stored.astype(np.float32)
     if stored.dtype.kind == "u":
         values /= np.float32(np.iinfo(stored.dtype).max)

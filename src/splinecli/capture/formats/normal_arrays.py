@@ -44,7 +44,7 @@ def read_vectors(path: Path, *, text_shape: tuple[int, int] | None = None) -> St
         text_shape: (H, W), which text files do not state; None to take no text.
 
     Raises:
-        InputError: the file cannot be read, or holds no array H x W x 3.
+        InputError: the file cannot be read, or contains no array H x W x 3.
     """
     alpha = None
     suffix = path.suffix.lower()
@@ -104,7 +104,7 @@ def _read_npy(file: Any, path: Path) -> NDArray[Any]:
         # Not np.load, which also opens archives.
         array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
     except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
-        raise InputError("the .npy file is damaged, or holds no array of numbers", path=path) from None
+        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
     return array
 
 

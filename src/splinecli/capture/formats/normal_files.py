@@ -5,7 +5,8 @@ Frame: x right, y up, z to the camera. A file is one of
 - MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array;
 - .npy: unsigned integers are a picture;
 - .txt: H*W rows of x y z in row-major order, for ground truth only;
-- a picture: n = 2 v / full scale - 1, black or mid-gray where there is no normal; floating-point TIFF holds n itself.
+- a picture: n = 2 v / full scale - 1, black or mid-gray where there is no normal; a floating-point TIFF contains n
+  itself.
 
 Vectors are scaled to unit length. Zero and non-finite vectors are no normals.
 """
@@ -43,7 +44,7 @@ def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | None = None) -> NDA
             too.
 
     Raises:
-        InputError: the file cannot be read, holds no normal map, or is not of the mask's size.
+        InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
     """
     path = Path(path)
     _check_file(path, "normal map")
@@ -146,7 +147,7 @@ def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) ->
 
 
 def _is_upside_down(stored: NDArray[Any], mask: NDArray[np.bool_]) -> bool:
-    """Whether vectors (H, W, 3) fill the mask clearly better when their rows are taken from the bottom up."""
+    """Return whether vectors (H, W, 3) fill the mask clearly better when their rows are taken from the bottom up."""
     filled = (stored != 0).any(axis=2)
     as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
     return bool(turned - as_stored > _CLEARLY_BETTER * np.count_nonzero(mask))

@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.header import is_image
 from splinecli.errors import InputError
 
 _SEPARATORS = re.compile(r"[\s,;]+")
+
+DECIMAL_POINT = "A comma separates columns; write decimals with a point"
+"""Hint for a line with decimal commas."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +42,13 @@ class NumberRows:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
         lengths = [len(row) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
-        for row, line in zip(self.rows, self.lines, strict=True):
+        for row, line, text in zip(self.rows, self.lines, self.texts, strict=True):
             if len(row) != usual:
                 raise InputError(
                     f"found {columns(len(row))}, expected {usual} as in the other lines",
                     path=self.path,
                     line=line,
+                    hint=DECIMAL_POINT if len(row) > usual and has_decimal_commas(text) else None,
                 )
         return np.array(self.rows, np.float64)
 
@@ -53,19 +58,27 @@ def columns(count: int) -> str:
     return f"{count} column" + ("" if count == 1 else "s")
 
 
-def read_lines(path: Path, *, else_latin_1: bool = False) -> list[str]:
+def has_decimal_commas(text: str) -> bool:
+    """Return whether a line looks like numbers with decimal commas, such as "0,5 0,3 0,8"."""
+    return "." not in text and re.search(r"\d,\d", text) is not None and re.search(r"[\s;]", text) is not None
+
+
+def read_lines(path: Path, *, else_latin_1: bool = False, expected: str = "a text file") -> list[str]:
     """Return the lines of a UTF-8 file, with or without a byte order mark. Raises InputError.
 
     Args:
         else_latin_1: whether a file that is not UTF-8 is read as Latin-1, which older programs on Windows write.
+        expected: what the file should be, for messages.
     """
     try:
         return path.read_text(encoding="utf-8-sig").split("\n")
     except FileNotFoundError:
         raise InputError("the file does not exist", path=path) from None
     except IsADirectoryError:
-        raise InputError("found a folder, expected a text file", path=path) from None
+        raise InputError(f"found a folder, expected {expected}", path=path) from None
     except UnicodeDecodeError:
+        if is_image(path.read_bytes()):
+            raise InputError(f"found an image, expected {expected}", path=path) from None
         if else_latin_1:
             return path.read_text(encoding="latin-1").split("\n")
         raise InputError(
@@ -75,14 +88,16 @@ def read_lines(path: Path, *, else_latin_1: bool = False) -> list[str]:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
 
 
-def read_number_rows(path: Path) -> NumberRows:
+def read_number_rows(path: Path, *, expected: str = "a text file") -> NumberRows:
     """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
+
+    `expected` says in messages what the file should be.
 
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
     rows, lines, texts = [], [], []
-    for line, text in enumerate(read_lines(path), start=1):
+    for line, text in enumerate(read_lines(path, expected=expected), start=1):
         content = text.partition("#")[0].strip()
         words = [word for word in _SEPARATORS.split(content) if word]
         if words:
@@ -90,12 +105,12 @@ def read_number_rows(path: Path) -> NumberRows:
             lines.append(line)
             texts.append(content)
     if not rows:
-        raise InputError("the file holds no numbers", path=path)
+        raise InputError("the file contains no numbers", path=path)
     return NumberRows(path, tuple(rows), tuple(lines), tuple(texts))
 
 
 def parse_number(word: str, path: Path, line: int) -> float:
-    """Return the finite number that a word of a text file holds. Raises InputError with the line."""
+    """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
     try:
         # float() also takes Python's notation "1_000".
         value = float(word) if "_" not in word else None

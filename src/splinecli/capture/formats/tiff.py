@@ -24,7 +24,7 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
     every sample format. OpenCV decodes compressions for which tifffile has no decoder (LZW).
 
     Raises:
-        InputError: the file is truncated, damaged, or of a kind that holds no linear gray or RGB values.
+        InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
     """
     import tifffile
 

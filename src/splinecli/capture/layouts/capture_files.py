@@ -75,7 +75,7 @@ class CaptureFiles:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Files named by the user, which replace those that the folder holds."""
+    """Files named by the user, which replace those in the folder."""
 
     lights: Path | None = None
     intensities: Path | None = None
@@ -121,7 +121,7 @@ def gather_files(
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the file with the first of these names that the folder holds, ignoring case; None for none."""
+    """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
     files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}
     return next((files[name] for name in names if name in files), None)
 

@@ -1,6 +1,6 @@
 """The layout of CyclesPS (Ikehata, ECCV 2018): folders images_<kind>/ beside the files that all kinds share.
 
-As published, PRPS/<object> holds images_specular and images_metallic, PRPS_Diffuse/<object> images_diffuse,
+As published, PRPS/<object> contains images_specular and images_metallic, PRPS_Diffuse/<object> images_diffuse,
 each with one image for each line of the object's light.txt: 00000.tif and so on. A capture is one such folder.
 """
 
@@ -30,7 +30,7 @@ _PREFIX = "images_"
 _LIGHTS = "light.txt"
 _BOUNDARIES = ("inboundary.png", "onboundary.png")
 _MARKS = frozenset({_LIGHTS, "gt_normal.tif", *_BOUNDARIES})
-# Two of the four: an object is recognised where some are missing, and nothing else is taken for one.
+# Two of the four: an object is recognised if some are missing, and no other folder is mistaken for one.
 _ENOUGH_MARKS = 2
 _NUMBERED = re.compile(r"\d{5}\.tif")
 

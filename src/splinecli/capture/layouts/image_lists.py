@@ -22,9 +22,13 @@ IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)
 _DIGITS = re.compile(r"([0-9]+)")
 
 
+class NoImagesError(InputError):
+    """A folder contains no images."""
+
+
 def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
-    # split() with a group alternates text and digits, so the same places hold the same types.
+    # split() with a group alternates text and digits, so equal positions have equal types.
     parts: list[int | str] = [
         int(part) if place % 2 else part for place, part in enumerate(_DIGITS.split(path.name.casefold()))
     ]
@@ -83,10 +87,10 @@ def list_images(
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
-    """Raise InputError where the folder holds no images."""
+    """Raise NoImagesError if there are no images."""
     if not images:
-        raise InputError(
-            "the folder holds no images", path=folder, hint="PNG, TIFF, JPEG and RAW files count as images"
+        raise NoImagesError(
+            "the folder contains no images", path=folder, hint="PNG, TIFF, JPEG and RAW files count as images"
         )
 
 

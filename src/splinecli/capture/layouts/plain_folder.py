@@ -29,7 +29,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
 
     Raises:
-        InputError: the folder holds no images, filenames.txt is wrong, or there is no light file and none is named.
+        InputError: the folder contains no images, filenames.txt is wrong, or there is no light file and none is named.
     """
     filenames = find_named(folder, [FILENAMES])
     is_diligent = filenames is not None and find_named(folder, [_DILIGENT_LIGHTS]) is not None
@@ -41,7 +41,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     lights = overrides.lights or find_lights(folder)
     if lights is None:
         raise InputError(
-            f"the folder holds {len(images)} images but no light file ({LIGHT_FILES})",
+            f"the folder contains {len(images)} images but no light file ({LIGHT_FILES})",
             path=folder,
             hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball",

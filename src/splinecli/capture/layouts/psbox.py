@@ -20,7 +20,7 @@ _OBJECTS = "Objects"
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """Return the capture's files, or None for another layout. Raises InputError where Objects/ holds no images."""
+    """Return the capture's files, or None for another layout. Raises InputError if Objects/ contains no images."""
     lights = overrides.lights or find_named(folder, _LIGHT_DIRECTIONS)
     images = list_objects(folder, leave_out=overrides.named(), lights=lights)
     if lights is None or images is None:
@@ -36,7 +36,7 @@ def list_objects(
 
     Args:
         leave_out: files that have another meaning.
-        lights: a light file named by the user; without it, the folder must hold one.
+        lights: a light file named by the user; without it, the folder must contain one.
     """
     objects = folder / _OBJECTS
     if (lights or find_named(folder, _LIGHT_DIRECTIONS)) is None or not is_folder(objects):

@@ -16,7 +16,7 @@ from splinecli.capture.layouts.capture_files import (
     find_named,
     folder_name,
 )
-from splinecli.capture.layouts.image_lists import list_folder, list_images
+from splinecli.capture.layouts.image_lists import NoImagesError, list_folder, list_images
 from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
 
@@ -25,16 +25,23 @@ _LAYOUTS = (psbox.find, cyclesps.find, plain_folder.find)
 
 
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
-    """Return the files of the capture in the folder. The overrides replace those that the folder holds.
+    """Return the files of the capture in the folder. The overrides replace those in the folder.
 
     Raises:
-        InputError: the folder is missing, is a file or holds no images; filenames.txt names an image that
+        InputError: the folder is missing, is a file or contains no images; filenames.txt names an image that
             does not exist; there is no light file; or a file of the overrides does not exist.
     """
     list_folder(Path(folder))  # raises where it is no folder
     overrides.named()
     for find in _LAYOUTS:
-        files = find(Path(folder), overrides)
+        try:
+            files = find(Path(folder), overrides)
+        except NoImagesError as error:
+            captures = [capture for path in _subfolders(Path(folder)) for capture in _captures_below(path)]
+            if error.path != Path(folder) or not captures:
+                raise
+            hint = f"There are captures in {folder}, such as {captures[0]}: give these"
+            raise InputError(error.problem, path=Path(folder), hint=hint) from None
         if files is not None:
             return files
     raise AssertionError("the plain folder takes every folder, or raises")  # pragma: no cover
@@ -52,12 +59,12 @@ def capture_name(folder: StrPath) -> str:
 def find_captures(folder: StrPath) -> list[Path]:
     """Return the captures of a dataset's folder in natural order; the folder alone where it is a capture itself.
 
-    A capture is a folder with a light file beside its images, or beside the folder Objects that holds them (PSBox), or
-    a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
+    A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
+    or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
     captures are found by names of files; reading one may still fail.
 
     Raises:
-        InputError: the folder is missing, is a file, or holds no capture.
+        InputError: the folder is missing, is a file, or contains no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)

@@ -45,7 +45,7 @@ def draw_lights(
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
         raise UsageError(
-            f"{n_lights} lights wanted, the capture has {available}",
+            f"{n_lights} lights were requested, but the capture has {available}",
             hint=f"Ask for at most {available} lights",
         )
     if n_lights is None or n_lights == available:
@@ -56,11 +56,11 @@ def draw_lights(
 def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
     """Raise UsageError for settings that fit no capture."""
     if n_lights is not None and n_lights < MIN_LIGHTS:
-        raise UsageError(f"{n_lights} lights wanted, expected at least {MIN_LIGHTS}")
+        raise UsageError(f"--n-lights is {n_lights}; expected at least {MIN_LIGHTS}")
     if trials < 1:
-        raise UsageError(f"{trials} trials wanted, expected at least 1")
+        raise UsageError(f"--trials is {trials}; expected at least 1")
     if seed < 0:
-        raise UsageError(f"the seed is {seed}, expected a whole number from 0")
+        raise UsageError(f"--seed is {seed}; expected a whole number from 0")
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def read_draws(path: Path) -> DrawsFile:
         draws.append(draw)
         lines.append(line)
     if not draws:
-        raise InputError("the file holds no draws, expected a line of light indices for each", path=path)
+        raise InputError("the file contains no draws, expected a line of light indices for each", path=path)
     return DrawsFile(path, tuple(draws), tuple(lines))
 
 
@@ -148,7 +148,7 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
 
 
 def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
-    """Whether lights (F, 3) lie in one plane, so that Capture refuses them."""
+    """Return whether lights (F, 3) lie in one plane, so that Capture refuses them."""
     singular_values = np.linalg.svd(light_directions, compute_uv=False)
     return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
 

@@ -11,15 +11,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import NumberRows, columns, read_number_rows
+from splinecli.capture.formats.text import (
+    DECIMAL_POINT,
+    NumberRows,
+    columns,
+    has_decimal_commas,
+    read_number_rows,
+)
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
+
+_FILE = "a text file with a line {} for each image"
 
 
 def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) float64 from a text file.
 
-    A row holds x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of lights is
+    A row is x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of lights is
     accepted (the University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is read as
     rows. Vectors may have any length above zero.
 
@@ -32,7 +40,7 @@ def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray
             vector or a light below the horizon; also where the count disagrees with the count line or with
             n_images.
     """
-    table = _drop_count_line(read_number_rows(Path(path)), n_images)
+    table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("x y z")), n_images)
     vectors, transposed = _one_light_a_row(table, {3: "x y z"}, "light directions", n_images)
     return unit_directions(
         vectors,
@@ -66,7 +74,12 @@ def unit_directions(
     directions: NDArray[np.float64] = np.divide(scaled, length, out=np.zeros_like(vectors), where=length > 0)
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            raise InputError(f"found a zero vector{place}, expected a light direction", path=path, line=line)
+            raise InputError(
+                f"found a zero vector{place}, expected a light direction",
+                path=path,
+                line=line,
+                hint="Write x y z towards the light, or remove the line and its image",
+            )
         if z <= 0:
             raise InputError(
                 f"found a light below the horizon{place} (z = {vector[2]:g}), expected z > 0",
@@ -85,7 +98,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
     Raises:
         InputError: as for read_light_directions; also with the line, for an intensity that is not above zero.
     """
-    table = _drop_count_line(read_number_rows(Path(path)), n_images)
+    table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
     intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
     for light, channel in np.argwhere(intensities <= 0):
@@ -140,12 +153,15 @@ def _one_light_a_row(
         readings.append((values.T, True))
     if not readings:
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
-        decimal_commas = n_columns == 6 and table.texts[0].count(",") >= 3
+        text = table.texts[0]
+        decimal_commas = n_columns > 3 and (
+            has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
+        )
         raise InputError(
             f"found {columns(n_columns)}, expected {expected}",
             path=table.path,
             line=table.lines[0],
-            hint="A comma separates columns; write decimals with a point" if decimal_commas else None,
+            hint=DECIMAL_POINT if decimal_commas else None,
         )
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:

@@ -83,7 +83,7 @@ def read_named_lights(path: Path) -> NamedLights:
 
 
 def _read_lp(path: Path) -> NamedLights:
-    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may hold spaces."""
+    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may contain spaces."""
     stored = read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
@@ -99,7 +99,7 @@ def _read_lp(path: Path) -> NamedLights:
             hint="Correct the number, or restore the missing lines",
         )
     if not rows:
-        raise InputError("the file holds no lights", path=path, line=first)
+        raise InputError("the file contains no lights", path=path, line=first)
     names, vectors = [], []
     for line, text in rows:
         words = text.rsplit(maxsplit=3)

@@ -1,1 +1,1 @@
-"""What photographs lack and other observations show: saturated pixels, light intensities, the mask."""
+"""Restore what the images do not contain: saturated values, light intensities, the mask."""

@@ -16,7 +16,8 @@ def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
 
     Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of lightness, the cube
     root of brightness, in which dark parts of an object are closer to its bright parts than to the background. The mask
-    is the largest connected area above it, with its holes filled. A background as bright as the object defeats this.
+    is the largest connected area above it, with its holes filled. This fails if the background is as bright as
+    the object.
 
     Args:
         brightness: (H, W), linear: the mean over all lights.

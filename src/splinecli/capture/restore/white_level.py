@@ -77,18 +77,17 @@ class SaturationFinder:
         self._counts = np.zeros(_FULL_SCALE_16_BIT + 1, np.int64)
 
     def add(self, position: int, pixels: NDArray[Any], path: Path) -> None:
-        """Take the mask's pixels (P, C) of the image at this position, as stored.
+        """Add the mask's pixels (P, C) of the image at this position, as stored.
 
         Raises:
             InputError: the white level that the user gave is above the image's full scale.
         """
         if pixels.dtype.kind == "u":
-            full_scale = float(np.iinfo(pixels.dtype).max)
-            self._full_scale = max(self._full_scale or 0, full_scale)
+            full_scale = int(np.iinfo(pixels.dtype).max)
+            self._full_scale = max(self._full_scale or 0.0, float(full_scale))
             if self.given is not None and self.given > full_scale:
                 raise InputError(
-                    f"found {pixels.dtype} pixels, which end at {full_scale:g}, expected the white level"
-                    f" {self.given:g} or more",
+                    f"the white level is {self.given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
                     path=path,
                     hint="Lower the white level, or leave it out",
                 )
@@ -159,7 +158,7 @@ class SaturationFinder:
         return self.stated << (16 - bits) if self.stated + 1 == 1 << bits else None
 
     def _is_clipped(self) -> bool:
-        """Whether 16-bit images look clipped at their common maximum."""
+        """Return whether 16-bit images look clipped at their common maximum."""
         fewest = max(FEWEST_PIXELS, SMALLEST_SHARE * self.shape[0])
         reaching = [pixels for pixels in self._at_maximum.values() if len(pixels) >= fewest]
         if len(reaching) < (FEWEST_IMAGES_AT_BITS if _is_bits(self._maximum) else FEWEST_IMAGES):
@@ -174,5 +173,5 @@ class SaturationFinder:
 
 
 def _is_bits(level: int) -> bool:
-    """Whether the level is 2^bits - 1, shifted to fill 16 bits or not, for 8 to 15 bits."""
+    """Return whether the level is 2^bits - 1, shifted to fill 16 bits or not, for 8 to 15 bits."""
     return any(level in ((1 << bits) - 1, ((1 << bits) - 1) << (16 - bits)) for bits in range(8, 16))
