@@ -106,10 +106,10 @@ def change_the_version(capture: Path) -> tuple[str, ...]:
 
 
 CHANGES = {
-    "other options (n_lights)": lambda _: ("--n-lights", "4"),
+    "made with another --n-lights": lambda _: ("--n-lights", "4"),
     "other input files": change_light_file,
-    "without normals.png": remove_a_result,
-    "of version 0.0.": change_the_version,
+    "but normals.png is missing": remove_a_result,
+    "made by version 0.0.": change_the_version,
 }
 
 
