@@ -230,7 +230,10 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     ]
     result = run("infer", capture, "--transfer", "rec709")
     assert (result.code, result.out) == (2, "")
-    assert "the transfer curve is 'rec709'; expected linear, srgb, or gamma:G with G from 0.1 to 10" in result.err
+    assert (
+        "the transfer curve is 'rec709'; expected linear, srgb, or gamma:G with G from 0.1 to 10"
+        in result.err
+    )
 
 
 def test_json_is_the_report_and_nothing_else(capture, run):
