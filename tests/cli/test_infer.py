@@ -159,7 +159,7 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
     )
     assert json.loads(again.out)[0]["n_pixels"] == report["n_pixels"]
     both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite")
-    assert (both.code, "exclude each other" in both.err) == (2, True)
+    assert (both.code, "contradict each other. Leave one out" in both.err) == (2, True)
     for path in capture.glob("image*.png"):
         cv2.imwrite(str(path), np.full(mask.shape, 30_000, np.uint16))
     nothing = run("infer", capture, "--method", "ls", "--auto-mask", "-o", "third")

@@ -12,7 +12,7 @@ from splinecli.capture.restore.white_level import WhiteLevel
 
 @dataclass(frozen=True)
 class CaptureWarning:
-    """Something about a capture that costs accuracy, or that was decided for the user.
+    """A fault of a capture that reduces accuracy, or a decision that was made for the user.
 
     Args:
         code: a name that stays the same when the sentence changes; one of the constants below.

@@ -37,7 +37,7 @@ class Capture:
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
         ground_truth: (H, W, 3) float32 normals, unit, or zero where there is no ground truth; or None.
-        warnings: what costs accuracy, or was decided for the user.
+        warnings: faults that reduce accuracy, and decisions that were made for the user.
         estimated_intensities: (F,) float64, by which the observations were divided because no file gives the light
             intensities and the images show that they differ; else None.
         restored: (P, F) bool, true where an observation was saturated and an estimate stands in its place; None

@@ -71,7 +71,7 @@ class CaptureSummary:
         return degrees
 
     def warnings(self) -> list[CaptureWarning]:
-        """Return warnings of what costs accuracy."""
+        """Return warnings of faults that reduce accuracy."""
         saturated = [image for image in self.images if image.saturated > SATURATED_SHARE]
         worst = max(saturated, key=lambda image: image.saturated, default=None)
         dark = [image for image in self.images if image.dtype.startswith("uint") and image.bright < DARK]

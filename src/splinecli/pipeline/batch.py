@@ -105,7 +105,7 @@ def infer_batch(
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
-    """Return the exit code of a batch: a defect is worst, then the highest number."""
+    """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
     found = set(codes)
     return DEFECT if DEFECT in found else max(found, default=0)
 

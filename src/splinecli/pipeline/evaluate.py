@@ -73,11 +73,13 @@ class EvaluateOptions:
             raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
         if self.draws is not None and self.n_lights:
             raise UsageError(
-                "--draws and --n-lights exclude each other", hint="The draws say how many lights"
+                "--draws and --n-lights contradict each other",
+                hint="Leave --n-lights out: the draws determine the number of lights",
             )
         if self.draws is not None and self.trials is not None:
             raise UsageError(
-                "--draws and --trials exclude each other", hint="Each line of the draws is a trial"
+                "--draws and --trials contradict each other",
+                hint="Leave --trials out: each line of the draws is a trial",
             )
         for name in self.methods:
             check_method(name)

@@ -83,9 +83,9 @@ class InferOptions:
         from splinecli.transfer import parse_transfer
 
         if self.n_lights is not None and self.light_indices is not None:
-            raise UsageError("--n-lights and --light-indices exclude each other")
+            raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
         if self.mask is not None and self.auto_mask:
-            raise UsageError("--mask and --auto-mask exclude each other")
+            raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         check_method(self.method)
         if self.n_lights is not None:
             check_draw_settings(self.n_lights, 1, self.seed)

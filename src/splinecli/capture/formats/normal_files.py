@@ -40,8 +40,8 @@ def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | None = None) -> NDA
 
     Args:
         path: any of the files above but text.
-        mask: (H, W), true where normals are wanted. If a picture's alpha channel cuts something out, that is left out,
-            too.
+        mask: (H, W), True at the pixels whose normals are read. If a picture's alpha channel cuts something out,
+            that is left out, too.
 
     Raises:
         InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
@@ -74,7 +74,7 @@ def read_ground_truth(
     Args:
         path: any of the files above; pictures as PNG or TIFF.
         shape: (H, W) of the images.
-        mask: (H, W), true where normals are wanted.
+        mask: (H, W), True at the pixels whose normals are read.
 
     Raises:
         InputError: the file cannot be read, has another size, or has no normal inside the mask.
