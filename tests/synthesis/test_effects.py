@@ -116,7 +116,9 @@ def mirror(pixels: int) -> PrincipledMaterial:
 
 def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
     normals = draw_visible_normals(50, generator(1))
-    wall = replace(draw_wall(normals, 1.0, generator()), same=torch.zeros(50, 1, dtype=torch.bool))
+    wall = replace(
+        draw_wall(normals, 1.0, generator()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool)
+    )
     directions, inside = cell_directions()
     cosine = dot(wall.facing, directions[inside]).clamp(min=0)
     arriving = (normals * wall.towards).sum(dim=1, keepdim=True).clamp(min=0)
@@ -139,7 +141,7 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
         facing=torch.tensor([[-half, 0.0, half]]),
         reflectance=one,
         towards=torch.tensor([[1.0, 0.0, 0.0]]),
-        same=one > 0,
+        has_pixel_material=one > 0,
     )
     # A wall at 45 degrees sends light from the zenith to the pixel, which faces camera and wall equally.
     mirrored, elsewhere = [0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]
