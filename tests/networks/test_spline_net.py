@@ -16,7 +16,7 @@ from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 Make = Callable[..., SplineNet]
 PAPER = {"size": "paper", "map_size": 8}
-FITS = {"fits": ["ls"]}
+SET = {"set_width": 16, "set_layers": 2, "fits": ["ls"]}
 FLIP = torch.tensor((1.0, -1.0, 1.0))
 
 
@@ -35,7 +35,7 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
 
-@pytest.mark.parametrize("settings", [{}, {"map_size": 16}, FITS, PAPER])
+@pytest.mark.parametrize("settings", [{}, {"map_size": 16}, SET, PAPER])
 def test_normals_are_unit_vectors(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -46,7 +46,7 @@ def test_normals_are_unit_vectors(
     assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
+@pytest.mark.parametrize("settings", [{}, SET, PAPER])
 def test_dense_map_ends_with_the_unit_disc(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -82,7 +82,7 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
     torch.testing.assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("settings", [{}, FITS])
+@pytest.mark.parametrize("settings", [{}, SET])
 @pytest.mark.parametrize("degrees", [90.0, 33.0, -171.5])
 def test_compact_estimates_turn_with_the_lights(
     random_network: Make, pixels: tuple[Tensor, Tensor], degrees: float, settings: dict[str, object]
@@ -100,7 +100,7 @@ def test_compact_estimates_turn_with_the_lights(
     assert (here - torch.nn.functional.normalize(fit, dim=1)).abs().max() > 0.01
 
 
-@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
+@pytest.mark.parametrize("settings", [{}, SET, PAPER])
 def test_brightness_does_not_matter(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -115,7 +115,7 @@ def test_brightness_does_not_matter(
         )
 
 
-@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
+@pytest.mark.parametrize("settings", [{}, SET, PAPER])
 def test_order_of_the_lights_does_not_matter(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -131,7 +131,7 @@ def test_order_of_the_lights_does_not_matter(
         )
 
 
-@pytest.mark.parametrize("settings", [{}, FITS])
+@pytest.mark.parametrize("settings", [{}, SET])
 def test_observations_that_are_not_valid_do_not_matter(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
@@ -144,7 +144,7 @@ def test_observations_that_are_not_valid_do_not_matter(
         torch.testing.assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("settings", [{}, FITS, PAPER])
+@pytest.mark.parametrize("settings", [{}, SET, PAPER])
 def test_all_zero_pixels_give_a_unit_normal(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from splinecli.errors import ModelError
+from splinecli.networks.light_set import HEAD_WIDTH
 from splinecli.networks.starting_fits import STARTING_FITS
 from splinecli.observation_map import MAP_SIZE, Grid
 
@@ -15,6 +16,10 @@ _CHOICES = {
     "interpolates": (True, False),
     "error_head": (True, False),
 }
+
+
+_LEAST = {"set_width": 0}
+"""Smallest values of settings that may be below 1."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,8 @@ class NetworkConfig:
         width: channels of the compact size.
         li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size.
         head_width: hidden features of NE-Net's head in the compact size.
+        set_width: channels of the set branch, 0 for none. Compact size only.
+        set_layers: attention layers of the set branch.
     """
 
     size: Literal["paper", "compact"] = "compact"
@@ -44,6 +51,8 @@ class NetworkConfig:
     fits: tuple[str, ...] = ()
     interpolates: bool = True
     error_head: bool = False
+    set_width: int = 0
+    set_layers: int = 3
 
     @property
     def is_canonical(self) -> bool:
@@ -68,9 +77,14 @@ class NetworkConfig:
                 if value not in _CHOICES[name]:
                     expected = " or ".join(map(repr, _CHOICES[name]))
                     raise ModelError(f"network {name} is {value!r}; expected {expected}")
-            elif not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 4096:
+            elif (
+                not isinstance(value, int)
+                or isinstance(value, bool)
+                or not _LEAST.get(name, 1) <= value <= 4096
+            ):
                 raise ModelError(
-                    f"network setting {name!r} is {value!r}; expected a whole number from 1 to 4096"
+                    f"network setting {name!r} is {value!r};"
+                    f" expected a whole number from {_LEAST.get(name, 1)} to 4096"
                 )
         config = cls(**values, fits=fits)
         # Both sizes halve the map twice. An instance norm needs more than one cell after that.
@@ -82,6 +96,12 @@ class NetworkConfig:
             raise ModelError("network setting 'fits' needs the size 'compact'")
         if config.error_head and config.size != "compact":
             raise ModelError("network setting 'error_head' needs the size 'compact'")
+        if config.set_width and config.size != "compact":
+            raise ModelError("network setting 'set_width' needs the size 'compact'")
+        if config.set_width % HEAD_WIDTH:
+            raise ModelError(
+                f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}"
+            )
         if config.grid != "even" and config.size != "paper":
             raise ModelError(f"network grid is {config.grid!r}; it needs the size 'paper'")
         return config

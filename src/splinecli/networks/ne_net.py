@@ -60,7 +60,7 @@ class CompactNENet(nn.Module):
     """Maps (P, C, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit length.
 
     The result is a weighted sum of the starting normals plus a correction. At first the first normal has weight 1, and
-    all else is zero. With K = 0 this weight is fixed.
+    all else is zero. With K = 0 this weight is fixed. Features (P, set_width) of the set branch join the hidden layer.
     The second result is that of the error head (P, 2), None without one.
     """
 
@@ -73,6 +73,7 @@ class CompactNENet(nn.Module):
         map_size: int,
         fits: int = 0,
         *,
+        set_width: int = 0,
         error_head: bool = False,
     ) -> None:
         super().__init__()
@@ -91,12 +92,17 @@ class CompactNENet(nn.Module):
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
                 self.weigh.bias.copy_(torch.arange(fits + 1) == 0)
+        self.join = nn.Linear(set_width, head_width, bias=False) if set_width else None
         self.error_head = ErrorHead(head_width, fits + 2) if error_head else None
 
-    def forward(self, maps: Tensor, normals: Tensor) -> tuple[Tensor, Tensor | None]:
+    def forward(
+        self, maps: Tensor, normals: Tensor, set_features: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
         features = torch.relu(self.squeeze(torch.relu(self.encoder(maps))))
         # Patches first, channels last: this is the order in memory, so flattening does not copy.
         hidden = self.hidden(features.permute(0, 2, 3, 1).flatten(1))
+        if self.join is not None and set_features is not None:
+            hidden = hidden + self.join(set_features)
         if self.compare is None or self.weigh is None:
             start = normals[:, 0]
         else:

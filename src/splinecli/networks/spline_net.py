@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from splinecli.fits.lambertian import fit_lambertian
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_net import CompactLINet, PaperLINet
+from splinecli.networks.light_set import SetBranch
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
 from splinecli.networks.starting_fits import fit_normals
 from splinecli.observation_map import (
@@ -61,6 +62,9 @@ class PixelMaps(NamedTuple):
         fitted_normals: (P, K, 3), of the further fits in the configuration.
         cosine, sine: (P,), of the turn from the capture's frame to the pixel's.
         mirrored: whether y is flipped after the turn.
+        observed, residuals: (P, F), the scaled observations and their residuals.
+        lights: (P, F, 3), in the pixels' frames.
+        valid: (P, F) bool, or None for all.
     """
 
     sparse: Tensor
@@ -73,6 +77,10 @@ class PixelMaps(NamedTuple):
     cosine: Tensor
     sine: Tensor
     mirrored: bool
+    observed: Tensor
+    residuals: Tensor
+    lights: Tensor
+    valid: Tensor | None
 
 
 class Estimate(NamedTuple):
@@ -105,9 +113,13 @@ class SplineNet(nn.Module):
                 config.ne_blocks,
                 config.head_width,
                 size,
-                len(config.fits),
+                len(config.fits) + int(config.set_width > 0),
+                set_width=config.set_width,
                 error_head=config.error_head,
             )
+        self.set_branch: SetBranch | None = None
+        if config.set_width:
+            self.set_branch = SetBranch(config.set_width, config.set_layers, 1 + len(config.fits))
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)
@@ -165,6 +177,10 @@ class SplineNet(nn.Module):
             cosine,
             sine,
             rotation.mirror,
+            observed,
+            residual,
+            lights,
+            valid,
         )
 
     def interpolate(self, maps: PixelMaps) -> Tensor | None:
@@ -186,7 +202,13 @@ class SplineNet(nn.Module):
         else:
             channels = (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map)
             normals = torch.cat((maps.lambertian_normals[:, None], maps.fitted_normals), dim=1)
-            raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals)
+            features = None
+            if self.set_branch is not None:
+                features, fitted = self.set_branch(
+                    maps.observed, maps.lights, maps.residuals, maps.valid, normals
+                )
+                normals = torch.cat((normals, fitted[:, None]), dim=1)
+            raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals, features)
         return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)
 
     def forward(

@@ -54,18 +54,31 @@ def stream_seed(seed: int, step: int, stream: int) -> int:
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network. Raises ModelError where they belong to another kind of network."""
+    """Copy the weights into the network. A set branch that they lack changes no normal at first."""
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
-    # A network may get an error head, and loses its own when it is trained further.
-    differing = [name for name in wanted if wanted[name] != found[name] and name != "error_head"]
+    adds_set = bool(wanted["set_width"]) and not found["set_width"]
+    allowed = {"error_head"} | ({"set_width", "set_layers"} if adds_set else set())
+    differing = [name for name in wanted if wanted[name] != found[name] and name not in allowed]
     if differing:
         name = differing[0]
         raise ModelError(
             f"the weights {weights!r} are of a network with {name} = {found[name]!r}, the run's has {wanted[name]!r}",
             hint="Choose the preset, or the settings network.*, that the weights were trained with",
         )
-    network.load_state_dict(loaded.state_dict(), strict=wanted["error_head"] == found["error_head"])
+    state = loaded.state_dict()
+    if adds_set:
+        # The set branch's normal comes last among those that NE-Net weighs; its columns start at zero.
+        fresh = network.state_dict()
+        for name in ("ne_net.compare.weight", "ne_net.weigh.weight", "ne_net.weigh.bias"):
+            if name in state:
+                old, state[name] = state[name], torch.zeros_like(fresh[name])
+                state[name][tuple(slice(size) for size in old.shape)] = old
+            elif "compare" in name:  # a network without fits, whose only normal has the weight 1 at first
+                state[name] = torch.zeros_like(fresh[name])
+        for parameter in network.ne_net.join.parameters():  # type: ignore[union-attr]
+            torch.nn.init.zeros_(parameter)
+    network.load_state_dict(state, strict=False)
 
 
 class Trainer:

@@ -147,7 +147,7 @@ def _fixed(network: SplineNet, part: Part) -> Iterator[None]:
     """Compute no gradients for parameters outside `part`. Gradients still pass through them."""
     inside = {
         "both": ("",),
-        "ne_net": ("ne_net.",),
+        "ne_net": ("ne_net.", "set_branch."),
         "li_net": ("li_net.",),
         "error_head": ("ne_net.error_head.",),
     }[part]

@@ -1,0 +1,113 @@
+"""The set branch: attention over a pixel's observations as they are, without rounding their lights to cells."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
+
+HEAD_WIDTH = 16
+"""Channels of an attention head."""
+
+DARKEST = 1e-3
+"""Added to observations before their logarithm is taken."""
+
+_PRIOR = 1e-4  # keeps the weighted least squares solvable where the weights leave fewer than three lights
+
+
+class SetBranch(nn.Module):
+    """A transformer over the F observations of each pixel.
+
+    It has one token for each observation and one for the pixel. The token of an observation is made from its light
+    direction, value, residual of the Lambertian fit, and the cosines between the starting normals and its light and
+    half vector. The tokens give a weight and a corrected value for each observation, and least squares over these
+    gives a normal. At first the weights are equal and the values are not corrected.
+    """
+
+    def __init__(self, width: int, layers: int, normals: int) -> None:
+        super().__init__()
+        self.observation = nn.Linear(6 + 2 * normals, width)
+        self.pixel = nn.Linear(3 * normals + 1, width)
+        self.layers = nn.ModuleList(_AttentionLayer(width) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+        self.weigh = nn.Linear(width, 2)
+        nn.init.zeros_(self.weigh.weight)
+        nn.init.zeros_(self.weigh.bias)
+
+    def forward(
+        self, observed: Tensor, lights: Tensor, residual: Tensor, valid: Tensor | None, normals: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the pixels' tokens (P, width) and the unit normals (P, 3) of least squares.
+
+        Args:
+            observed, residual: (P, F), each pixel scaled to a largest observation of 1.
+            lights: (P, F, 3), unit, in the pixels' frames.
+            valid: (P, F) bool; None for all.
+            normals: (P, K, 3), the starting normals, unit or zero.
+        """
+        features = torch.cat((_token_features(observed, lights, residual, normals)), dim=-1)
+        count = observed.shape[1] if valid is None else valid.sum(dim=1, keepdim=True)
+        log_count = torch.as_tensor(count, dtype=observed.dtype, device=observed.device).log()
+        pixel = torch.cat((normals.flatten(1), log_count.expand(len(observed), 1)), dim=1)
+        tokens = torch.cat((self.pixel(pixel)[:, None], self.observation(features)), dim=1)
+        mask = None
+        if valid is not None:
+            mask = torch.cat((valid.new_ones(len(valid), 1), valid), dim=1)[:, None, None]
+        for layer in self.layers:
+            tokens = layer(tokens, mask)
+        tokens = self.norm(tokens)
+        with torch.autocast(observed.device.type, enabled=False):
+            log_weight, correction = self.weigh(tokens[:, 1:].to(self.weigh.weight.dtype)).unbind(-1)
+            weight = log_weight.clamp(-10, 10).exp()
+            weight = weight if valid is None else weight * valid
+            fitted = _weighted_normals(observed + correction, lights, weight)
+        return tokens[:, 0], fitted
+
+
+class _AttentionLayer(nn.Module):
+    """Attention and a perceptron on tokens (P, T, width). Each follows a layer norm and is added to its input."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.heads = width // HEAD_WIDTH
+        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.queries_keys_values = nn.Linear(width, 3 * width)
+        self.attended = nn.Linear(width, width)
+        self.perceptron = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        pixels, count, width = tokens.shape
+        split = self.queries_keys_values(self.norm1(tokens)).view(pixels, count, 3, self.heads, HEAD_WIDTH)
+        queries, keys, values = split.permute(2, 0, 3, 1, 4)
+        attended = nn.functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+        tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
+        out: Tensor = tokens + self.perceptron(self.norm2(tokens))
+        return out
+
+
+def _token_features(
+    observed: Tensor, lights: Tensor, residual: Tensor, normals: Tensor
+) -> tuple[Tensor, ...]:
+    half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
+    return (
+        lights,
+        observed[..., None],
+        (observed.clamp(min=0) + DARKEST).log()[..., None],
+        residual[..., None],
+        lights @ normals.mT,
+        half @ normals.mT,
+    )
+
+
+def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor:
+    """Return the unit normals (P, 3) of weighted least squares, l . b = target."""
+    weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
+    x, y, z = lights.unbind(-1)
+    prior = lights.new_tensor((_PRIOR, _PRIOR, _PRIOR, 0, 0, 0))
+    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
+    matrix = (weight[:, None] @ products)[:, 0] + prior
+    # Where nothing else decides, the normal points to the camera.
+    vector = ((weight * targets)[:, None] @ lights)[:, 0] + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
+    scaled = multiply_symmetric(inverse_3x3(matrix.unbind(-1), 1e-6), vector.unbind(-1))
+    return nn.functional.normalize(torch.stack(scaled, dim=-1), dim=-1)
