@@ -226,7 +226,7 @@ def cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_scenes_and_a_mesh_are_rendered(run, cube):
-    arguments = ("prepare", "--mesh", cube, "--size", 16, "--lights", 20, "-o", "set")
+    arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
     result = run(*arguments, "--scenes", 1)
     assert result.code == 0
     assert result.out.startswith("set: 6 entries of 2 scenes, ")
@@ -255,7 +255,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
 
 def test_a_mesh_that_the_camera_cannot_see(run, cube):
     Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
-    result = run("prepare", "--mesh", "back.obj", "--size", 16, "--lights", 20, "-o", "set")
+    result = run("prepare", "--mesh", "back.obj", "--size", 16, "--n-lights", 20, "-o", "set")
     assert (result.code, result.out) == (3, "")
     assert result.err.startswith(
         "splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z"
@@ -263,7 +263,7 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
 
 
 def test_a_scene_does_not_depend_on_those_before_it(run, cube):
-    common = ("prepare", "--size", 16, "--lights", 20, "--quiet")
+    common = ("prepare", "--size", 16, "--n-lights", 20, "--quiet")
     run(*common, "--scenes", 2, "-o", "set")
     shutil.move("set", "first")
     # After an interruption, the second scene is rendered without the first.

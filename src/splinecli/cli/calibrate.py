@@ -26,8 +26,8 @@ def calibrate(
     """Measure light directions from images of mirror balls.
 
     A BALL is a folder with one image for each light, in the order of the lights. The outline of the ball comes from
-    --circle, from a mask (--mask, or a file named mask in the folder), or from an image named ref or the mean of all
-    images, where it is detected. The brightest spot in the ball is the lamp. Directions of several balls are averaged.
+    --circle or a mask (--mask, or a file named mask in the folder). Otherwise it is detected in an image named ref, or
+    in the mean of all images. The brightest spot in the ball is the lamp. Directions of several balls are averaged.
 
     Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the result by eye, and
     calibration.json. With a gray ball or card, it also writes light_intensities.txt, the relative light intensities.

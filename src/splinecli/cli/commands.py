@@ -24,6 +24,15 @@ _RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"
 class Command(TyperCommand):
     """A command whose help has panels, as plain text, and which expands `~` in what it is given."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if getattr(error, "ctx", self) is None:
+                error.ctx = ctx  # type: ignore[attr-defined]
+            raise
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command. A shell expands `~` in `-o ~/x`, but not in `--output=~/x`."""
         ctx.params = {name: _expand(value) for name, value in ctx.params.items()}

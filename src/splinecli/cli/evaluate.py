@@ -46,8 +46,8 @@ def evaluate(
 
     All methods see the same draws. Captures are read as infer reads them; --as-stored reproduces published tables.
 
-    Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT, and a plot where
-    several K or SIGMA are given. OUT/trials.jsonl stores finished trials: run the command again to go on, or with more
+    Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT, and a plot if you
+    give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the command again to go on, or with more
     trials, methods or lights. A capture that cannot be scored is skipped with a message, and the exit code is then 3.
     """
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names

@@ -17,8 +17,8 @@ def import_weights(
 ) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 
-    Other commands take the weight file with --weights. Both checkpoints must be of one training step, such as
-    200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in them is not run.
+    Other commands take the weight file with --weights. Both checkpoints must come from the same training
+    step, such as 200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in them is not run.
     """
     if output.is_dir():
         raise OutputError("is a folder, expected a file", path=output, hint="Name a file with -o")

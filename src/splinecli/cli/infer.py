@@ -65,13 +65,13 @@ def infer(
 ) -> int:
     """Estimate the normal map of each CAPTURE.
 
-    A CAPTURE is a folder of images of one object, taken by a fixed camera under different lights, with a light file in
-    it or given by --lights. Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png where there
-    is ground truth. With several captures, OUT/index.html links the results.
+    A CAPTURE is a folder with the images of one object. A fixed camera took them under different lights. The light file
+    is in the folder, or --lights names it. Writes OUT/<name>/normals.png, normals.npy and report.json, and
+    error_map.png if there is ground truth. With several captures, OUT/index.html links the results.
 
-    Captures that are already done are skipped. A capture whose files or options have changed since is named and keeps
-    its results, unless --update or --overwrite is given. A capture that fails does not stop the others. The exit code
-    is that of the worst capture.
+    Captures that are already done are skipped. If files or options of a capture have changed, infer reports it and
+    keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
+    The exit code is that of the most serious failure.
     """
     from splinecli.pipeline.infer_options import InferOptions
 

@@ -11,10 +11,10 @@ from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
 def info(
     capture: Path = inputs.CAPTURE,
-    lights: Path | None = inputs.INFO_LIGHTS,
-    intensities: Path | None = inputs.INFO_INTENSITIES,
-    mask: Path | None = inputs.INFO_MASK,
-    ground_truth: Path | None = inputs.INFO_GROUND_TRUTH,
+    lights: Path | None = inputs.LIGHTS,
+    intensities: Path | None = inputs.INTENSITIES,
+    mask: Path | None = inputs.MASK,
+    ground_truth: Path | None = inputs.GROUND_TRUTH,
     transfer: str = inputs.TRANSFER,
     ambient: Path | None = inputs.AMBIENT,
     flat_field: Path | None = inputs.FLAT_FIELD,

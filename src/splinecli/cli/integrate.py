@@ -27,7 +27,7 @@ def integrate(
 ) -> None:
     """Integrate a normal map to a depth map and a mesh.
 
-    Bilateral normal integration: the surface may tear at edges, where the normals do not fit together. Without a
+    Uses bilateral normal integration. The surface may break at edges, where the normals do not fit together. Without a
     camera matrix, the depth map has heights towards the camera in pixels, with mean zero. With one, it has depths
     along the viewing axis, of unknown scale.
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import typer
 
 from splinecli.cli.app import app
+from splinecli.cli.usage_errors import usage_message
 from splinecli.errors import OutputError, SplinecliError
 
 INTERRUPTED = 130
@@ -34,10 +35,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except SplinecliError as error:
         return fail(str(error), error.exit_code)
     except _ClickUsageError as error:
-        message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
-        context = getattr(error, "ctx", None)
-        where = context.command_path if context else "splinecli"
-        return fail(f"{message}. See '{where} --help'.", 2)
+        return fail(usage_message(error), 2)
     except BrokenPipeError:
         return _end_at_closed_pipe()
     except SystemExit as error:

@@ -37,7 +37,11 @@ FILES = (
     ("CAPTURE/light_directions.txt", "A line x y z for each image: x right, y up, z to the camera."),
     ("CAPTURE/*.lp, lights.json", "Instead: lights with the names of their images, from RTI or AliceVision."),
     ("CAPTURE/light_intensities.txt", "A line r g b for each image. Optional."),
-    ("CAPTURE/mask.png", "Bright on the object. Optional: without it, every pixel belongs to the object."),
+    (
+        "CAPTURE/mask.png",
+        "White on the object (above half of its largest value). Optional: without it, every pixel belongs to the"
+        " object.",
+    ),
     ("CAPTURE/ambient.png", "The object with the lamp off, subtracted from all images. Optional."),
     ("CAPTURE/Normal_gt.mat", "True normals. Optional: with them, errors are reported."),
     ("OUT/NAME/normals.png", "Normal map, 16-bit RGB, (n + 1) / 2."),
@@ -46,7 +50,7 @@ FILES = (
         "OUT/NAME/normals_8bit.png, normals.tiff",
         "With --format png8, tiff: normal map in 8 bits, in float32.",
     ),
-    ("OUT/NAME/error_map.png", "If there are true normals: angular error with a colour bar."),
+    ("OUT/NAME/error_map.png", "If there are true normals: angular error with a color bar."),
     ("OUT/NAME/found_mask.png", "With --auto-mask: the mask of the object."),
     ("OUT/NAME/albedo.png, albedo.npy", "With --maps albedo: a picture, and linear values in float32."),
     (
@@ -70,7 +74,7 @@ FILES = (
 )
 ENVIRONMENT = (
     ("COLUMNS", "Width of help texts and tables."),
-    ("NO_COLOR", "If set, the terminal output has no colours."),
+    ("NO_COLOR", "If set, the terminal output has no colors."),
     ("OMP_NUM_THREADS", "Number of processor threads of the networks."),
     ("CUDA_VISIBLE_DEVICES", "GPUs that --device auto and cuda may use."),
 )

@@ -47,7 +47,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "prepare": {
         "Input": ("--as-stored", "--update", "--white-level"),
-        "Scenes": ("--scenes", "--mesh", "--size", "--lights", "--measured", "--measured-share", "--seed"),
+        "Scenes": ("--scenes", "--mesh", "--size", "--n-lights", "--measured", "--measured-share", "--seed"),
         "Output": ("--output", *REPEAT),
     },
     "train": {

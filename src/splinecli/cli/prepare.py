@@ -23,7 +23,7 @@ def prepare(
     scenes: int = training.SCENES,
     mesh: list[Path] | None = training.MESHES,
     size: int | None = training.IMAGE_SIZE,
-    lights: int | None = training.SCENE_LIGHTS,
+    n_lights: int | None = training.SCENE_LIGHTS,
     measured: Path | None = training.MEASURED,
     measured_share: float = training.MEASURED_SHARE,
     seed: int = inputs.SEED,
@@ -34,7 +34,7 @@ def prepare(
 
     A pixel set has the true normal of each pixel and its observations under all lights. Writes SET/manifest.json, a
     folder for each capture and scene, and the overview SET/contact_sheet.png. The same command continues after an
-    interruption, and adds to a set that exists. Captures that cannot be read are named and left out. Rendering needs
+    interruption, and adds to a set that exists. Captures that cannot be read are reported and skipped. Rendering needs
     the extra packages of 'splinecli[render]'.
     """
     if not sources and not scenes and not mesh:
@@ -47,7 +47,7 @@ def prepare(
     options = PrepareOptions(
         output=output,
         captures=tuple(folder for source in sources or [] for folder in find_captures(source)),
-        scenes=_plan(scenes, mesh or [], seed, size, lights, measured, measured_share),
+        scenes=_plan(scenes, mesh or [], seed, size, n_lights, measured, measured_share),
         as_stored=as_stored,
         white_level=white_level,
         update=update,
@@ -62,7 +62,7 @@ def _plan(
     meshes: list[Path],
     seed: int,
     size: int | None,
-    lights: int | None,
+    n_lights: int | None,
     measured: Path | None,
     measured_share: float,
 ) -> ScenePlan:
@@ -73,7 +73,7 @@ def _plan(
     config = replace(
         config,
         size=size or config.size,
-        lights=lights or config.lights,
+        lights=n_lights or config.lights,
         measured_share=measured_share if measured else 0.0,
     )
     return ScenePlan(config, seed, scenes, tuple(meshes), measured)

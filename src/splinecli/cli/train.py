@@ -91,7 +91,7 @@ def _run(trainer: Trainer, messages: Messages) -> None:
     """Train to the end and show the progress."""
     if trainer.single_scene_sets:
         names = ", ".join(trainer.single_scene_sets)
-        messages.warn(f"{names}: the only scene of a set is used for training and for validation")
+        messages.warn(f"{names}: the set has a single scene, so training and validation use the same pixels")
     shown = trainer.progress
     with messages.progress("training", 1.0, start=shown) as advance:
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
+from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS
 from splinecli.training.losses import Norm
 
 GENERATOR = "generator"
@@ -58,7 +59,7 @@ class TrainingConfig:
     learning_rate: float = 1.5e-3
     schedule: Literal["cosine", "stepped"] = "cosine"
     warmup_steps: int = 300
-    steps: int = 40_000
+    steps: int = DEFAULT_STEPS
     minutes: float = 0.0
     beta1: float = 0.9
     beta2: float = 0.99
@@ -188,7 +189,7 @@ PRESETS = {
         learning_rate=1e-4,
         schedule="stepped",
         warmup_steps=0,
-        steps=200_000,
+        steps=PAPER_STEPS,
         beta1=0.9,
         beta2=0.999,
         weight_decay=0.0,

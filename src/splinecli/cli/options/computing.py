@@ -7,11 +7,13 @@ from typer import Option
 from splinecli.cli import choices
 from splinecli.cli.options.values import Device, Precision, complete_weights
 
-METHOD = Option("spline-net", metavar="METHOD", help="{methods}.", autocompletion=choices.methods)
+METHOD = Option(
+    "spline-net", metavar="METHOD", help="Method to use: {methods}.", autocompletion=choices.methods
+)
 METHODS = Option(
     None,
     metavar="M",
-    help="Method to score, or all. May be repeated. [default: spline-net]",
+    help="Method to score: all, {methods}. May be repeated. [default: spline-net]",
     autocompletion=lambda: [*choices.methods(), "all"],
 )
 WEIGHTS = Option(
@@ -24,19 +26,28 @@ ROTATIONS = Option(
     None,
     metavar="R",
     min=1,
-    help="Rotated copies of each pixel that a network averages over. [default: 1; cnn-ps: 10]",
+    help="Average the network's result over R rotations of the lights. [default: 1; cnn-ps: 10]",
 )
-STIFFNESS = Option(2.0, metavar="K", min=0, help="How easily the surface tears at edges. 0 never tears it.")
+STIFFNESS = Option(
+    2.0, metavar="K", min=0, help="How sharply the surface may break at edges. 0 keeps it in one piece."
+)
 LARGEST_STEP = Option(
     None,
     metavar="PIXELS",
     min=0,
-    help="Leave out triangles whose corners differ more in height. [default: keep all]",
+    help="Leave out triangles whose corners differ by more than this height. [default: keep all]",
 )
 
-DEVICE = Option(Device.auto, help="Device to compute on. auto takes a CUDA GPU if there is one.")
-PRECISION = Option(Precision.auto, help="Number format. auto takes bfloat16 where the hardware supports it.")
-BATCH_SIZE = Option(None, metavar="N", min=1, help="Pixels that the method computes at a time.")
+DEVICE = Option(Device.auto, help="Device to compute on. auto is a CUDA GPU if there is one, else the CPU.")
+PRECISION = Option(
+    Precision.auto, help="Number format. auto is bfloat16 if the hardware supports it, else float32."
+)
+BATCH_SIZE = Option(
+    None,
+    metavar="N",
+    min=1,
+    help="Number of pixels per batch. A smaller number needs less memory. [default: 512 to 8,192, by method]",
+)
 JOBS = Option(
     None, metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]"
 )

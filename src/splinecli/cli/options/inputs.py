@@ -6,22 +6,31 @@ from typer import Argument, Option
 
 from splinecli.cli.options.values import NormalConvention, complete_curves
 
+MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
+
 # Captures of infer and info.
 
-CAPTURES = Argument(..., metavar="CAPTURE", help="Folders of images, each of one object.")
-CAPTURE = Argument(..., metavar="CAPTURE", help="Folder of images of one object.")
+CAPTURES = Argument(..., metavar="CAPTURE", help="Folders with the images of one object each.")
+CAPTURE = Argument(..., metavar="CAPTURE", help="Folder with the images of one object.")
 
-LIGHTS = Option(None, metavar="FILE", help="Light directions: a line x y z for each image, z to the camera.")
+LIGHTS = Option(
+    None,
+    metavar="FILE",
+    help="Light directions: a line x y z for each image, z to the camera. [default: the light file in CAPTURE]",
+)
 INTENSITIES = Option(
     None,
     metavar="FILE|equal",
-    help="Light intensities: a line r g b for each image. [default: estimated where they are unequal]",
+    help="Light intensities: a line r g b for each image. [default: equal, or estimated if the images show that"
+    " they differ]",
 )
 MASK = Option(
-    None, metavar="FILE", help="Mask image: non-zero pixels belong to the object. [default: all pixels]"
+    None,
+    metavar="FILE",
+    help=f"{MASK_IMAGE.format('object')} [default: a file named mask.*, or all pixels]",
 )
 AUTO_MASK = Option(
-    False, "--auto-mask", help="Find the object if there is no mask, and write found_mask.png."
+    False, "--auto-mask", help="If there is no mask, find the object in the images and write found_mask.png."
 )
 GROUND_TRUTH = Option(
     None, metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."
@@ -38,7 +47,9 @@ AMBIENT = Option(
     help="Image taken without the lights, to subtract from all images. [default: ambient.*]",
 )
 FLAT_FIELD = Option(
-    None, metavar="DIR", help="Images of an evenly white surface: one for all lights, or one each."
+    None,
+    metavar="DIR",
+    help="Folder with images of an evenly white surface: one for all lights, or one for each light.",
 )
 WHITE_LEVEL = Option(
     None,
@@ -47,25 +58,18 @@ WHITE_LEVEL = Option(
     help="Stored value from which a pixel counts as saturated. [default: found in the images]",
 )
 AS_STORED = Option(
-    False, "--as-stored", help="Neither restore saturated pixels nor estimate unknown light intensities."
+    False,
+    "--as-stored",
+    help="Use the stored values: do not restore saturated pixels or estimate light intensities.",
 )
-
-# The files of info, whose help is shorter.
-
-INFO_LIGHTS = Option(
-    None, metavar="FILE", help="Light directions, a line x y z for each image (z to the camera)."
-)
-INFO_INTENSITIES = Option(None, metavar="FILE|equal", help="Light intensities, a line r g b for each image.")
-INFO_MASK = Option(
-    None, metavar="FILE", help="Mask image: non-zero pixels belong to the object. [default: all]"
-)
-INFO_GROUND_TRUTH = Option(None, metavar="FILE", help="True normals (.mat, .npy, text, PNG, TIFF).")
 
 # Draws of lights, and the captures of evaluate.
 
 SEED = Option(0, metavar="S", min=0, max=2**32 - 1, help="Seed of the random draws.")
 NUMBER_OF_LIGHTS = Option(None, metavar="K", help="Use K lights drawn at random. [default: all]")
-LIGHT_INDICES = Option(None, metavar="I,J,...", help="Use these lights, counted from 0.")
+LIGHT_INDICES = Option(
+    None, metavar="I,J,...", help="Use these lights, counted from 0. Plots and warnings count from 1."
+)
 DATASETS = Argument(
     ..., metavar="DATASET", help="Folders of captures with ground truth, or the captures themselves."
 )
@@ -78,21 +82,25 @@ LIGHT_NOISE = Option(
     None,
     metavar="SIGMA",
     min=0,
-    help="Tilt the lights at random, with this standard deviation. May be repeated. [default: 0]",
+    help="Tilt the lights at random, with this standard deviation in degrees. May be repeated. [default: 0]",
 )
-MAX_PIXELS = Option(None, metavar="N", min=1, help="Score N random pixels of each capture.")
+MAX_PIXELS = Option(None, metavar="N", min=1, help="Score N random pixels of each capture. [default: all]")
 SKIP_FIRST = Option(
     None,
     metavar="[CAPTURE=]N",
-    help="Leave out the first N images of one capture, or of all. May be repeated.",
+    help="Leave out the first N images of one capture, or of all. May be repeated. [default: 0]",
 )
 
 # Targets of calibrate.
 
 BALLS = Argument(..., metavar="BALL", help="Folders of images of one mirror ball each.")
-CIRCLES = Option(None, metavar="X,Y,R", help="Outline of the ball in pixels, y down. Once for each BALL.")
+CIRCLES = Option(
+    None, metavar="X,Y,R", help="Outline of the ball in pixels, y down. May be repeated, once for each BALL."
+)
 BALL_MASKS = Option(
-    None, metavar="FILE", help="Mask image: non-zero pixels belong to the ball. Once for each BALL."
+    None,
+    metavar="FILE",
+    help=f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
 )
 GRAY_BALL = Option(None, metavar="DIR", help="Images of a matte gray ball under the same lights.")
 GRAY_CARD = Option(None, metavar="DIR", help="Images of a matte gray card that faces the camera.")
@@ -111,7 +119,7 @@ NORMALS = Argument(
 NORMALS_MASK = Option(
     None,
     metavar="FILE",
-    help="Mask image: non-zero pixels belong to the object. [default: all pixels that have a normal]",
+    help=f"{MASK_IMAGE.format('object')} [default: all pixels that have a normal]",
 )
 CAMERA_MATRIX = Option(
     None,
@@ -122,6 +130,4 @@ NORMALS_CONVENTION = Option(
     NormalConvention.opengl,
     help="Green channel of a normal map that is an image: opengl is y up, directx is y down.",
 )
-COLOURS = Option(
-    None, metavar="FILE", help="Image that gives the colours of the mesh, such as an albedo map."
-)
+COLOURS = Option(None, metavar="FILE", help="Image that gives the colors of the mesh, such as an albedo map.")

@@ -22,16 +22,14 @@ CALIBRATION_FOLDER = Option(
 SURFACE_FOLDER = Option(
     None, "--output", "-o", metavar="OUT", help="Folder of the results. [default: that of NORMALS]"
 )
-EVALUATION_FOLDER = Option(
-    Path("evaluation"), "--output", "-o", metavar="OUT", help="Folder for the results."
-)
+EVALUATION_FOLDER = Option(Path("evaluation"), "--output", "-o", metavar="OUT", help="Folder of the results.")
 PIXEL_SET = Option(..., "--output", "-o", metavar="SET", help="Folder of the pixel set.")
 RUN = Option(
     ...,
     "--output",
     "-o",
     metavar="RUN",
-    help=f"Folder of the run. Its files are renewed every {CHECKPOINT_SECONDS} seconds.",
+    help=f"Folder of the run. Its files are updated every {CHECKPOINT_SECONDS} seconds.",
 )
 WEIGHT_FILE = Option(..., "--output", "-o", metavar="FILE.safetensors", help="The weight file to write.")
 
@@ -57,7 +55,11 @@ MAPS = Option(
     help="Further maps to write: any of {maps} (a shaded image).",
     autocompletion=complete_list(choices.maps),
 )
-HTML = Option(False, "--html", help="Also write page.html: images and a view under a movable light.")
+HTML = Option(
+    False,
+    "--html",
+    help="Also write page.html: the maps, and a view of the surface under a light that you move.",
+)
 SURFACE = Option(False, "--surface", help="Also write mesh.ply, depth.npy and depth.tiff, as integrate does.")
 CONVENTION = Option(
     NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
@@ -79,11 +81,11 @@ TENSORBOARD = Option(
 OVERWRITE = Option(False, "--overwrite", help="Replace earlier results.")
 OVERWRITE_FILE = Option(False, "--overwrite", help="Replace an existing file.")
 OVERWRITE_PLOT = Option(False, "--overwrite", help="Replace an earlier plot.")
-OVERWRITE_TRIALS = Option(False, "--overwrite", help="Compute trials again that OUT already has.")
-UPDATE = Option(False, "--update", help="Redo captures that changed, skip those that are done.")
+OVERWRITE_TRIALS = Option(False, "--overwrite", help="Compute all trials again, also those stored in OUT.")
+UPDATE = Option(False, "--update", help="Compute changed captures again, and skip those that are done.")
 
 # What is printed.
 
-JSON = Option(False, "--json", help="Print one JSON document on stdout and nothing else.")
+JSON = Option(False, "--json", help="Print one JSON document on stdout, and nothing else.")
 JSON_LIST = Option(False, "--json", help="Print a JSON list of the reports on stdout, and nothing else.")
 QUIET = Option(False, "--quiet", "-q", help="Print nothing but errors.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typer import Argument, Option
 
 from splinecli.cli.options.values import complete_weights
-from splinecli.training.defaults import DEFAULT_PRESET, PRESET_NAMES
+from splinecli.training.defaults import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STEPS, PRESET_NAMES
 
 # Pixel sets of prepare.
 
@@ -13,11 +13,15 @@ SOURCES = Argument(
     None, metavar="SOURCE", help="Captures with ground truth, folders of them, CyclesPS trees."
 )
 SCENES = Option(0, metavar="N", min=0, help="Render N random scenes.")
-MESHES = Option(None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...). Repeatable.")
+MESHES = Option(
+    None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...). May be repeated."
+)
 IMAGE_SIZE = Option(
     None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"
 )
-SCENE_LIGHTS = Option(None, metavar="F", min=16, help="Number of lights of a rendered scene. [default: 500]")
+SCENE_LIGHTS = Option(
+    None, "--n-lights", metavar="N", min=16, help="Number of lights of a rendered scene. [default: 500]"
+)
 MEASURED = Option(None, metavar="FILE", help="Also use these measured materials (.npz).")
 MEASURED_SHARE = Option(0.5, metavar="SHARE", min=0, max=1, help="Share of the materials that are measured.")
 
@@ -32,25 +36,35 @@ PRESET = Option(
 )
 CONFIG = Option(None, metavar="FILE", help="Settings from a TOML file or a run's config.json.")
 PARAMETERS = Option(
-    None, metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. Repeatable."
+    None, metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. May be repeated."
 )
 START_FROM = Option(
     None,
     metavar="NAME|FILE",
-    help="Begin with these weights instead of random ones.",
+    help="Begin with these weights. [default: random weights]",
     autocompletion=complete_weights,
 )
 GENERATOR_WEIGHT = Option(
     None,
     metavar="W",
     min=0,
-    help="Weight of generated pixels, where each SET has weight 1. [default: 0; 1 without SET]",
+    help="Weight of generated pixels; each SET has weight 1. [default: 0; 1 without SET]",
 )
 LIGHT_COUNTS = Option(
     None, metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]"
 )
-STEPS = Option(None, metavar="N", min=1, help="Train for N steps.")
-MINUTES = Option(None, metavar="M", min=0.01, help="Train for M minutes.")
+STEPS = Option(
+    None,
+    metavar="N",
+    min=1,
+    help=f"Train for N steps. [default: {DEFAULT_STEPS:,}; preset paper: {PAPER_STEPS:,}]",
+)
+MINUTES = Option(
+    None,
+    metavar="M",
+    min=0.01,
+    help="Train for M minutes instead of a number of steps. [default: train for --steps]",
+)
 RESUME = Option(False, "--resume", help="Continue from the run's checkpoint.")
 RUN_SEED = Option(None, metavar="S", min=0, max=2**32 - 1, help="Seed of the run. [default: 0]")
 

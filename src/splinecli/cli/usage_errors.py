@@ -1,0 +1,90 @@
+"""Messages for the errors that click's parser finds, such as an unknown option or a word in place of a number.
+
+Typer and click name these errors differently from version to version, so this module relies on their attributes only.
+An error without a known attribute keeps click's text.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_NUMBERS = {"int": "a whole number", "float": "a number"}
+_LIMITS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
+_SYNTAX = (
+    (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
+    (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
+    (r"^Missing argument '(.+)'\.?$", r"\1 is missing"),
+    (r"^Missing option '([^']+)'.*$", r"\1 is missing"),
+    (r"^Missing command\.?$", "a command is missing"),
+    (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
+)
+"""Click's texts as regular expressions, and the words that replace them."""
+
+
+def usage_message(error: Any) -> str:
+    """Return the message for a usage error of click: what was found, what was expected, and where help is."""
+    context = getattr(error, "ctx", None)
+    where = context.command_path if context else "splinecli"
+    text = _bad_value(error) or _unknown_name(error) or _syntax(error.format_message())
+    end = "" if text.endswith("?") else "."
+    return f"{text.rstrip('.')}{end} See '{where} --help'."
+
+
+def _bad_value(error: Any) -> str | None:
+    """Return the message for a value of an option that has the wrong type or is out of range."""
+    details = getattr(error.__cause__, "errors", None)
+    parameter = getattr(error, "param", None)
+    if not callable(details) or not parameter:
+        return None
+    detail = details()[0]
+    option, value, limits = max(parameter.opts, key=len), detail["input"], detail.get("ctx", {})
+    kind = detail["type"].removesuffix("_parsing")
+    if kind in _NUMBERS:
+        return f"{option} is {value!r}; expected {_NUMBERS[kind]}{_range(parameter)}"
+    for limit, words in _LIMITS.items():
+        if limit in limits:
+            return f"{option} is {value}; expected {words} {limits[limit]:g}"
+    choices = re.search(r" is not one of (.+)$", detail["msg"])
+    if choices:
+        return f"{option} is {value!r}; expected one of {choices[1].replace(chr(39), '')}"
+    return None
+
+
+def _range(parameter: Any) -> str:
+    """Return the range of an option in words: " from 1", " from 0 to 1" or ""."""
+    from splinecli.capture.record import MIN_LIGHTS
+
+    smallest, largest = getattr(parameter, "min", None), getattr(parameter, "max", None)
+    if smallest is None and parameter.name == "n_lights":
+        # The number of lights is checked with the other values of infer, so that --json reports it.
+        smallest = MIN_LIGHTS
+    words = "" if smallest is None else f" from {smallest:g}"
+    return words if largest is None else f"{words} to {largest:.10g}"
+
+
+def _unknown_name(error: Any) -> str | None:
+    """Return the message for an unknown command or option, with similar names."""
+    text = error.format_message()
+    option = getattr(error, "option_name", None)
+    if option and hasattr(error, "possibilities"):
+        return f"no option {option}.{_suggestion(sorted(error.possibilities or ()))}"
+    command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)
+    if command:
+        return f"no command {command[1]}.{_suggestion((command[2] or '').strip('?').split(', '))}"
+    return None
+
+
+def _syntax(text: str) -> str:
+    """Return click's text in the words of the other messages."""
+    for pattern, words in _SYNTAX:
+        text = re.sub(pattern, words, text)
+    return text
+
+
+def _suggestion(names: list[str]) -> str:
+    names = [name for name in names if name]
+    if not names:
+        return ""
+    *most, last = names
+    return f" Did you mean {', '.join(most)} or {last}?" if most else f" Did you mean {last}?"
