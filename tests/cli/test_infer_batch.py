@@ -146,7 +146,7 @@ def test_update_keeps_files_of_others(capture, run):
     assert "out/sphere: contains normals.png, but no report.json. Add --overwrite" in result.err
     assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
     both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
-    assert (both.code, "exclude each other" in both.err) == (2, True)
+    assert (both.code, "contradict each other" in both.err) == (2, True)
 
 
 def test_another_object_of_the_same_name(capture, make_capture, run):
@@ -335,7 +335,7 @@ def test_a_folder_of_photographs_and_a_stray_file(capture, run):
         (("--white-level", "0"), 2, "the white level is 0, expected a number above 0"),
         (("--weights", "spline-net"), 2, "method ls uses no weights"),
         (("--maps", "confidence"), 2, "method ls gives no confidence"),
-        (("--update", "--overwrite"), 2, "--overwrite and --update exclude each other"),
+        (("--update", "--overwrite"), 2, "--overwrite and --update contradict each other"),
     ],
 )
 def test_arguments_are_checked_before_the_first_capture(

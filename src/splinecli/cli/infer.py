@@ -77,7 +77,7 @@ def infer(
 
     with _json_documents(as_json) as documents:
         if overwrite and update:
-            raise UsageError("--overwrite and --update exclude each other")
+            raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
         options = InferOptions(
             lights=_text(lights),
             intensities=_text(intensities),

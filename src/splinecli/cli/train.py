@@ -46,7 +46,7 @@ def train(
     options. With torchrun, several processes train together.
     """
     if steps is not None and minutes is not None:
-        raise UsageError("--steps and --minutes exclude each other")
+        raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
 
     from splinecli.training.run import configure_run, open_run, resumes
 
