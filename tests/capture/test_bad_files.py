@@ -101,7 +101,7 @@ def test_headers_that_may_not_be_read(folder: Path, forbid: Callable[[Path], Non
     with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
         is_display_encoded(folder / "1.tif")
     with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
-        stated_white_level([folder / "1.tif"])
+        stated_white_level(folder / "1.tif")
 
 
 def test_an_image_that_vanishes(folder: Path) -> None:

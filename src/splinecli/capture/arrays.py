@@ -71,9 +71,9 @@ def capture_from_arrays(
         light_indices=tuple(range(n_lights)),
         mask=inside,
         warnings=tuple(found.warnings()),
-        white_level=found.white_level,
+        white_level=found.saturation.white_level,
     )
-    stored = StoredCapture(capture, found.saturated, intensities_known=light_intensities is not None)
+    stored = StoredCapture(capture, found.saturation, intensities_known=light_intensities is not None)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.restore.white_level import Saturation, SaturationFinder
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,28 +24,29 @@ class StoredPixels:
         values: (P, C), as stored.
         linear: (P, C) float32, linear light.
         intensity: (3,), RGB, of the light.
+        stated_white_level: the white level that the file states; None where it states none.
     """
 
     path: Path
     values: NDArray[Any]
     linear: NDArray[np.float32]
     intensity: NDArray[np.float64]
+    stated_white_level: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Observations (P, F) as read, which of them are saturated (None for none), and from which stored value."""
+    """Observations (P, F) as read, and which of them are saturated."""
 
     values: NDArray[np.float32]
-    white_level: WhiteLevel | None
-    saturated: NDArray[np.bool_] | None
+    saturation: Saturation
     any_8_bit: bool
 
     def warnings(self) -> list[CaptureWarning]:
-        n_saturated = 0 if self.saturated is None else np.count_nonzero(self.saturated)
+        n_saturated = int(self.saturation.n_saturated.sum())
         n_black = len(self.values) - np.count_nonzero(self.values.any(axis=1))
         warnings = [
-            capture_warnings.white_level(self.white_level),
+            capture_warnings.white_level(self.saturation.white_level),
             capture_warnings.saturated(n_saturated / max(self.values.size, 1)),
             capture_warnings.black_pixels(n_black / max(len(self.values), 1)),
             capture_warnings.eight_bit() if self.any_8_bit else None,
@@ -71,12 +72,12 @@ def collect_observations(
     any_8_bit = False
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8
-        saturation.add(position, image.values, image.path)
+        saturation.add(position, image.values, image.path, stated=image.stated_white_level)
         observations[:, position] = _observe(image.linear, image.intensity)
         del image  # before the next one is decoded
         if progress is not None:
             progress()
-    return Observations(observations, *saturation.finish(), any_8_bit)
+    return Observations(observations, saturation.finish(), any_8_bit)
 
 
 def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -102,7 +102,7 @@ class CaptureSource:
             )
         images = self._stored_pixels(indices, mask, first)
         del first
-        saturation = self.find_saturation(int(np.count_nonzero(mask)), indices)
+        saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
         found = collect_observations(images, saturation, progress)
         warnings = [*self.warnings, *found.warnings()]
         if upside_down:
@@ -115,18 +115,9 @@ class CaptureSource:
             mask=mask,
             ground_truth=ground_truth,
             warnings=tuple(warnings),
-            white_level=found.white_level,
+            white_level=found.saturation.white_level,
         )
-        return StoredCapture(capture, found.saturated, self.intensities_known)
-
-    def find_saturation(self, n_pixels: int, indices: Sequence[int]) -> SaturationFinder:
-        """Return what finds the saturated observations of these images. Raises InputError."""
-        return SaturationFinder(
-            n_pixels,
-            len(indices),
-            given=self.white_level,
-            stated=stated_white_level([self.files.images[index] for index in indices]),
-        )
+        return StoredCapture(capture, found.saturation, self.intensities_known)
 
     def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
         """Return a function that reads the mask's (H, W) pixels (P, 3) RGB of an image by its index.
@@ -186,7 +177,9 @@ class CaptureSource:
             check_size(stored.shape, mask.shape, path, like=self.files.images[indices[0]].name)
             pixels = stored[mask]
             stored = None  # free this image before the next one is decoded
-            yield StoredPixels(path, pixels, linearise(pixels, path, index), self.light_intensities[index])
+            linear, intensity = linearise(pixels, path, index), self.light_intensities[index]
+            yield StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
+            del pixels, linear
 
     def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
         linear = linearise(pixels, self.files.images[index], index)

@@ -12,6 +12,7 @@ from splinecli.capture import capture_warnings
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
+from splinecli.capture.restore.white_level import Saturation
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,23 +20,28 @@ class StoredCapture:
     """A capture as its files store it, with what is needed to restore it.
 
     `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
-    lights of each draw, and restores each choice by itself, so that both commands see the same observations.
+    lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
+    level of a choice is decided from its images alone.
 
     Args:
         capture: the stored observations, linear, divided by the light intensities that the files give.
-        saturated: (P, F) bool, or None where no observation is saturated.
+        saturation: which observations are saturated.
         intensities_known: whether a file, an option or the image format gives the light intensities.
     """
 
     capture: Capture
-    saturated: NDArray[np.bool_] | None
+    saturation: Saturation
     intensities_known: bool
 
     def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
-        """Return the capture under some of its lights, with arrays of its own; see Capture.choose_lights."""
-        capture = self.capture.choose_lights(positions)
-        saturated = None if self.saturated is None else self.saturated[:, list(positions)]
-        return replace(self, capture=capture, saturated=saturated)
+        """Return the capture under some of its lights, with arrays of its own; see Capture.choose_lights.
+
+        The warnings stay those of all lights.
+        """
+        capture, saturation = self.capture.choose_lights(positions), self.saturation.choose_images(positions)
+        if saturation.white_level != capture.white_level:
+            capture = replace(capture, white_level=saturation.white_level)
+        return replace(self, capture=capture, saturation=saturation)
 
     def choose_pixels(self, rows: NDArray[np.integer]) -> StoredCapture:
         """Return the capture with some of its pixels, with arrays of its own.
@@ -43,15 +49,16 @@ class StoredCapture:
         Args:
             rows: rows of the observations, in rising order.
         """
-        saturated = None if self.saturated is None else self.saturated[rows]
-        return replace(self, capture=self.capture.choose_pixels(rows), saturated=saturated)
+        return replace(
+            self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows)
+        )
 
     def estimate_intensities(self) -> NDArray[np.float64] | None:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
         if self.intensities_known:
             return None
         return estimate_light_intensities(
-            self.capture.observations, self.saturated, self.capture.light_directions
+            self.capture.observations, self.saturation.flags, self.capture.light_directions
         )
 
     def restore(self, intensities: NDArray[np.float64] | None) -> Capture:
@@ -66,8 +73,9 @@ class StoredCapture:
         if intensities is not None:
             observations /= intensities.astype(np.float32)
             warnings = (*warnings, capture_warnings.estimated_intensities(intensities))
-        if self.saturated is not None:
-            restored = restore_saturated(observations, self.saturated, self.capture.light_directions)
+        saturated = self.saturation.flags
+        if saturated is not None:
+            restored = restore_saturated(observations, saturated, self.capture.light_directions)
         if intensities is None and restored is None:
             return self.capture
         return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import Lineariser
 from splinecli.capture.restore.saturation import find_saturated
@@ -104,11 +105,12 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
             mask = source.read_mask(stored.shape[:2])
             # It refuses ambient images and flat fields that do not fit.
             Lineariser(source.radiometry, mask, len(source.files.images))
-            finder = source.find_saturation(int(np.count_nonzero(mask)), range(len(source.files.images)))
+            n_images = len(source.files.images)
+            finder = SaturationFinder(int(np.count_nonzero(mask)), n_images, given=source.white_level)
         fits = mask.shape == stored.shape[:2]
         pixels = stored[mask] if fits else stored.reshape(-1, stored.shape[2])
         if fits:
-            finder.add(position, pixels, path)
+            finder.add(position, pixels, path, stated=stated_white_level(path))
         images.append(
             ImageSummary(
                 path,
@@ -130,8 +132,8 @@ def _by_white_level(
     finder: SaturationFinder, images: list[ImageSummary], mask: NDArray[np.bool_]
 ) -> tuple[WhiteLevel | None, tuple[ImageSummary, ...]]:
     """Return the white level, and the images with brightness and saturation relative to it."""
-    level, saturated = finder.finish()
-    shares = np.zeros(len(images)) if saturated is None else saturated.mean(axis=0)
+    saturation = finder.finish()
+    level, shares = saturation.white_level, saturation.n_saturated / max(np.count_nonzero(mask), 1)
     summaries = []
     for image, share in zip(images, shares, strict=True):
         bright = image.bright

@@ -39,13 +39,17 @@ def clip(images: NDArray[np.float64], level: int, exposure: float = 2.0) -> NDAr
     return np.minimum(np.rint(images * exposure * level), level).astype(np.uint16)
 
 
-def find(images: Images, **settings: int) -> tuple[WhiteLevel | None, int]:
+def find(
+    images: Images, *, given: int | None = None, stated: int | None = None
+) -> tuple[WhiteLevel | None, int]:
     """The white level of images (F, H, W), and the number of their saturated observations."""
-    finder = SaturationFinder(images[0].size, len(images), **settings)
+    finder = SaturationFinder(images[0].size, len(images), given=given)
     for position, image in enumerate(images):
-        finder.add(position, image.reshape(-1, 1), Path(f"{position}.png"))
-    level, saturated = finder.finish()
-    return level, 0 if saturated is None else int(saturated.sum())
+        finder.add(position, image.reshape(-1, 1), Path(f"{position}.png"), stated=stated)
+    saturation = finder.finish()
+    number = 0 if saturation.flags is None else int(saturation.flags.sum())
+    assert number == saturation.n_saturated.sum()
+    return saturation.white_level, number
 
 
 @pytest.mark.parametrize("level", [4095, 1023, 16_383, 4095 << 4, 15_600, 3839])

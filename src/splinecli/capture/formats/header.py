@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -40,24 +40,15 @@ def is_display_encoded(path: Path) -> bool:
     return False
 
 
-def stated_white_level(images: Sequence[Path]) -> int | None:
-    """Return the white level that all 16-bit images state, 2^bits - 1 where they state bits; None without one.
+def stated_white_level(path: Path) -> int | None:
+    """Return the white level that a 16-bit image states, 2^bits - 1 where it states bits; None without one.
 
     It comes from a PNG's chunk sBIT, or from a TIFF's BitsPerSample, WhiteLevel (DNG) or MaxSampleValue. The last one
     may also be the largest value of an image, so it counts only if it is 2^bits - 1.
 
     Raises:
-        InputError: a file cannot be read.
+        InputError: the file cannot be read.
     """
-    levels = set()
-    for path in images:
-        levels.add(_stated(path))
-        if len(levels) > 1 or None in levels:
-            return None
-    return levels.pop() if levels else None
-
-
-def _stated(path: Path) -> int | None:
     try:
         with path.open("rb") as file:
             start = file.read(len(_PNG))

@@ -7,7 +7,10 @@ have the values just below it. On a smooth surface without clipping, the maximum
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,6 +57,137 @@ class WhiteLevel:
     origin: Origin
 
 
+def _nothing() -> NDArray[np.int64]:
+    return np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class _ImageValues:
+    """What decides whether observations of one image are saturated.
+
+    Args:
+        full_scale: the largest value that the file can store; None for floating-point images.
+        stated: the white level that the file states; None where it states none.
+        saturated: the pixels at the given white level or above, or at full scale where none is given.
+        maximum: the largest value of a 16-bit image; 0 for other images.
+        at_maximum: the pixels with this value.
+        below: the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED.
+        counts: how often each of these values occurs.
+    """
+
+    full_scale: int | None = None
+    stated: int | None = None
+    saturated: NDArray[np.integer] = field(default_factory=_nothing)
+    maximum: int = 0
+    at_maximum: NDArray[np.integer] = field(default_factory=_nothing)
+    below: NDArray[np.int64] = field(default_factory=_nothing)
+    counts: NDArray[np.int64] = field(default_factory=_nothing)
+
+
+_NOT_ADDED = _ImageValues()
+
+
+@dataclass(frozen=True, eq=False)
+class Saturation:
+    """The white level of some images and their saturated observations, decided from these images alone.
+
+    Args:
+        n_pixels: P, the number of the mask's pixels.
+        images: what is known of each of the F images.
+        given: the white level that the user gave; None to find it.
+        rows: the pixels whose observations are wanted; None for all. The level is decided from all pixels.
+    """
+
+    n_pixels: int
+    images: tuple[_ImageValues, ...]
+    given: float | None = None
+    rows: NDArray[np.integer] | None = None
+
+    @property
+    def white_level(self) -> WhiteLevel | None:
+        """The white level; None for floating-point images, which have none."""
+        return self._decision[0]
+
+    @cached_property
+    def flags(self) -> NDArray[np.bool_] | None:
+        """The saturated observations (P, F), or None where none is saturated."""
+        _, saturated = self._decision
+        if not any(len(pixels) for pixels in saturated):
+            return None
+        rows = slice(None) if self.rows is None else self.rows
+        n_rows = self.n_pixels if self.rows is None else len(self.rows)
+        flags = np.zeros((n_rows, len(saturated)), np.bool_)
+        for position, pixels in enumerate(saturated):
+            column = np.zeros(self.n_pixels, np.bool_)
+            column[pixels] = True
+            flags[:, position] = column[rows]
+        return flags
+
+    @property
+    def n_saturated(self) -> NDArray[np.int64]:
+        """The number of saturated observations of each image (F,), among all pixels."""
+        return np.array([len(pixels) for pixels in self._decision[1]], np.int64)
+
+    def choose_images(self, positions: Sequence[int]) -> Saturation:
+        """Return the white level and the saturated observations that some of the images have by themselves."""
+        return replace(self, images=tuple(self.images[position] for position in positions))
+
+    def choose_pixels(self, rows: NDArray[np.integer]) -> Saturation:
+        """Return the same white level with the observations of some pixels."""
+        return replace(self, rows=rows if self.rows is None else self.rows[rows])
+
+    @cached_property
+    def _decision(self) -> tuple[WhiteLevel | None, list[NDArray[np.integer]]]:
+        """The white level, and the saturated pixels of each image."""
+        saturated = [image.saturated for image in self.images]
+        if self.given is not None:
+            return WhiteLevel(float(self.given), "given"), saturated
+        full_scale = max((image.full_scale or 0 for image in self.images), default=0)
+        if not full_scale:
+            return None, saturated
+        maximum = max(image.maximum for image in self.images)
+        if maximum not in (0, _FULL_SCALE_16_BIT) and not any(len(pixels) for pixels in saturated):
+            at_maximum = [
+                image.at_maximum if image.maximum == maximum else _nothing() for image in self.images
+            ]
+            stated = self._stated_level(maximum)
+            if stated is not None:
+                return WhiteLevel(stated, "file"), at_maximum if maximum >= stated else saturated
+            if self._is_clipped(maximum):
+                return WhiteLevel(maximum, "images"), at_maximum
+        return WhiteLevel(float(full_scale), "full scale"), saturated
+
+    def _stated_level(self, maximum: int) -> int | None:
+        """Return the level that all files state.
+
+        PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
+        """
+        levels = {image.stated for image in self.images if image is not _NOT_ADDED}
+        stated = levels.pop() if len(levels) == 1 else None
+        if stated is None or maximum <= stated:
+            return stated
+        bits = stated.bit_length()
+        return stated << (16 - bits) if stated + 1 == 1 << bits else None
+
+    def _is_clipped(self, maximum: int) -> bool:
+        """Return whether 16-bit images look clipped at their common maximum."""
+        images = [image for image in self.images if image.maximum == maximum]
+        fewest = max(FEWEST_PIXELS, SMALLEST_SHARE * self.n_pixels)
+        reaching = [image.at_maximum for image in images if len(image.at_maximum) >= fewest]
+        if len(reaching) < (FEWEST_IMAGES_AT_BITS if _is_bits(maximum) else FEWEST_IMAGES):
+            return False
+        # A flat background has one value under all lights. Clipped pixels are bright under some lights only.
+        images_at_maximum = np.bincount(np.concatenate(reaching), minlength=self.n_pixels)
+        number = int(images_at_maximum[images_at_maximum < len(reaching)].sum())
+        # Each image has its largest values, so the largest of all are among them, with all of their counts.
+        below, places = np.unique(np.concatenate([image.below for image in images]), return_inverse=True)
+        if len(below) < COMPARED_VALUES:
+            return False
+        counts = np.zeros(len(below), np.int64)
+        np.add.at(counts, places, np.concatenate([image.counts for image in images]))
+        return number >= SPIKE * int(counts[-COMPARED_VALUES:].max())
+
+
 class SaturationFinder:
     """Find the saturated observations of a capture from its images, one at a time.
 
@@ -61,115 +195,62 @@ class SaturationFinder:
         n_pixels: P, the number of the mask's pixels.
         n_images: F.
         given: the white level that the user gave; None to find it.
-        stated: the white level that the files state, 2^bits - 1 for a number of bits; None where they state none.
     """
 
-    def __init__(
-        self, n_pixels: int, n_images: int, *, given: float | None = None, stated: int | None = None
-    ) -> None:
+    def __init__(self, n_pixels: int, n_images: int, *, given: float | None = None) -> None:
         self.shape = n_pixels, n_images
-        self.given, self.stated = given, stated
-        self._full_scale: float | None = None
-        self._saturated: dict[int, NDArray[np.integer]] = {}  # image -> its saturated pixels
-        # Of 16-bit images: the largest value so far, the pixels that have it, and how often each value occurs there.
-        self._maximum = 0
-        self._at_maximum: dict[int, NDArray[np.integer]] = {}
-        self._counts = np.zeros(_FULL_SCALE_16_BIT + 1, np.int64)
+        self.given = given
+        self._images = [_NOT_ADDED] * n_images
 
-    def add(self, position: int, pixels: NDArray[Any], path: Path) -> None:
+    def add(self, position: int, pixels: NDArray[Any], path: Path, *, stated: int | None = None) -> None:
         """Add the mask's pixels (P, C) of the image at this position, as stored.
+
+        Args:
+            stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
 
         Raises:
             InputError: the white level that the user gave is above the image's full scale.
         """
-        if pixels.dtype.kind == "u":
-            full_scale = int(np.iinfo(pixels.dtype).max)
-            self._full_scale = max(self._full_scale or 0.0, float(full_scale))
-            if self.given is not None and self.given > full_scale:
+        full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
+        if self.given is not None:
+            if full_scale is not None and self.given > full_scale:
                 raise InputError(
                     f"the white level is {self.given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
                     path=path,
                     hint="Lower the white level, or leave it out",
                 )
-        if self.given is not None:
             saturated = np.asarray((pixels >= self.given).any(axis=1))
-            self._keep(self._saturated, position, saturated)
+            self._images[position] = _ImageValues(full_scale, stated, _indices(saturated))
             return
-        self._keep(self._saturated, position, find_saturated(pixels))
+        image = _ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
         if pixels.dtype == np.uint16 and pixels.size:
-            self._follow_maximum(position, pixels)
+            maximum = int(pixels.max())
+            at_maximum = _indices((pixels == maximum).any(axis=1)) if maximum else _nothing()
+            below, counts = _largest_values(pixels, maximum)
+            image = replace(image, maximum=maximum, at_maximum=at_maximum, below=below, counts=counts)
+        self._images[position] = image
 
-    def finish(self) -> tuple[WhiteLevel | None, NDArray[np.bool_] | None]:
-        """Return the white level and the saturated observations (P, F).
+    def finish(self) -> Saturation:
+        """Return the white level and the saturated observations. Images that were not added have none."""
+        n_pixels, _ = self.shape
+        return Saturation(n_pixels, tuple(self._images), self.given)
 
-        The level is None for floating-point images, which have none; the observations are None where none is
-        saturated.
-        """
-        level, saturated = self._decide()
-        if not saturated:
-            return level, None
-        flags = np.zeros(self.shape, np.bool_)
-        for position, pixels in saturated.items():
-            flags[pixels, position] = True
-        return level, flags
 
-    def _decide(self) -> tuple[WhiteLevel | None, dict[int, NDArray[np.integer]]]:
-        if self.given is not None:
-            return WhiteLevel(float(self.given), "given"), self._saturated
-        if self._full_scale is None:
-            return None, {}
-        at_full_scale = WhiteLevel(self._full_scale, "full scale"), self._saturated
-        if self._maximum in (0, _FULL_SCALE_16_BIT) or self._saturated:
-            return at_full_scale
-        stated = self._stated_level()
-        if stated is not None:
-            return WhiteLevel(stated, "file"), self._at_maximum if self._maximum >= stated else {}
-        if self._is_clipped():
-            return WhiteLevel(self._maximum, "images"), self._at_maximum
-        return at_full_scale
+def _indices(flags: NDArray[np.bool_]) -> NDArray[np.integer]:
+    # Indices, not flags: few observations are saturated, and large captures have billions.
+    return np.flatnonzero(flags).astype(np.int32 if len(flags) < 2**31 else np.int64)
 
-    def _keep(self, store: dict[int, NDArray[np.integer]], position: int, flags: NDArray[np.bool_]) -> None:
-        # Indices, not flags: few observations are saturated, and large captures have billions.
-        pixels = np.flatnonzero(flags)
-        if len(pixels):
-            store[position] = pixels.astype(np.int32 if len(flags) < 2**31 else np.int64)
 
-    def _follow_maximum(self, position: int, pixels: NDArray[np.uint16]) -> None:
-        maximum = int(pixels.max())
-        if maximum > self._maximum:
-            self._maximum = maximum
-            self._at_maximum.clear()
-            self._counts[:] = 0
-        if maximum < self._maximum:
-            return
-        self._keep(self._at_maximum, position, (pixels == maximum).any(axis=1))
-        values = pixels.reshape(-1)
-        for start in range(0, len(values), _BLOCK):
-            self._counts += np.bincount(values[start : start + _BLOCK], minlength=len(self._counts))
-
-    def _stated_level(self) -> int | None:
-        """Return the level by the number of bits that the files state.
-
-        PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
-        """
-        if self.stated is None or self._maximum <= self.stated:
-            return self.stated
-        bits = self.stated.bit_length()
-        return self.stated << (16 - bits) if self.stated + 1 == 1 << bits else None
-
-    def _is_clipped(self) -> bool:
-        """Return whether 16-bit images look clipped at their common maximum."""
-        fewest = max(FEWEST_PIXELS, SMALLEST_SHARE * self.shape[0])
-        reaching = [pixels for pixels in self._at_maximum.values() if len(pixels) >= fewest]
-        if len(reaching) < (FEWEST_IMAGES_AT_BITS if _is_bits(self._maximum) else FEWEST_IMAGES):
-            return False
-        # A flat background has one value under all lights. Clipped pixels are bright under some lights only.
-        images_at_maximum = np.bincount(np.concatenate(reaching), minlength=self.shape[0])
-        number = int(images_at_maximum[images_at_maximum < len(reaching)].sum())
-        below = np.flatnonzero(self._counts[: self._maximum])[-COMPARED_VALUES:]
-        if len(below) < COMPARED_VALUES or below[0] < LOWEST_COMPARED * self._maximum:
-            return False
-        return number >= SPIKE * int(self._counts[below].max())
+def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the values of an image that are compared with its maximum, in rising order, and their counts."""
+    lowest = math.ceil(LOWEST_COMPARED * maximum)
+    values = pixels.reshape(-1)
+    counts = np.zeros(maximum + 1, np.int64)
+    for start in range(0, len(values), _BLOCK):
+        block = values[start : start + _BLOCK]
+        counts += np.bincount(block[block >= lowest], minlength=len(counts))
+    below = np.flatnonzero(counts[:maximum])[-COMPARED_VALUES:].copy()
+    return below, counts[below]
 
 
 def _is_bits(level: int) -> bool:
