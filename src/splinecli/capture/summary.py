@@ -133,7 +133,7 @@ def _by_white_level(
 ) -> tuple[WhiteLevel | None, tuple[ImageSummary, ...]]:
     """Return the white level, and the images with brightness and saturation relative to it."""
     saturation = finder.finish()
-    level, shares = saturation.white_level, saturation.n_saturated / max(np.count_nonzero(mask), 1)
+    level, shares = saturation.white_level, saturation.n_saturated / max(int(np.count_nonzero(mask)), 1)
     summaries = []
     for image, share in zip(images, shares, strict=True):
         bright = image.bright
