@@ -60,8 +60,8 @@ def estimate_normals(
 
     Args:
         tile_pixels: number of pixels that the estimator gets at once.
-        progress: called with the number of pixels just finished: after each batch of the estimator (about 1,000 pixels
-            for networks), not only after each tile.
+        progress: called with the number of pixels just finished: after each batch of the estimator, and about 30 times
+            a batch of a network, not only after each tile.
 
     Raises:
         SplinecliError: the estimator gave normals that are not unit vectors.

@@ -12,6 +12,7 @@ from torch import Tensor
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import CONFIDENT_DEG, Directions, Observations, Progress
+from splinecli.methods.layer_progress import LayerProgress, PixelSteps
 from splinecli.networks.error_head import probability_within
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
@@ -66,6 +67,8 @@ class NetworkEstimator:
         self.batch_size = batch_size
         self.network = loaded.network.to(device)
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
+        self._layers = LayerProgress(self.network)
+        self._work_per_pixel = rotations * self._layers.work_of(self._run_one_pixel)
 
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
@@ -98,16 +101,29 @@ class NetworkEstimator:
         light_directions: Directions,
         progress: Progress | None,
     ) -> NDArray[np.float32]:
+        def solve(batch: Tensor, lights: Tensor) -> Tensor:
+            if progress is None:
+                return self._average_rotations(batch, lights)
+            steps = PixelSteps(progress, len(batch), len(batch) * self._work_per_pixel)
+            with self._layers.counting(steps.add):
+                solved = self._average_rotations(batch, lights)
+            steps.finish()
+            return solved
+
         return estimate_in_batches(
-            self._average_rotations,
+            solve,
             observations,
             light_directions,
             batch_size=self.batch_size,
             device=self.device,
             dtype=torch.float32,
             columns=4,
-            progress=progress,
         )
+
+    @torch.inference_mode()
+    def _run_one_pixel(self) -> None:
+        lights = torch.eye(3, device=self.device)
+        self.network(torch.ones(1, 3, device=self.device), lights)
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
         """Return normals and confidence (P, 4). The confidence is 0 without an error head."""
