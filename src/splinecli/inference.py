@@ -60,7 +60,7 @@ def estimate_normals(
 
     Args:
         tile_pixels: number of pixels that the estimator gets at once.
-        progress: called with the number of pixels just finished: after each batch of the estimator, and about 30 times
+        progress: called with the number of pixels just finished: after each batch of the estimator, and up to 128 times
             a batch of a network, not only after each tile.
 
     Raises:

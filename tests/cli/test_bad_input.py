@@ -122,8 +122,9 @@ def test_capture_with_two_images(capture, run, golden):
     golden("bad_input/two_images.txt", result.err)
 
 
-def test_same_names(capture, run, golden):
-    result = run("infer", capture, capture / "." / "../sphere")
+def test_same_names(capture, make_capture, run, golden):
+    make_capture("others/sphere")
+    result = run("infer", capture, "others/sphere")
     assert result.code == 2
     golden("bad_input/same_names.txt", result.err)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
+from typer.models import ParameterInfo
 
 from splinecli import __version__
 from splinecli.cli.calibrate import calibrate
@@ -45,11 +48,16 @@ def _splinecli(
     pass
 
 
-app.command(cls=Command)(infer)
-app.command(cls=Command)(info)
-app.command(cls=Command)(calibrate)
-app.command(cls=Command)(integrate)
-app.command(cls=Command)(evaluate)
-app.command(cls=Command)(prepare)
-app.command(cls=Command)(train)
-app.command(cls=Command)(import_weights)
+def _add(command: Callable[..., object]) -> None:
+    """Add a command whose paths are checked by the pipeline alone.
+
+    By default, Typer refuses a path without permission. One such capture would then end a batch.
+    """
+    for parameter in inspect.signature(command).parameters.values():
+        if isinstance(parameter.default, ParameterInfo):
+            parameter.default.readable = False
+    app.command(cls=Command)(command)
+
+
+for _command in (infer, info, calibrate, integrate, evaluate, prepare, train, import_weights):
+    _add(_command)

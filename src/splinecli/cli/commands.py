@@ -1,4 +1,4 @@
-"""What all commands share: help in panels, and `~` in every path."""
+"""What all commands share: help in panels, `~` in every path, and a JSON document also where a command fails."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import typer
 from typer.core import TyperCommand, TyperGroup
 
 from splinecli.cli.choices import fill_in
+from splinecli.cli.failures import ParserError, print_error_document
 from splinecli.cli.panels import sort_into_panels
 
 TERM_WIDTH = 30
@@ -18,11 +20,29 @@ TERM_WIDTH = 30
 
 ARGUMENTS = "Arguments"
 
+INFER = "infer"
+"""The command whose JSON is a list of documents."""
+
+JSON = "--json"
+
 _RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"
 
 
 class Command(TyperCommand):
-    """A command whose help has panels, as plain text, and which expands `~` in what it is given."""
+    """A command whose help has panels, as plain text, and which expands `~` in its arguments.
+
+    With --json, a command that fails prints a document on stdout as well: {"error", "exit_code"}.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the arguments into `ctx.params`."""
+        wants_json = JSON in args and any(JSON in parameter.opts for parameter in self.params)
+        try:
+            return super().parse_args(ctx, args)
+        except ParserError as error:
+            if wants_json:
+                print_error_document(error, as_list=ctx.info_name == INFER)
+            raise
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
@@ -36,7 +56,17 @@ class Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Run the command. A shell expands `~` in `-o ~/x`, but not in `--output=~/x`."""
         ctx.params = {name: _expand(value) for name, value in ctx.params.items()}
-        return super().invoke(ctx)
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            # infer prints its list itself, with what it has done until then.
+            if (
+                ctx.params.get("as_json")
+                and ctx.info_name != INFER
+                and not isinstance(error, typer.Exit | typer.Abort)
+            ):
+                print_error_document(error, as_list=False)
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line, without the braces that Typer sets about arguments."""

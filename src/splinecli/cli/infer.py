@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.cli import choices
 from splinecli.cli.console import Messages
+from splinecli.cli.failures import error_document
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import Device, NormalConvention, Precision, parse_indices, split_commas
-from splinecli.errors import SplinecliError, UsageError
+from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome, Redo
@@ -114,13 +115,11 @@ def infer(
 @contextmanager
 def _json_documents(wanted: bool) -> Iterator[list[dict[str, Any]]]:
     """Yield a list of documents and print it at the end, also after an error, if it is wanted."""
-    from splinecli.pipeline.batch import error_document
-
     documents: list[dict[str, Any]] = []
     try:
         yield documents
-    except SplinecliError as error:
-        documents.append(error_document(error))
+    except Exception as error:
+        documents.append({"capture": None, **error_document(error)})
         raise
     finally:
         if wanted:
@@ -144,10 +143,7 @@ def _run(
         outcomes.append(outcome)
         documents.append(outcome.report)
         _show(outcome, output, messages, with_summary=summaries)
-    if any(outcome.status == "missing" for outcome in outcomes):
-        if len(captures) > 1:
-            messages.say("Nothing was computed.")
-    elif len(captures) > 1:
+    if len(outcomes) > 1:
         _show_table(outcomes, output, messages)
     return worst_exit_code(outcome.exit_code for outcome in outcomes)
 

@@ -8,49 +8,41 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import typer
 
 from splinecli.cli.app import app
-from splinecli.cli.usage_errors import usage_message
-from splinecli.errors import OutputError, SplinecliError
+from splinecli.cli.closed_pipes import UntilClosed
+from splinecli.cli.failures import explain, is_defect
 
 INTERRUPTED = 130
-DEFECT = 1
-# Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
-_ClickUsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
     _repair_streams()
     _let_threads_sleep()
+    out, err = UntilClosed(sys.stdout), UntilClosed(sys.stderr)
+    with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
+        code = _run_command(args)
+        out.flush()
+    return code
+
+
+def _run_command(args: Sequence[str] | None) -> int:
     command = typer.main.get_command(app)
     try:
         result = command.main(
             args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False
         )
-        sys.stdout.flush()
-    except SplinecliError as error:
-        return fail(str(error), error.exit_code)
-    except _ClickUsageError as error:
-        return fail(usage_message(error), 2)
-    except BrokenPipeError:
-        return _end_at_closed_pipe()
-    except SystemExit as error:
-        # Click turns a closed pipe into exit code 1.
-        if isinstance(error.__context__, BrokenPipeError):
-            return _end_at_closed_pipe()
-        raise
     except (KeyboardInterrupt, typer.Abort):
         return fail("interrupted.", INTERRUPTED)
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        return fail(f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code)
-    except Exception:
-        traceback.print_exc()
-        return fail("this is a defect of splinecli; please report it with the lines above.", DEFECT)
+    except Exception as error:
+        if is_defect(error):
+            traceback.print_exc()
+        return fail(*explain(error))
     if result == INTERRUPTED:
         return fail("interrupted.", INTERRUPTED)
     return result if isinstance(result, int) else 0
@@ -60,13 +52,6 @@ def fail(message: str, exit_code: int) -> int:
     """Print the message on stderr, in one line, and return the exit code."""
     print(f"splinecli: {message}", file=sys.stderr)
     return exit_code
-
-
-def _end_at_closed_pipe() -> int:
-    """Return 0: the reader of stdout has read enough, as `| head -1` does."""
-    # Otherwise Python complains when it flushes stdout at its exit.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
 
 
 def _repair_streams() -> None:

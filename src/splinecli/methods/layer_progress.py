@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from splinecli.methods.estimator import Progress
 
-STEPS = 32
+STEPS = 128
 """Most calls for a batch. A batch of cnn-ps takes 10 seconds on one core."""
 
 

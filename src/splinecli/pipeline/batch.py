@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -54,16 +54,16 @@ def infer_batch(
 ) -> Iterator[Outcome]:
     """Run `infer_capture` on each folder and yield its outcome, in order.
 
-    If a folder does not exist, only the missing ones are yielded and nothing is computed. With several captures, or
-    where OUT/index.html is there already, that page is written at the end.
+    With several captures, or where OUT/index.html is there already, that page is written at the end.
 
     Args:
-        folders: the captures.
+        folders: the captures. A folder that is given twice counts once.
         options, observer: see infer_capture.
         redo: which captures that have results are computed again.
 
     Raises:
-        UsageError: two captures have the same name, or the options do not fit the method.
+        UsageError: two captures have the same name, the options do not fit the method, or a "folder" that does not
+            exist is the name of a map, format or method.
         InputError: a file that the options name does not exist.
         ModelError: the weights cannot be used.
         OutputError: the output folder cannot be written, or the disk is full.
@@ -71,12 +71,10 @@ def infer_batch(
     from splinecli.files import check_writable
     from splinecli.results.index import check_index_free, has_index
 
+    folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     missing = _missing(folders)
-    if missing:
-        yield from missing
-        return
     names = [_name(folder) for folder in folders]
-    _check_names(folders, names)
+    _check_names({folder: name for folder, name in zip(folders, names, strict=True) if folder not in missing})
     options.check_files()
     output = Path(options.output)
     check_writable(output)
@@ -87,7 +85,7 @@ def infer_batch(
     outcomes = []
     for folder, name in zip(folders, names, strict=True):
         try:
-            outcome = _earlier_outcome(folder, name, options, redo)
+            outcome = missing.get(folder) or _earlier_outcome(folder, name, options, redo)
         except Exception as error:
             outcome = _failure(name, folder, error)
         if outcome is None:
@@ -115,23 +113,38 @@ def error_document(error: SplinecliError, capture: str | None = None) -> dict[st
     return {"capture": capture, "error": str(error), "exit_code": error.exit_code}
 
 
-def _missing(folders: Sequence[Path]) -> list[Outcome]:
-    """Return a failure for each folder that does not exist."""
+def _own_path(folder: Path) -> Path:
+    """Return one path for all spellings of a folder. A link keeps its name, because its results have it."""
+    from splinecli.capture.paths import resolve
+
+    try:
+        return resolve(folder) if ".." in folder.parts else folder.absolute()
+    except InputError:
+        return folder  # what is wrong with it is reported when its turn comes
+
+
+def _missing(folders: Sequence[Path]) -> dict[Path, Outcome]:
+    """Return a failure for each folder that does not exist. Raises UsageError for a word of another option."""
     from splinecli.capture.paths import find_mode
     from splinecli.methods import method_names
     from splinecli.results.files import MAPS, NORMALS
 
-    outcomes = []
+    outcomes = {}
     for folder in folders:
         try:
             exists = find_mode(folder) is not None
         except InputError:
             exists = True  # what is wrong with it is reported when its turn comes
-        if not exists:
-            stray = str(folder) in (*MAPS, *NORMALS, *method_names())
-            hint = "Write lists with commas, such as --maps albedo,confidence" if stray else None
-            error = InputError("the folder does not exist", path=folder, hint=hint)
-            outcomes.append(replace(_failed(folder.name or str(folder), error), status="missing"))
+        if exists:
+            continue
+        if str(folder) in (*MAPS, *NORMALS, *method_names()):
+            raise UsageError(
+                "the folder does not exist",
+                path=folder,
+                hint="Write lists with commas, such as --maps albedo,confidence",
+            )
+        error = InputError("the folder does not exist", path=folder)
+        outcomes[folder] = replace(_failed(folder.name or str(folder), error), status="missing")
     return outcomes
 
 
@@ -144,9 +157,9 @@ def _name(folder: Path) -> str:
         return folder.name  # what is wrong with it is reported when its turn comes
 
 
-def _check_names(folders: Sequence[Path], names: Sequence[str]) -> None:
+def _check_names(names: Mapping[Path, str]) -> None:
     seen: dict[str, Path] = {}
-    for folder, name in zip(folders, names, strict=True):
+    for folder, name in names.items():
         other = seen.setdefault(name, folder)
         if other is not folder:
             raise UsageError(

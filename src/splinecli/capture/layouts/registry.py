@@ -61,7 +61,8 @@ def find_captures(folder: StrPath) -> list[Path]:
 
     A capture is a folder with a light file beside its images, or beside the folder Objects that contains them (PSBox),
     or a folder of images of a CyclesPS object. An object of CyclesPS and its published tree are datasets, too. The
-    captures are found by names of files; reading one may still fail.
+    captures are found by names of files; reading one may still fail. A subfolder that cannot be listed counts as a
+    capture, so that the caller reports it when it reads it.
 
     Raises:
         InputError: the folder is missing, is a file, or contains no capture.
@@ -90,9 +91,12 @@ def _captures_in(folder: Path) -> list[Path]:
 
 def _captures_below(folder: Path) -> list[Path]:
     """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's tree."""
-    if folder.name in cyclesps.TREES:
-        return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
-    return _captures_in(folder)
+    try:
+        if folder.name in cyclesps.TREES:
+            return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
+        return _captures_in(folder)
+    except InputError:
+        return [folder]
 
 
 def _looks_like_capture(folder: Path) -> bool:

@@ -1,0 +1,46 @@
+"""Errors as one message, an exit code, and the JSON document that stands in place of a report."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import typer
+
+from splinecli.cli.usage_errors import usage_message
+from splinecli.errors import OutputError, SplinecliError
+
+DEFECT = 1
+USAGE = 2
+# Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
+ParserError: type[Exception] = typer.BadParameter.__mro__[1]
+"""What the parser raises for arguments that it cannot use."""
+
+
+def explain(error: Exception) -> tuple[str, int]:
+    """Return the message of an error that ends a command, and its exit code."""
+    if isinstance(error, SplinecliError):
+        return str(error), error.exit_code
+    if isinstance(error, ParserError):
+        return usage_message(error), USAGE
+    if isinstance(error, OSError):
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code
+    return "this is a defect of splinecli; please report it with the lines above.", DEFECT
+
+
+def is_defect(error: Exception) -> bool:
+    """Return whether splinecli did not expect the error."""
+    return not isinstance(error, SplinecliError | ParserError | OSError)
+
+
+def error_document(error: Exception) -> dict[str, Any]:
+    """Return {"error", "exit_code"}."""
+    message, exit_code = explain(error)
+    return {"error": message, "exit_code": exit_code}
+
+
+def print_error_document(error: Exception, *, as_list: bool) -> None:
+    """Print on stdout the document of an error that ends a command; the list of infer's documents with `as_list`."""
+    document = error_document(error)
+    print(json.dumps([{"capture": None, **document}] if as_list else document, indent=2))
