@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,6 +96,25 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> C
     def call(*args: object) -> Run:
         code = main([str(arg) for arg in args])
         return Run(code, *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def run_without_privileges() -> Callable[..., Run]:
+    """Run the command line in a process that permissions bind, also where the tests run as root."""
+    command = [sys.executable, "-m", "splinecli"]
+    if os.name == "nt":
+        pytest.skip("POSIX permissions")
+    if os.geteuid() == 0:
+        if shutil.which("setpriv") is None:
+            pytest.skip("root may read everything, and setpriv is not installed")
+        rights = "-dac_override,-dac_read_search"
+        command = ["setpriv", f"--bounding-set={rights}", f"--inh-caps={rights}", *command]
+
+    def call(*args: object) -> Run:
+        done = subprocess.run([*command, *map(str, args)], capture_output=True, text=True)
+        return Run(done.returncode, done.stdout, done.stderr)
 
     return call
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -66,6 +67,97 @@ def test_a_closed_pipe_is_no_error(command, capture):
     os.close(write)
     unexpected = [line for line in done.stderr.splitlines() if not line.startswith("splinecli: warning: ")]
     assert (done.returncode, unexpected) == (0, [])
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
+@pytest.mark.parametrize("closed", ["stdout", "both"])
+def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_capture):
+    """`infer captures/* | head -1` and `infer captures/* 2>&1 | head -1` compute every capture."""
+    make_capture("second")
+    make_capture("third")
+    Path("third/image3.png").write_bytes(b"no picture")
+    read, write = os.pipe()
+    os.close(read)
+    arguments = [
+        sys.executable,
+        "-u",
+        "-m",
+        "splinecli",
+        "infer",
+        str(capture),
+        "third",
+        "second",
+        "--method",
+        "ls",
+    ]
+    done = subprocess.run(
+        arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True
+    )
+    os.close(write)
+    assert done.returncode == 3
+    assert {path.name for path in Path("out").iterdir()} == {"index.html", "second", "sphere"}
+    if closed == "stdout":
+        assert done.stderr.endswith("3 captures: 2 done, 1 failed; see out/index.html\n")
+
+
+FAILING = {
+    "infer": ("nowhere",),
+    "info": ("nowhere",),
+    "calibrate": ("nowhere",),
+    "integrate": ("nowhere",),
+    "evaluate": ("nowhere",),
+    "prepare": ("nowhere", "-o", "set"),
+}
+
+
+def test_all_commands_with_json_are_in_the_next_tests():
+    with_json = {name for name, one in COMMANDS.items() if any("--json" in p.opts for p in one.params)}
+    assert with_json == set(FAILING)
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_a_failure_is_a_json_document(name, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run(name, *FAILING[name], "--json")
+    document = json.loads(result.out)
+    if name == "infer":
+        (document,) = document
+        assert document.pop("capture") == "nowhere"
+    assert document == {
+        "error": result.err.removeprefix("splinecli: ").rstrip("\n"),
+        "exit_code": result.code,
+    }
+    assert (result.code, "nowhere" in document["error"]) == (3, True)
+
+
+@pytest.mark.parametrize("name", FAILING)
+@pytest.mark.parametrize(
+    "wrong", [("--magic",), ("--output",), ()], ids=["unknown", "no value", "no argument"]
+)
+def test_an_error_of_the_parser_is_a_json_document(name, wrong, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run(name, "--json", *wrong)
+    document = json.loads(result.out)
+    if name == "infer":
+        (document,) = document
+        assert document.pop("capture") is None
+    assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": 2}
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert run(name, "--magic").out == ""
+
+
+@pytest.mark.parametrize(("command", "skipped"), [("evaluate", "capture"), ("prepare", "source")])
+def test_a_subfolder_without_permission_is_skipped(command, skipped, make_capture, run_without_privileges):
+    for name in ("set/a", "set/b", "set/c"):
+        make_capture(name)
+    Path("set/b").chmod(0)
+    extra = ("--method", "ls", "--trials", 1, "--n-lights", 4) if command == "evaluate" else ()
+    result = run_without_privileges(command, "set", *extra, "-o", "out", "--json")
+    Path("set/b").chmod(0o755)
+    (entry,) = json.loads(result.out)["skipped"]
+    assert (result.code, Path(entry[skipped]).name) == (3, "b")
+    assert "set/b: the folder cannot be read (Permission denied)" in entry["reason"]
+    assert entry["reason"] in result.err
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def main(args: Sequence[str] | None = None) -> int:
     _repair_streams()
     _let_threads_sleep()
     out, err = UntilClosed(sys.stdout), UntilClosed(sys.stderr)
-    with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
+    with redirect_stdout(out), redirect_stderr(err):
         code = _run_command(args)
         out.flush()
     return code
