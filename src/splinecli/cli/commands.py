@@ -35,22 +35,15 @@ class Command(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the arguments into `ctx.params`."""
-        wants_json = JSON in args and any(JSON in parameter.opts for parameter in self.params)
-        try:
-            return super().parse_args(ctx, args)
-        except ParserError as error:
-            if wants_json:
-                print_error_document(error, as_list=ctx.info_name == INFER)
-            raise
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
+        wants_json = JSON in args and any(JSON in parameter.opts for parameter in self.params)
         try:
             return super().parse_args(ctx, args)
         except Exception as error:
             if getattr(error, "ctx", self) is None:
                 error.ctx = ctx  # type: ignore[attr-defined]
+            if wants_json and isinstance(error, ParserError):
+                print_error_document(error, as_list=ctx.info_name == INFER)
             raise
 
     def invoke(self, ctx: Any) -> Any:
