@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from splinecli.errors import ModelError
-from splinecli.networks.light_set import HEAD_WIDTH
+from splinecli.networks.set_branch import HEAD_WIDTH
 from splinecli.networks.starting_fits import STARTING_FITS
 from splinecli.observation_map import MAP_SIZE, Grid
 

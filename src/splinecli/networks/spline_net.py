@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from splinecli.fits.lambertian import fit_lambertian
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_net import CompactLINet, PaperLINet
-from splinecli.networks.light_set import SetBranch
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
+from splinecli.networks.set_branch import SetBranch
 from splinecli.networks.starting_fits import fit_normals
 from splinecli.observation_map import (
     cell_directions,
