@@ -61,7 +61,7 @@ def test_settings_left_out_have_their_defaults() -> None:
         ({"sources": ["set"]}, "'sources' is .* expected a table of settings"),
         ({"sources": {"set": True}}, "the weight of source 'set' is True; expected a number from 0"),
         ({"sources": {"set": float("inf")}}, "the weight of source 'set' is inf"),
-        ({"sources": {"set": 0}}, "'sources' gives no source a weight above 0"),
+        ({"sources": {"set": 0}}, "'sources' has no weight above 0"),
     ],
 )
 def test_refused(values: dict[str, Any], message: str) -> None:

@@ -81,7 +81,7 @@ def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
     file = write(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
     assert configure(None, file).sources == {"/data/a": 2.0, "/data/b": 1.0}
     assert configure(None, file, [{"sources": {"/data/c": 1.0}}]).sources == {"/data/c": 1.0}
-    with pytest.raises(ModelError, match="gives no source a weight above 0"):
+    with pytest.raises(ModelError, match="has no weight above 0"):
         configure(None, None, [{"sources": {}}])
 
 
