@@ -68,7 +68,6 @@ class NetworkEstimator:
         self.network = loaded.network.to(device)
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._layers = LayerProgress(self.network)
-        self._work_per_pixel = rotations * self._layers.work_of(self._run_one_pixel)
 
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
@@ -101,10 +100,12 @@ class NetworkEstimator:
         light_directions: Directions,
         progress: Progress | None,
     ) -> NDArray[np.float32]:
+        work_per_pixel = 0 if progress is None else self._work_per_pixel(len(light_directions))
+
         def solve(batch: Tensor, lights: Tensor) -> Tensor:
             if progress is None:
                 return self._average_rotations(batch, lights)
-            steps = PixelSteps(progress, len(batch), len(batch) * self._work_per_pixel)
+            steps = PixelSteps(progress, len(batch), len(batch) * work_per_pixel)
             with self._layers.counting(steps.add):
                 solved = self._average_rotations(batch, lights)
             steps.finish()
@@ -121,9 +122,11 @@ class NetworkEstimator:
         )
 
     @torch.inference_mode()
-    def _run_one_pixel(self) -> None:
-        lights = torch.eye(3, device=self.device)
-        self.network(torch.ones(1, 3, device=self.device), lights)
+    def _work_per_pixel(self, n_lights: int) -> int:
+        """Return the multiplications for a pixel. The set branch, if there is one, has some for each light."""
+        observations = torch.ones(1, n_lights, device=self.device)
+        lights = torch.tensor((0.0, 0.0, 1.0), device=self.device).expand(n_lights, 3)
+        return len(self._rotations) * self._layers.work_of(lambda: self.network(observations, lights))
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
         """Return normals and confidence (P, 4). The confidence is 0 without an error head."""
