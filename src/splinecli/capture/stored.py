@@ -15,6 +15,11 @@ from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.capture.restore.white_level import Saturation
 
 
+def name_reading(*, as_stored: bool) -> str:
+    """Return how a capture was read, as reports and pixel sets name it; see CaptureSource.read."""
+    return "as stored" if as_stored else "restored"
+
+
 @dataclass(frozen=True, eq=False)
 class StoredCapture:
     """A capture as its files store it, with what is needed to restore it.

@@ -10,7 +10,6 @@ import typer
 from splinecli.cli.usage_errors import usage_message
 from splinecli.errors import OutputError, SplinecliError
 
-DEFECT = 1
 USAGE = 2
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
 ParserError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -26,7 +25,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code
-    return "this is a defect of splinecli; please report it with the lines above.", DEFECT
+    return "this is a defect of splinecli; please report it with the lines above.", SplinecliError.exit_code
 
 
 def is_defect(error: Exception) -> bool:
@@ -40,7 +39,11 @@ def error_document(error: Exception) -> dict[str, Any]:
     return {"error": message, "exit_code": exit_code}
 
 
+def batch_error_document(error: Exception) -> dict[str, Any]:
+    """Return {"capture", "error", "exit_code"} for an error that ends infer's batch; it is no capture's."""
+    return {"capture": None, **error_document(error)}
+
+
 def print_error_document(error: Exception, *, as_list: bool) -> None:
     """Print on stdout the document of an error that ends a command; the list of infer's documents with `as_list`."""
-    document = error_document(error)
-    print(json.dumps([{"capture": None, **document}] if as_list else document, indent=2))
+    print(json.dumps([batch_error_document(error)] if as_list else error_document(error), indent=2))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.cli import choices
 from splinecli.cli.console import Messages
-from splinecli.cli.failures import error_document
+from splinecli.cli.failures import batch_error_document
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import Device, NormalConvention, Precision, parse_indices, split_commas
 from splinecli.errors import UsageError
@@ -119,7 +119,7 @@ def _json_documents(wanted: bool) -> Iterator[list[dict[str, Any]]]:
     try:
         yield documents
     except Exception as error:
-        documents.append({"capture": None, **error_document(error)})
+        documents.append(batch_error_document(error))
         raise
     finally:
         if wanted:

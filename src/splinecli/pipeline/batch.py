@@ -23,9 +23,6 @@ Redo = Literal["nothing", "changed", "all"]
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
-DEFECT = 1
-"""Exit code of an error that splinecli did not expect."""
-
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
@@ -105,11 +102,11 @@ def infer_batch(
 def worst_exit_code(codes: Iterable[int]) -> int:
     """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
     found = set(codes)
-    return DEFECT if DEFECT in found else max(found, default=0)
+    return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
 
 
-def error_document(error: SplinecliError, capture: str | None = None) -> dict[str, Any]:
-    """Return what stands in place of a report: `capture` is None for an error that ended the batch."""
+def _error_document(error: SplinecliError, capture: str) -> dict[str, Any]:
+    """Return the document that stands in place of the report of a capture."""
     return {"capture": capture, "error": str(error), "exit_code": error.exit_code}
 
 
@@ -187,7 +184,7 @@ def _earlier_outcome(folder: Path, name: str, options: InferOptions, redo: Redo)
         path=target,
         hint=f"Add {update}--overwrite to redo everything, or choose another place with -o",
     )
-    return Outcome(name, "changed", error_document(error, name), error.exit_code)
+    return Outcome(name, "changed", _error_document(error, name), error.exit_code)
 
 
 def _failure(name: str, folder: Path, error: Exception) -> Outcome:
@@ -209,7 +206,7 @@ def _failure(name: str, folder: Path, error: Exception) -> Outcome:
 
 
 def _failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
-    return Outcome(name, "failed", error_document(error, name), error.exit_code, trace)
+    return Outcome(name, "failed", _error_document(error, name), error.exit_code, trace)
 
 
 def _write_index(outcomes: Sequence[Outcome], output: Path) -> None:

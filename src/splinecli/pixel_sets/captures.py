@@ -11,15 +11,13 @@ import numpy as np
 
 from splinecli.capture import capture_name, open_capture
 from splinecli.capture.stamp import digest, stamp_capture
+from splinecli.capture.stored import name_reading
 from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureFiles, CaptureSource
-
-RESTORED, AS_STORED = "restored", "as stored"
-"""Values of the recipe's "reading"."""
 
 
 class CaptureChangedError(OutputError):
@@ -84,7 +82,7 @@ def add_capture(
     source = open_capture(folder, white_level=white_level)
     recipe: dict[str, Any] = {
         "source": str(folder.resolve()),
-        "reading": AS_STORED if as_stored else RESTORED,
+        "reading": name_reading(as_stored=as_stored),
         "white_level": white_level,
         # The stamp depends on the white level too, so it is compared last.
         "files": digest(stamp_capture(source)),

@@ -9,6 +9,7 @@ from typing import Any
 
 from splinecli import __version__
 from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.stored import name_reading
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 
@@ -62,7 +63,7 @@ def report_of(
         "options": options,
         "inputs_sha256": inputs,
         "version": __version__,
-        "reading": "as stored" if as_stored else "restored",
+        "reading": name_reading(as_stored=as_stored),
         "white_level": None if capture.white_level is None else asdict(capture.white_level),
     }
 
