@@ -27,15 +27,26 @@ def shadow_weights(observations: Array) -> Array:
 
 
 def predict(observations: Array, weights: Array, light_directions: Array) -> Array:
-    """Return what matte pixels would show (P, F): I = l . b, where b minimises the weighted squared residuals."""
-    x, y, z = light_directions.T
-    products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
-    xx, yy, zz, xy, xz, yz = (weights @ products).T
+    """Return what matte pixels would show (P, F): I = l . b, where b minimises the weighted squared residuals.
+
+    Args:
+        observations, weights: (P, F).
+        light_directions: (F, 3) or (P, F, 3), unit.
+    """
+    x, y, z = np.moveaxis(light_directions, -1, 0)
+    products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)
+    xx, yy, zz, xy, xz, yz = _sum_over_lights(weights, products).T
     covariance = inverse_3x3((xx + _PRIOR, yy + _PRIOR, zz + _PRIOR, xy, xz, yz), _PRIOR)
-    right_side = (weights * observations) @ light_directions
+    right_side = _sum_over_lights(weights * observations, light_directions)
     scaled_normals = np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
-    predicted: Array = scaled_normals @ light_directions.T
-    return predicted
+    if light_directions.ndim == 2:
+        return np.asarray(scaled_normals @ light_directions.T)
+    return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
+
+
+def _sum_over_lights(values: Array, terms: Array) -> Array:
+    """Return the sums (P, K) of values (P, F) times terms (F, K) or (P, F, K)."""
+    return values @ terms if terms.ndim == 2 else (values[:, None] @ terms)[:, 0]
 
 
 def absolute_weights(residuals: Array) -> Array:

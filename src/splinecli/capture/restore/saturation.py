@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from splinecli.capture.restore.robust_fit import absolute_weights, predict, shadow_weights
 
-ITERATIONS = 100
-STEP = 1.6
-"""Share of the way from the value to its prediction in each iteration. Beyond 1 it saves half of the iterations."""
+ITERATIONS = 16
+"""Fits to a pixel. More change the restored values by less than the fit's own error."""
+
+RAISED_WEIGHT = np.float32(0.1)
+"""Weight of an observation that the last fit raised; one that the fit meets has 50. It determines nothing but what the
+others leave open."""
 
 MAX_BRIGHTENING = 8.0
 """No observation is restored to more than this many times the pixel's brightest stored one."""
@@ -40,14 +43,15 @@ def restore_saturated(
 
     Args:
         saturated: (P, F).
-        light_directions: (F, 3), unit.
+        light_directions: (F, 3) or (P, F, 3), unit.
     """
     lights = light_directions.astype(np.float32)
     everywhere = np.asarray(saturated.all(axis=1))
     rows = np.flatnonzero(saturated.any(axis=1) & ~everywhere)
     for start in range(0, len(rows), _TILE_PIXELS):
         tile = rows[start : start + _TILE_PIXELS]
-        observations[tile] = _restored(observations[tile], saturated[tile], lights)
+        own = lights if lights.ndim == 2 else lights[tile]
+        observations[tile] = _restored(observations[tile], saturated[tile], own)
     return saturated & ~everywhere[:, None] if len(rows) else None
 
 
@@ -62,9 +66,10 @@ def _restored(
     weights = lit
     for _ in range(ITERATIONS):
         predicted = predict(values, weights, lights)
-        further = np.clip(values + np.float32(STEP) * (predicted - values), lowest, MAX_BRIGHTENING)
-        values = np.where(saturated, further, lowest)
-        weights = lit * absolute_weights(predicted - values)
+        residuals = predicted - lowest
+        raised = saturated & (residuals > 0)
+        values = np.where(raised, np.minimum(predicted, MAX_BRIGHTENING), lowest)
+        weights = lit * np.where(raised, RAISED_WEIGHT, absolute_weights(residuals))
     # Rounding must not make a value darker than stored.
     restored: NDArray[np.float32] = np.where(saturated, np.maximum(values * scale, stored), stored)
     return restored
