@@ -38,9 +38,14 @@ GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
 IMAGES_LEFT_OUT = "images_left_out"
 LIGHTS_MATCHED = "lights_matched"
+LIGHT_FRAME = "light_frame"
+LIGHT_ORDER = "light_order"
 SATURATED = "saturated"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
+
+PROBABLY_WRONG = frozenset({LIGHT_FRAME, LIGHT_ORDER})
+"""Warnings that say that an input is probably wrong. With --strict they are errors."""
 
 SATURATED_SHARE = 0.01
 """The share of saturated observations above which the capture carries a warning."""

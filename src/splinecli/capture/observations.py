@@ -73,14 +73,14 @@ def collect_observations(
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8
         saturation.add(position, image.values, image.path, stated=image.stated_white_level)
-        observations[:, position] = _observe(image.linear, image.intensity)
+        observations[:, position] = observe(image.linear, image.intensity)
         del image  # before the next one is decoded
         if progress is not None:
             progress()
     return Observations(observations, saturation.finish(), any_8_bit)
 
 
-def _observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
+def observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return observations (P,) from linear pixels (P, C) under a light of RGB intensity (3,).
 
     Each channel is divided by its intensity, then the mean is taken. A gray image is equal in all channels.

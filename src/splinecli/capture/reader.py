@@ -17,6 +17,7 @@ from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overr
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights import named_lights
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
@@ -36,6 +37,7 @@ def open_capture(
     ground_truth: StrPath | None = None,
     radiometry: RadiometricCalibration = AS_STORED,
     white_level: float | None = None,
+    light_frame: LightFrame = USUAL_FRAME,
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
@@ -47,6 +49,7 @@ def open_capture(
             folder is subtracted.
         white_level: stored value from which an observation counts as saturated, such as 4095 for 12 bits. By default it
             is found from the files and their values (see white_level.py).
+        light_frame: the frame of the light file.
 
     Raises:
         InputError: the folder contains no capture (see find_capture_files) or a light file is wrong.
@@ -57,7 +60,7 @@ def open_capture(
     equal = intensities is not None and str(intensities) == EQUAL
     named = (lights, None if equal else intensities, mask, ground_truth)
     files = find_capture_files(folder, Overrides(*(None if file is None else Path(file) for file in named)))
-    source = _read_lights(files, radiometry, equal=equal)
+    source = _read_lights(files, radiometry, light_frame, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     ambient = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     if radiometry.ambient is None and ambient is not None:
@@ -98,7 +101,9 @@ def read_capture(
     return source.read(light_indices, progress, as_stored=as_stored)
 
 
-def _read_lights(files: CaptureFiles, radiometry: RadiometricCalibration, *, equal: bool) -> CaptureSource:
+def _read_lights(
+    files: CaptureFiles, radiometry: RadiometricCalibration, frame: LightFrame, *, equal: bool
+) -> CaptureSource:
     """Return the capture with its lights; a light file that names images sets their order.
 
     Args:
@@ -108,7 +113,7 @@ def _read_lights(files: CaptureFiles, radiometry: RadiometricCalibration, *, equ
     warnings: list[CaptureWarning] = []
     intensities = None
     if path.suffix.lower() in named_lights.SUFFIXES:
-        named = named_lights.read_named_lights(path)
+        named = named_lights.read_named_lights(path, frame)
         images, how = named.match(files.images)
         flats = radiometry.flat_field
         if len(flats) == len(files.images) > 1:  # they are in the order of the folder's images
@@ -120,7 +125,7 @@ def _read_lights(files: CaptureFiles, radiometry: RadiometricCalibration, *, equ
         if how != "name":
             warnings.append(capture_warnings.lights_matched(path.name, how))
     else:
-        directions = read_light_directions(path, len(files.images))
+        directions = read_light_directions(path, len(files.images), frame)
     if equal:
         intensities = None
     elif files.light_intensities is not None:
@@ -129,4 +134,12 @@ def _read_lights(files: CaptureFiles, radiometry: RadiometricCalibration, *, equ
     if intensities is None:
         check_exposures(files.images)
         intensities = np.ones((len(files.images), 3))
-    return CaptureSource(files, directions, intensities, tuple(warnings), radiometry, intensities_known=known)
+    return CaptureSource(
+        files,
+        directions,
+        intensities,
+        tuple(warnings),
+        radiometry,
+        intensities_known=known,
+        light_frame=frame,
+    )

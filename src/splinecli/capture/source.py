@@ -16,6 +16,7 @@ from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.image_size import check_size
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration
 from splinecli.capture.masks import read_capture_mask
 from splinecli.capture.observations import StoredPixels, collect_observations
@@ -41,6 +42,7 @@ class CaptureSource:
         warnings: what a user should read.
         radiometry: how stored values become linear light.
         white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
+        light_frame: the frame of the light file, in which the directions are no longer.
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
     """
 
@@ -52,6 +54,7 @@ class CaptureSource:
     white_level: float | None = None
     automatic_mask: NDArray[np.bool_] | None = None
     intensities_known: bool = True
+    light_frame: LightFrame = USUAL_FRAME
 
     @property
     def n_lights(self) -> int:

@@ -15,8 +15,11 @@ from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import Lineariser
+from splinecli.capture.observations import observe
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.sample import Sample, grid_step
 from splinecli.capture.source import CaptureSource
 
 DARK = 0.05
@@ -58,12 +61,14 @@ class CaptureSummary:
         images: a summary of each image.
         n_pixels: number of the mask's pixels.
         white_level: as in Capture.
+        sample: some of the pixels of all images, on a grid; None where images have different sizes.
     """
 
     source: CaptureSource
     images: tuple[ImageSummary, ...]
     n_pixels: int
     white_level: WhiteLevel | None
+    sample: Sample | None = None
 
     @property
     def axis_angles_deg(self) -> NDArray[np.float64]:
@@ -103,14 +108,20 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         stored = decode_image(path)
         if mask is None:
             mask = source.read_mask(stored.shape[:2])
-            # It refuses ambient images and flat fields that do not fit.
-            Lineariser(source.radiometry, mask, len(source.files.images))
             n_images = len(source.files.images)
             finder = SaturationFinder(int(np.count_nonzero(mask)), n_images, given=source.white_level)
+            step = grid_step(mask)
+            on_grid = np.zeros_like(mask)
+            on_grid[::step, ::step] = mask[::step, ::step]
+            # It refuses ambient images and flat fields that do not fit.
+            linearise = Lineariser(source.radiometry, on_grid, n_images)
+            observations = np.zeros((int(np.count_nonzero(on_grid)), n_images), np.float32)
         fits = mask.shape == stored.shape[:2]
         pixels = stored[mask] if fits else stored.reshape(-1, stored.shape[2])
         if fits:
             finder.add(position, pixels, path, stated=stated_white_level(path))
+            linear = linearise(stored[on_grid], path, position)
+            observations[:, position] = observe(linear, source.light_intensities[position])
         images.append(
             ImageSummary(
                 path,
@@ -125,7 +136,13 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
             progress()
     assert mask is not None, "a capture has images"
     level, summaries = _by_white_level(finder, images, mask)
-    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level)
+    sample = None
+    if all(image.shape[:2] == mask.shape for image in images):
+        if not source.intensities_known:
+            intensities = estimate_light_intensities(observations, None, source.light_directions)
+            observations /= 1 if intensities is None else intensities.astype(np.float32)
+        sample = Sample(observations, mask[::step, ::step], step)
+    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample)
 
 
 def _by_white_level(

@@ -43,6 +43,7 @@ def infer(
     ambient: Path | None = inputs.AMBIENT,
     flat_field: Path | None = inputs.FLAT_FIELD,
     white_level: float | None = inputs.WHITE_LEVEL,
+    light_frame: str | None = inputs.LIGHT_FRAME,
     as_stored: bool = inputs.AS_STORED,
     output: Path = outputs.INFER_FOLDER,
     method: str = computing.METHOD,
@@ -61,6 +62,7 @@ def infer(
     convention: NormalConvention = outputs.CONVENTION,
     overwrite: bool = outputs.OVERWRITE,
     update: bool = outputs.UPDATE,
+    strict: bool = outputs.STRICT,
     as_json: bool = outputs.JSON_LIST,
     quiet: bool = outputs.QUIET,
 ) -> int:
@@ -105,6 +107,8 @@ def infer(
             html=html,
             surface=surface,
             convention=convention.value,
+            light_frame=light_frame,
+            strict=strict,
         )
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"
         return _run(

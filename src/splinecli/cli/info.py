@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
+from splinecli.errors import InputError
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
 
@@ -19,16 +20,21 @@ def info(
     ambient: Path | None = inputs.AMBIENT,
     flat_field: Path | None = inputs.FLAT_FIELD,
     white_level: float | None = inputs.WHITE_LEVEL,
+    light_frame: str | None = inputs.LIGHT_FRAME,
+    check_lights: bool = inputs.CHECK_LIGHTS,
     plot: Path | None = outputs.LIGHT_PLOT,
     overwrite: bool = outputs.OVERWRITE_PLOT,
+    strict: bool = outputs.STRICT,
     as_json: bool = outputs.JSON,
     quiet: bool = outputs.QUIET,
-) -> None:
+) -> int:
     """Show what `infer` would read from CAPTURE, without running it.
 
     Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
     the elevation of the lights, and the memory and time that infer needs. Writes nothing but the plot.
     """
+    from splinecli.capture.capture_warnings import PROBABLY_WRONG
+
     options = InfoOptions(
         capture=capture,
         lights=lights,
@@ -41,6 +47,10 @@ def info(
         white_level=white_level,
         plot=plot,
         overwrite=overwrite,
+        light_frame=light_frame,
+        check_lights=check_lights,
     )
     report = describe_capture(options, Messages(quiet=quiet))
     print_report(report, "\n".join(summary_lines(report)), as_json=as_json, quiet=quiet)
+    wrong = strict and not PROBABLY_WRONG.isdisjoint(report["warning_codes"])
+    return InputError.exit_code if wrong else 0

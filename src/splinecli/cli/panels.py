@@ -9,7 +9,14 @@ REPEAT = ("--overwrite", "--json", "--quiet")
 PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     "infer": {
         "Input": ("--mask", "--auto-mask", "--ground-truth", *VALUES, "--as-stored"),
-        "Lights": ("--lights", "--intensities", "--n-lights", "--seed", "--light-indices"),
+        "Lights": (
+            "--lights",
+            "--light-frame",
+            "--intensities",
+            "--n-lights",
+            "--seed",
+            "--light-indices",
+        ),
         "Method": ("--method", "--weights", "--rotations"),
         "Output": (
             "--output",
@@ -18,6 +25,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--html",
             "--surface",
             "--convention",
+            "--strict",
             "--update",
             *REPEAT,
         ),
@@ -25,8 +33,8 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "info": {
         "Input": ("--mask", "--ground-truth", *VALUES),
-        "Lights": ("--lights", "--intensities"),
-        "Output": ("--plot", *REPEAT),
+        "Lights": ("--lights", "--light-frame", "--intensities", "--check-lights"),
+        "Output": ("--plot", "--strict", *REPEAT),
     },
     "calibrate": {
         "Input": ("--circle", "--mask"),

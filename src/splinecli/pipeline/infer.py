@@ -38,21 +38,24 @@ def infer_capture(
         estimator: what `make_method(options)` returned; it saves time in a batch.
 
     Raises:
-        InputError: the capture cannot be read.
+        InputError: the capture cannot be read, or with options.strict, its lights or images are probably wrong.
         UsageError: the options do not fit the capture or the method.
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written.
     """
     from splinecli.inference import estimate_normals
+    from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
     from splinecli.results.files import write_estimate
     from splinecli.results.report import report_of
 
     source, capture, read_seconds = _read(folder, options, observer)
+    warnings = [*capture.warnings, *check_capture(source, capture)]
+    refuse_if_strict(warnings, capture.name, strict=options.strict)
     if estimator is None:
         estimator = make_method(options)
     with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
         estimate = estimate_normals(capture, estimator, progress=advance)
-    warnings = [*capture.warnings, *_method_warnings(estimator, capture)]
+    warnings += _method_warnings(estimator, capture)
     for warning in warnings:
         observer.warn(f"{capture.name}: {warning}")
     report = report_of(

@@ -28,6 +28,8 @@ class InferOptions:
     Args:
         lights, mask, ground_truth: files that replace those of the capture.
         intensities: a file of light intensities, or "equal".
+        light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
+        strict: fail where a warning says that the lights or images are probably wrong.
         auto_mask: find the object where the capture has no mask.
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
@@ -55,6 +57,7 @@ class InferOptions:
     mask: str | None = None
     auto_mask: bool = False
     ground_truth: str | None = None
+    light_frame: str | None = None
     transfer: str = "linear"
     ambient: str | None = None
     flat_field: str | None = None
@@ -75,9 +78,11 @@ class InferOptions:
     html: bool = False
     surface: bool = False
     convention: Convention = "opengl"
+    strict: bool = False
 
     def __post_init__(self) -> None:
         from splinecli.capture.lights.draws import check_draw_settings
+        from splinecli.capture.lights.light_frames import parse_light_frame
         from splinecli.capture.record import check_light_indices
         from splinecli.results.files import MAPS, NORMALS
         from splinecli.transfer import parse_transfer
@@ -92,6 +97,7 @@ class InferOptions:
         if self.light_indices is not None:
             check_light_indices(self.light_indices, max(self.light_indices, default=0) + 1)
         parse_transfer(self.transfer)
+        parse_light_frame(self.light_frame)
         if self.white_level is not None and not 0 < self.white_level < math.inf:
             raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
         _check_one_of("precision", self.precision, get_args(Precision))
@@ -139,6 +145,7 @@ class InferOptions:
     def open(self, folder: Path) -> CaptureSource:
         """Open the capture in the folder under these options. Raises InputError."""
         from splinecli.capture import open_capture
+        from splinecli.capture.lights.light_frames import parse_light_frame
 
         return open_capture(
             folder,
@@ -148,6 +155,7 @@ class InferOptions:
             ground_truth=self.ground_truth,
             radiometry=self.radiometric_calibration(),
             white_level=self.white_level,
+            light_frame=parse_light_frame(self.light_frame),
         )
 
 

@@ -40,12 +40,14 @@ class InfoOptions:
         capture: the folder of the capture.
         lights, intensities, mask, ground_truth: files that replace those of the capture. `intensities` may also be
             "equal".
+        light_frame: the frame of the light file, such as "x-left,y-down".
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
         white_level: the stored value from which a pixel counts as saturated. None finds it.
         plot: a PNG file that a plot of the lights is written to.
         overwrite: replace an earlier plot.
+        check_lights: also list the readings of the light file that were compared.
     """
 
     capture: Path
@@ -53,16 +55,19 @@ class InfoOptions:
     intensities: Path | None = None
     mask: Path | None = None
     ground_truth: Path | None = None
+    light_frame: str | None = None
     transfer: str = "linear"
     ambient: Path | None = None
     flat_field: Path | None = None
     white_level: float | None = None
     plot: Path | None = None
     overwrite: bool = False
+    check_lights: bool = False
 
     def open(self) -> CaptureSource:
         """Open the capture under these options. Raises InputError, UsageError."""
         from splinecli.capture import open_capture
+        from splinecli.capture.lights.light_frames import parse_light_frame
 
         return open_capture(
             self.capture,
@@ -72,19 +77,24 @@ class InfoOptions:
             ground_truth=self.ground_truth,
             radiometry=radiometric_calibration(self.transfer, self.ambient, self.flat_field),
             white_level=self.white_level,
+            light_frame=parse_light_frame(self.light_frame),
         )
 
 
 def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Read a capture without estimating normals, write the plot if there is one, and return the report.
+    """Read a capture without estimating normals, and return the report.
+
+    The plot is written if there is one.
 
     Raises:
         InputError: the folder has no capture, or a file cannot be read.
         OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
+    from splinecli.capture.lights.light_advice import candidate_rows, light_warnings
     from splinecli.capture.summary import summarise_capture
     from splinecli.files import write_bytes
+    from splinecli.pipeline.input_checks import check_source
 
     source = options.open()
     if options.plot is not None:
@@ -95,9 +105,19 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         from splinecli.pictures.light_sky import sky_plot
 
         write_bytes(options.plot, sky_plot(source.light_directions, source.files.name))
-    report = _report(summary)
-    for warning in report["warnings"]:
-        observer.warn(warning)
+    check = None if summary.sample is None else check_source(source, summary.sample, range(source.n_lights))
+    warnings = summary.warnings()
+    if check is not None:
+        warnings += light_warnings(check, source.light_frame, source.files.light_directions)
+    for warning in warnings:
+        observer.warn(str(warning))
+    report = {
+        **_report(summary),
+        "warnings": [str(warning) for warning in warnings],
+        "warning_codes": [warning.code for warning in warnings],
+    }
+    if options.check_lights:
+        report["light_candidates"] = [] if check is None else candidate_rows(check)
     return report
 
 
@@ -125,7 +145,22 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("expect", f"{report['expect']['memory_mib']} MiB of memory and about {report['expect']['seconds']} s"
                    " on a laptop"),
     ]  # fmt: skip
-    return [f"{name:13}{text}" for name, text in rows]
+    return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
+
+
+def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
+    """Return the table of readings of the light file; nothing if it was not asked for."""
+    if candidates is None:
+        return []
+    lines = [f"{'reading of the light file':48}{'misfit':>8}{'curl':>8}{'outline':>9}{'advantage':>11}"]
+    for row in candidates:
+        misfit = "-" if row["misfit"] is None else f"{100 * row['misfit']:.0f} %"
+        curl, rim, advantage = (
+            "-" if row[key] is None else f"{row[key]:{form}}"
+            for key, form in (("curl", ".2f"), ("rim", "+.2f"), ("advantage", "+.2f"))
+        )
+        lines.append(f"{row['reading']:48}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
+    return lines
 
 
 def _check_plot(plot: Path, source: CaptureSource, *, overwrite: bool) -> None:
@@ -173,7 +208,6 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
             "memory_mib": round(_memory_mib(summary)),
             "seconds": round(STARTING_SECONDS + summary.n_pixels / PIXELS_PER_SECOND),
         },
-        "warnings": [str(warning) for warning in summary.warnings()],
     }
 
 

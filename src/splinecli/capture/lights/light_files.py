@@ -18,13 +18,16 @@ from splinecli.capture.formats.text import (
     has_decimal_commas,
     read_number_rows,
 )
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
 
 _FILE = "a text file with a line {} for each image"
 
 
-def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray[np.float64]:
+def read_light_directions(
+    path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME
+) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) float64 from a text file.
 
     A row is x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of lights is
@@ -34,6 +37,7 @@ def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray
     Args:
         path: the file.
         n_images: the number of lights that is expected, if it is known.
+        frame: the frame of the file.
 
     Raises:
         InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
@@ -43,7 +47,7 @@ def read_light_directions(path: StrPath, n_images: int | None = None) -> NDArray
     table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("x y z")), n_images)
     vectors, transposed = _one_light_a_row(table, {3: "x y z"}, "light directions", n_images)
     return unit_directions(
-        vectors,
+        vectors @ frame.matrix.T + 0.0,  # no -0
         table.path,
         [table.lines[2 if transposed else light] for light in range(len(vectors))],
         [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))],
@@ -85,7 +89,9 @@ def unit_directions(
                 f"found a light below the horizon{place} (z = {vector[2]:g}), expected z > 0",
                 path=path,
                 line=line,
-                hint="z points to the camera; the file may be in another frame",
+                hint="z points away from the camera in this file: add --light-frame z-away"
+                if (directions[:, 2] < 0).all()
+                else "z points to the camera; the file may be in another frame",
             )
     return directions
 

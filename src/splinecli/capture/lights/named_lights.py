@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines
 from splinecli.capture.lights.light_files import unit_directions
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.errors import InputError
 
 SUFFIXES = (".lp", ".json")
@@ -77,12 +78,16 @@ class NamedLights:
         )
 
 
-def read_named_lights(path: Path) -> NamedLights:
-    """Return the lights of an .lp or AliceVision JSON file; the suffix decides which. Raises InputError."""
-    return _read_json(path) if path.suffix.lower() == ".json" else _read_lp(path)
+def read_named_lights(path: Path, frame: LightFrame = USUAL_FRAME) -> NamedLights:
+    """Return the lights of an .lp or AliceVision JSON file; the suffix decides which. Raises InputError.
+
+    Args:
+        frame: the frame of an .lp file. That of a JSON file is relative to AliceVision's, which has y down and z away.
+    """
+    return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)
 
 
-def _read_lp(path: Path) -> NamedLights:
+def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
     """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may contain spaces."""
     stored = read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
@@ -108,11 +113,11 @@ def _read_lp(path: Path) -> NamedLights:
         names.append(_FOLDERS.split(words[0].strip('"'))[-1])
         vectors.append([parse_number(word, path, line) for word in words[1:]])
     lines = tuple(line for line, _ in rows)
-    directions = unit_directions(np.array(vectors), path, lines, [""] * len(lines))
+    directions = unit_directions(np.array(vectors) @ frame.matrix.T + 0.0, path, lines, [""] * len(lines))
     return NamedLights(path, tuple(names), lines, directions)
 
 
-def _read_json(path: Path) -> NamedLights:
+def _read_json(path: Path, frame: LightFrame) -> NamedLights:
     """Read AliceVision's format.
 
     {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
@@ -150,7 +155,7 @@ def _read_json(path: Path) -> NamedLights:
             f"{len(intensities)} of {len(lights)} lights have an intensity, expected all or none", path=path
         )
     directions = unit_directions(
-        np.array(vectors) * (1.0, -1.0, -1.0) + 0.0,  # no -0
+        np.array(vectors) * (1.0, -1.0, -1.0) @ frame.matrix.T + 0.0,  # no -0
         path,
         [None] * len(lights),
         [f" as light {number}" for number in range(1, len(lights) + 1)],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typer import Argument, Option
 
-from splinecli.cli.options.values import NormalConvention, complete_curves
+from splinecli.cli.options.values import NormalConvention, complete_curves, complete_list
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 
@@ -17,6 +17,16 @@ LIGHTS = Option(
     None,
     metavar="FILE",
     help="Light directions: a line x y z for each image, z to the camera. [default: the light file in CAPTURE]",
+)
+LIGHT_FRAME = Option(
+    None,
+    metavar="LIST",
+    help="Frame of the light file: any of x-left, y-down, z-away and exchanged (y stands before x)."
+    " [default: x right, y up, z to the camera]",
+    autocompletion=complete_list("x-left", "y-down", "z-away", "exchanged"),
+)
+CHECK_LIGHTS = Option(
+    False, "--check-lights", help="List other readings of the light file, and how well the images fit each."
 )
 INTENSITIES = Option(
     None,

@@ -84,6 +84,12 @@ OVERWRITE_PLOT = Option(False, "--overwrite", help="Replace an earlier plot.")
 OVERWRITE_TRIALS = Option(False, "--overwrite", help="Compute all trials again, also those stored in OUT.")
 UPDATE = Option(False, "--update", help="Compute changed captures again, and skip those that are done.")
 
+STRICT = Option(
+    False,
+    "--strict",
+    help="Fail (exit code 3) where a warning says that the lights or the images are probably wrong.",
+)
+
 # What is printed.
 
 JSON = Option(False, "--json", help="Print one JSON document on stdout, and nothing else.")

@@ -1,0 +1,131 @@
+"""Evidence on the frame of light directions, from the normals that they give.
+
+Lights in a wrong frame fit the images as well as right ones. But normals of a surface have no curl (Horn, "Shape from
+shading", 1970; Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity", IJCV 1999), and they point outwards at the
+outline of the object (Ikeuchi and Horn 1981).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.restore.robust_fit import absolute_weights, predict, shadow_weights
+from splinecli.normals import unit
+
+Array = NDArray[np.float64]
+
+SMOOTHING = 1.5
+"""Standard deviation in pixels of the smoothing of the normals before they are differentiated."""
+
+RIM_PIXELS = 3
+"""Width of the rim inside the outline, in pixels."""
+
+STEEP_Z = 0.7
+"""A rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction."""
+
+_LOWEST_Z = 0.2  # slopes grow without bound towards the outline
+_FITS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class RoughNormals:
+    """Normals on a grid of pixels.
+
+    Args:
+        normals: (h, w, 3), unit in the mask, zero outside.
+        mask: (h, w).
+        outward: (h, w, 2), unit vectors in the image, x right and y up, that point out of the mask, at the pixels of
+            the rim; zero elsewhere.
+    """
+
+    normals: Array
+    mask: NDArray[np.bool_]
+    outward: Array
+
+    @property
+    def rim_steepness(self) -> float:
+        """The share of the rim's pixels that are steep. It does not depend on the frame of the lights."""
+        rim = self.outward.any(axis=2)
+        return float((self.normals[rim][:, 2] < STEEP_Z).mean()) if rim.any() else 0.0
+
+    def transformed(self, matrix: Array) -> RoughNormals:
+        """Return the normals that the lights would give after a multiplication with a matrix (3, 3)."""
+        normals = self.normals @ np.linalg.inv(matrix)
+        return RoughNormals(np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward)
+
+    def curl(self) -> float:
+        """Return the median |curl| of the slopes over their median derivative: 0 for a surface."""
+        z = np.maximum(self.normals[..., 2], _LOWEST_Z)
+        p, q = -self.normals[..., 0] / z, -self.normals[..., 1] / z
+        p_x, p_y = _derivatives(p)
+        q_x, q_y = _derivatives(q)
+        inside = _inner(self.mask & (self.normals[..., 2] > _LOWEST_Z))
+        if inside.sum() < 50:
+            return float("nan")
+        size = np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)[inside]
+        return float(np.median(np.abs(p_y - q_x)[inside]) / max(np.median(size), 1e-12))
+
+    def rim(self) -> float:
+        """Return the mean cosine, in the image, between normals and the outward direction at steep pixels of the rim.
+
+        It is 1 for a closed convex outline, 0 where one axis is flipped, and -1 where both are.
+        """
+        steep = self.outward.any(axis=2) & (self.normals[..., 2] < STEEP_Z)
+        if not steep.any():
+            return float("nan")
+        along = unit(self.normals[steep][:, :2])
+        return float((along * self.outward[steep]).sum(axis=1).mean())
+
+
+def rough_normals(
+    observations: NDArray[np.floating], light_directions: Array, mask: NDArray[np.bool_]
+) -> RoughNormals:
+    """Return smoothed normals of a fit of least absolute deviations.
+
+    Args:
+        observations: (P, F). light_directions: (F, 3). mask: (H, W) with P pixels.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    values = observations.astype(np.float64)
+    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    lit = weights = shadow_weights(values)
+    for _ in range(_FITS):
+        predicted = predict(values, weights, light_directions)
+        weights = lit * absolute_weights(values - predicted)
+    normals = np.zeros((*mask.shape, 3))
+    normals[mask] = unit(predicted @ np.linalg.pinv(light_directions).T)
+    smooth = np.stack([gaussian_filter(normals[..., axis], SMOOTHING) for axis in range(3)], axis=2)
+    smooth = np.where(mask[..., None], unit(smooth), 0.0)
+    return RoughNormals(smooth, mask, _outward(mask))
+
+
+def _outward(mask: NDArray[np.bool_]) -> Array:
+    """Return unit vectors (h, w, 2) out of the mask at its rim; the picture's own border is no outline."""
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")
+    if padded.all():
+        return np.zeros((*mask.shape, 2))
+    inside, soft = distance_transform_edt(padded), gaussian_filter(padded.astype(np.float64), 2 * SMOOTHING)
+    x, y = _derivatives(soft)
+    inner = slice(RIM_PIXELS + 1, -RIM_PIXELS - 1)
+    rim = (mask & (inside[inner, inner] <= RIM_PIXELS))[..., None]
+    return np.where(rim, unit(-np.stack((x, y), axis=2)[inner, inner]), 0.0)
+
+
+def _derivatives(values: Array) -> tuple[Array, Array]:
+    """Return the derivatives to the right and upwards."""
+    downwards, right = np.gradient(values)
+    return np.asarray(right), np.asarray(-downwards)
+
+
+def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pixels whose four neighbours are in the mask."""
+    from scipy.ndimage import binary_erosion
+
+    eroded: NDArray[np.bool_] = binary_erosion(mask)
+    return eroded

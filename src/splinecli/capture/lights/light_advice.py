@@ -1,0 +1,70 @@
+"""Warnings from a check of lights: what does not fit, by how much, and what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, CaptureWarning
+from splinecli.capture.lights.light_check import UNKNOWN_ORDER, Candidate, LightCheck
+from splinecli.capture.lights.light_frames import LightFrame
+
+
+def light_warnings(check: LightCheck, frame: LightFrame, light_file: Path) -> list[CaptureWarning]:
+    """Return the warnings about lights that were read in a frame.
+
+    Args:
+        frame: the frame in which the light file was read, which the advice replaces.
+    """
+    warnings = []
+    if check.order is not None:
+        warnings.append(CaptureWarning(LIGHT_ORDER, _order_text(check, light_file)))
+    if check.best is not None:
+        code = LIGHT_FRAME if check.best.frame is not None else LIGHT_ORDER
+        warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file)))
+    return warnings
+
+
+def _order_text(check: LightCheck, light_file: Path) -> str:
+    assert check.given_misfit is not None, "an order is judged by its misfit"
+    if check.order == UNKNOWN_ORDER:
+        return (
+            f"The images fit {light_file.name} no better than lights in a random order"
+            f" (misfit {100 * check.given_misfit:.0f} % of a random order's). Its lines are in another order than the"
+            " images, or it belongs to another capture."
+        )
+    assert check.order_misfit is not None, "a better order has a misfit"
+    return (
+        f"The images fit the lights of {light_file.name} much better {check.order}"
+        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against"
+        f" {100 * check.given_misfit:.0f} %). Check that its lines are in the order of the images."
+    )
+
+
+def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
+    figures = [f"curl {best.curl:.2f} against {check.given.curl:.2f}"]
+    if best.rim is not None and check.given.rim is not None:
+        figures.append(f"outline {best.rim:+.2f} against {check.given.rim:+.2f}")
+    words = best.name if best.frame is None else f"with {best.name}"
+    text = f"The lights give normals that fit a surface much better {words} ({', '.join(figures)})"
+    if best.frame is None:
+        return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
+    advice = f"{text}: run again with --light-frame {best.frame.after(frame)}."
+    if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
+        advice += " If the object is hollow up to its outline, as the inside of a bowl, the lights are right."
+    return advice
+
+
+def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
+    """Return the compared readings of a light file as JSON values; figures that cannot be told are null."""
+    figures = ("misfit", "curl", "rim", "advantage")
+    return [
+        {"reading": candidate.name, **{name: _rounded(getattr(candidate, name)) for name in figures}}
+        for candidate in check.candidates
+    ]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else round(value, 3)

@@ -1,0 +1,246 @@
+"""Tell light directions in a wrong frame or order from right ones, by the images and the normals that they give.
+
+The thresholds were chosen on captures that splinecli's own renderer made (MERL's measured materials, CyclesPS's
+classes of materials, 6 to 48 lights, with and without errors of their directions); docs/measurements.md has the
+figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.lights.frame_evidence import RoughNormals, rough_normals
+from splinecli.capture.lights.light_fit import (
+    find_factors,
+    random_misfits,
+    shifted_orders,
+    swapped_orders,
+)
+from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
+
+Array = NDArray[np.float64]
+
+MIN_LIGHTS = 6
+"""Fewer lights leave too few equations to judge their order."""
+
+BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
+"""Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
+
+MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
+"""Smallest misfit of a wrong order, as a share of the median of random orders: of all lights, of two exchanged ones."""
+
+CHANCE = 0.02
+"""An order is wrong if more than this share of random orders fits as well."""
+
+MIN_LIGHTS_FOR_CHANCE = 8
+
+UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
+"""An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
+could explain: highlights and shadows."""
+
+CURL_WEIGHT, RIM_WEIGHT = 2.1, 0.83
+"""The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
+
+NEAR = 0.1
+"""Candidates whose advantages differ by less are near equals."""
+
+LOWEST_CURL = 0.1
+"""Curls below this are noise. On a cap of a sphere, other frames give little more."""
+
+MAX_MISFIT_OF_RIM = 0.5
+"""With a larger misfit, normals of metal say little about the outline."""
+
+RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.8
+"""Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
+
+UNKNOWN_ORDER = "unknown"
+"""The order of the lights does not fit, and no simple other one does."""
+
+_AS_GIVEN = "as given"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One reading of the light file.
+
+    Args:
+        name: in words, such as "y negated".
+        frame: its frame, relative to the given one. None where it is an order that no frame stands for.
+        misfit: distance between the images and these lights, as a share of the median of random orders; None where
+            there are too few lights.
+        curl: of the normals; 0 is a surface.
+        rim: mean cosine between normals and the outward direction at the outline; None without a closed outline.
+        steps: by how many lights it shifts the order.
+        advantage: evidence for it against the given lights; from 1 it is better.
+    """
+
+    name: str
+    frame: LightFrame | None
+    misfit: float | None
+    curl: float
+    rim: float | None
+    steps: int = 0
+    advantage: float = 0.0
+
+
+@dataclass(frozen=True)
+class LightCheck:
+    """What the images say about the light directions.
+
+    Args:
+        candidates: readings of the light file; the given one first, then from best to worst.
+        order: the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits.
+        given_misfit, order_misfit: as in Candidate, of the given order and of the better one.
+        best: the reading that gives better normals; None if there is none. Its frame is relative to the given one.
+        outline_counts: how much the normals at the mask's edge count, from 0 to 1.
+    """
+
+    candidates: tuple[Candidate, ...]
+    order: str | None = None
+    given_misfit: float | None = None
+    order_misfit: float | None = None
+    best: Candidate | None = None
+    outline_counts: float = 0.0
+
+    @property
+    def given(self) -> Candidate:
+        return self.candidates[0]
+
+
+def check_lights(
+    observations: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    light_directions: Array,
+    indices: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
+) -> LightCheck:
+    """Return what observations (P, F) of a mask (H, W) say about their lights.
+
+    Args:
+        light_directions: (N, 3), all lights of the capture, in the order of the file.
+        indices: the F lights of the observations; None for all.
+        names: of the F images, for the words of the result.
+    """
+    chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
+    names = [str(index + 1) for index in chosen] if names is None else names
+    found = _check_order(observations, light_directions, chosen, names)
+    normals = rough_normals(observations, found.lights, mask)
+    weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
+    if found.misfit is not None and found.misfit > MAX_MISFIT_OF_RIM:
+        weight = 0.0
+    weight = float(np.clip(weight, 0, 1))
+    first, *others = (
+        _candidate(
+            frame.describe() or _AS_GIVEN, frame, normals.transformed(frame.matrix), found.misfit, weight
+        )
+        for frame in PLANE_FRAMES
+    )
+    for row, matrix in found.turns:
+        words, steps = _shift_words(row, len(light_directions)), _shift_steps(row, len(light_directions))
+        turned = _candidate(words, None, normals.transformed(matrix), found.misfit, weight)
+        others.append(replace(turned, steps=steps))
+    ranked = sorted((_judge(other, first, weight) for other in others), key=lambda other: -other.advantage)
+    # Where no order fits, the normals are no evidence.
+    best = None if found.order == UNKNOWN_ORDER else _best(ranked, in_order=found.order is not None)
+    order = found.order
+    if order is not None and best is not None and best.frame is None:
+        order, best = best.name, None  # one of several orders that fit, told by the normals
+    return LightCheck((first, *ranked), order, found.given_misfit, found.misfit, best, weight)
+
+
+def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
+    """Return the best candidate, if it is better than the given one.
+
+    Of near equals it is a frame, or with `in_order` another order, because the order is known to be wrong.
+    """
+    better = [candidate for candidate in ranked if candidate.advantage >= 1]
+    near = [candidate for candidate in better if candidate.advantage > better[0].advantage - NEAR]
+    preferred = [candidate for candidate in near if (candidate.frame is None) == in_order]
+    return min(preferred or near, key=lambda candidate: candidate.steps, default=None)
+
+
+def _candidate(
+    name: str, frame: LightFrame | None, normals: RoughNormals, misfit: float | None, weight: float
+) -> Candidate:
+    return Candidate(name, frame, misfit, normals.curl(), normals.rim() if weight > 0 else None)
+
+
+def _judge(other: Candidate, given: Candidate, weight: float) -> Candidate:
+    """Return the candidate with its advantage over the given one."""
+    curls = np.log(max(given.curl, LOWEST_CURL) / max(other.curl, LOWEST_CURL))
+    advantage = CURL_WEIGHT * (curls if np.isfinite(curls) else 0.0)
+    if other.rim is not None and given.rim is not None:
+        advantage += RIM_WEIGHT * weight * (other.rim - given.rim)
+    return replace(other, advantage=float(advantage))
+
+
+@dataclass(frozen=True, eq=False)
+class _Order:
+    """The order of lights that fits best: its name (None for the given one), the lights (F, 3) in it, the misfits of
+    the given order and of this one, and other rows of shifted_orders that fit as well, with their matrices: they turn a
+    regular ring of lights."""
+
+    order: str | None
+    lights: Array
+    given_misfit: float | None = None
+    misfit: float | None = None
+    turns: tuple[tuple[int, Array], ...] = ()
+
+
+def _check_order(
+    observations: NDArray[np.floating],
+    light_directions: Array,
+    chosen: NDArray[np.integer],
+    names: Sequence[str],
+) -> _Order:
+    lights, n_all = light_directions[chosen], len(light_directions)
+    factors = find_factors(observations) if len(lights) >= MIN_LIGHTS else None
+    if factors is None:
+        return _Order(None, lights)
+    random = random_misfits(factors, lights)
+    usual = max(float(np.median(random)), 1e-9)
+    given = float(factors.misfits(lights[None])[0])
+    share, limit = given / usual, given * (BETTER_ORDER if len(lights) > FEW else BETTER_ORDER_OF_FEW)
+    shifted = light_directions[shifted_orders(n_all)[:, chosen]]
+    shift_misfits = factors.misfits(shifted)
+    best = int(shift_misfits.argmin())
+    if share > MIN_MISFIT and shift_misfits[best] < limit:
+        mended = float(shift_misfits[best])
+        turns = _turns(shifted[best], shifted, shift_misfits <= max(1.3 * mended, 0.05 * usual))
+        return _Order(_shift_words(best, n_all), shifted[best], share, mended / usual, turns)
+    swaps = swapped_orders(len(lights))
+    swap_misfits = factors.misfits(lights[swaps])
+    best = int(swap_misfits.argmin())
+    if share > MIN_SWAP_MISFIT and swap_misfits[best] < limit:
+        one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
+        words = f"with those of {one} and {other} exchanged"
+        return _Order(words, lights[swaps[best]], share, float(swap_misfits[best]) / usual)
+    by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
+    if by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual):
+        return _Order(UNKNOWN_ORDER, lights, share, share)
+    turns = _turns(lights, shifted, shift_misfits <= max(1.3 * given, 0.05 * usual))
+    return _Order(None, lights, share, share, turns)
+
+
+def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[tuple[int, Array], ...]:
+    """Return the fitting ones of shifted orders (N, F, 3), each as the matrix that takes the lights (F, 3) to it."""
+    inverse = np.linalg.pinv(lights)
+    matrices = ((int(k), (inverse @ shifted[k]).T) for k in np.flatnonzero(fitting))
+    return tuple((k, matrix) for k, matrix in matrices if not np.allclose(matrix, np.eye(3), atol=1e-6))
+
+
+def _shift_steps(order: int, n_lights: int) -> int:
+    """Return by how many lights a row of shifted_orders is shifted, in the shorter direction."""
+    return min(order % n_lights, -order % n_lights)
+
+
+def _shift_words(order: int, n_lights: int) -> str:
+    """Return words for a row of shifted_orders."""
+    steps = order % n_lights
+    if order < n_lights:
+        return f"if image 1 belongs to light {steps + 1}, image 2 to the next, and so on"
+    return f"in reversed order, beginning with light {(n_lights - 1 + steps) % n_lights + 1}"

@@ -1,0 +1,125 @@
+"""How well images fit their light directions, and whether another order of the lights would fit better.
+
+The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
+(Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
+factors are found without the lights. Right lights are linear combinations of these factors, whatever their frame.
+Lights in a wrong order are not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.restore.robust_fit import absolute_weights
+from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
+
+Array = NDArray[np.float64]
+
+LIT_SHARE = 0.1
+"""Observations below this share of a pixel's largest one count as shadow."""
+
+MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000
+"""Limits of the sample that the factors are found from."""
+
+RANDOM_ORDERS = 500
+"""The number of random orders of the lights that a given order is compared with."""
+
+_ROUNDS = 25
+_PRIOR = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """The best factors of rank 3 of some observations.
+
+    Args:
+        matrix: (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between
+            two such matrices is one between images, as a share of the mean brightness.
+        residual: the root mean square of what the factors do not explain, in the same unit.
+    """
+
+    matrix: Array
+    residual: float
+
+    def misfits(self, light_directions: Array) -> Array:
+        """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
+        basis = np.linalg.qr(light_directions)[0]
+        explained = ((self.matrix @ basis) ** 2).sum(axis=(1, 2))
+        misfits: Array = np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0))
+        return misfits
+
+
+def find_factors(observations: NDArray[np.floating]) -> Factors | None:
+    """Return the factors of observations (P, F), or None where there are too few lit ones.
+
+    Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
+    """
+    values = _sample(observations)
+    n_pixels, n_lights = values.shape
+    if n_lights < 4 or n_pixels < 10 * n_lights:
+        return None
+    lit = (values > LIT_SHARE).astype(np.float64)
+    matrix = np.linalg.svd(values, full_matrices=False)[2][:3]
+    weights = lit
+    for _ in range(_ROUNDS):
+        rows = _solve(values, weights, matrix.T)
+        matrix = _solve(values.T, weights.T, rows).T
+        residuals = values - rows @ matrix
+        weights = lit * absolute_weights(residuals)
+    # The largest values of a row are 1, but a few rows in deep shadow may be wild.
+    kept = np.abs(rows @ matrix).max(axis=1) < 3
+    rows, residuals, lit = rows[kept], residuals[kept], lit[kept]
+    if len(rows) < 10 * n_lights:
+        return None
+    brightness = np.sqrt((values[kept] ** 2).sum(axis=1).mean())
+    scale = np.linalg.qr(rows)[1] / np.sqrt(len(rows)) / brightness
+    return Factors(scale @ matrix, float(np.sqrt((residuals**2 * lit).sum(axis=1).mean()) / brightness))
+
+
+def random_misfits(factors: Factors, light_directions: Array) -> Array:
+    """Return the misfits of the lights (F, 3) in random orders, in rising order."""
+    rng = np.random.default_rng(0)
+    orders = np.stack([rng.permutation(len(light_directions)) for _ in range(RANDOM_ORDERS)])
+    misfits: Array = np.sort(factors.misfits(light_directions[orders]))
+    return misfits
+
+
+def shifted_orders(n_lights: int) -> NDArray[np.int64]:
+    """Return the orders (2 F, F) of all cyclic shifts, then those of the reversed order's; the first is the given."""
+    steps = np.arange(n_lights)
+    forward = (steps[None] + steps[:, None]) % n_lights
+    return np.concatenate((forward, forward[:, ::-1]))
+
+
+def swapped_orders(n_lights: int) -> NDArray[np.int64]:
+    """Return the orders (F (F - 1) / 2, F) with two lights exchanged."""
+    first, second = np.triu_indices(n_lights, 1)
+    orders = np.tile(np.arange(n_lights), (len(first), 1))
+    rows = np.arange(len(first))
+    orders[rows, first], orders[rows, second] = second, first
+    return orders
+
+
+def _sample(observations: NDArray[np.floating]) -> Array:
+    """Return lit pixels (p, F), each scaled to a largest observation of 1."""
+    brightest = observations.max(axis=1)
+    usable = np.flatnonzero(brightest > 0.1 * np.quantile(brightest, 0.99))
+    number = min(len(usable), MAX_PIXELS, max(MAX_OBSERVATIONS // observations.shape[1], 1))
+    chosen = usable[np.linspace(0, len(usable) - 1, number).astype(int)] if len(usable) else usable
+    values = observations[chosen].astype(np.float64)
+    values = values / values.max(axis=1, keepdims=True)
+    # Three unknowns need more than three lit observations to leave a residual.
+    kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
+    return kept
+
+
+def _solve(values: Array, weights: Array, basis: Array) -> Array:
+    """Return the rows (P, 3) that minimise the weighted squares of values (P, F) - rows @ basis (F, 3)'."""
+    x, y, z = basis.T
+    products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
+    inverse = inverse_3x3(tuple((weights @ products).T), _PRIOR)
+    solution: Array = np.stack(multiply_symmetric(inverse, tuple(((weights * values) @ basis).T)), axis=1)
+    return solution

@@ -1,0 +1,42 @@
+"""A sample of a capture's pixels on a grid, small enough for checks that see neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_PIXELS = 20_000
+"""Of larger captures, every second or third row and column is taken, and so on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Observations on a grid of pixels.
+
+    Args:
+        observations: (p, F), linear, divided by the light intensities; pixels of the mask in row-major order.
+        mask: (h, w) bool with p true pixels.
+        step: rows and columns of the images from one pixel of the grid to the next.
+    """
+
+    observations: NDArray[np.floating]
+    mask: NDArray[np.bool_]
+    step: int
+
+
+def grid_step(mask: NDArray[np.bool_]) -> int:
+    """Return the step with which a grid has at most about MAX_PIXELS pixels of the mask (H, W)."""
+    return max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
+
+
+def sample_observations(observations: NDArray[np.floating], mask: NDArray[np.bool_]) -> Sample:
+    """Return a sample of observations (P, F) of the pixels of a mask (H, W)."""
+    step = grid_step(mask)
+    if step == 1:
+        return Sample(observations, mask, step)
+    rows = np.full(mask.shape, -1)
+    rows[mask] = np.arange(len(observations))
+    rows = rows[::step, ::step]
+    return Sample(observations[rows[rows >= 0]], rows >= 0, step)

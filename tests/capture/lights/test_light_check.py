@@ -1,0 +1,213 @@
+"""Wrong light files are told from right ones, on surfaces whose normals are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import read_capture
+from splinecli.capture.lights.frame_evidence import rough_normals
+from splinecli.capture.lights.light_check import UNKNOWN_ORDER, LightCheck, check_lights
+from splinecli.capture.lights.light_fit import find_factors, random_misfits, shifted_orders, swapped_orders
+from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame, parse_light_frame
+from splinecli.errors import UsageError
+
+Array = NDArray[np.float64]
+MEDALLION = Path(__file__).resolve().parents[3] / "examples/medallion"
+SIZE = 64
+
+
+def ring(count: int, axis_deg: float = 40) -> Array:
+    azimuth, zenith = 0.3 + np.arange(count) * 2 * np.pi / count, np.radians(axis_deg)
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.full(count, np.cos(zenith))),
+        axis=1,
+    )
+
+
+def scattered(count: int = 14) -> Array:
+    """Lights on a spiral, so that no shift or exchange takes them to each other."""
+    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(12, 55, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def vase() -> tuple[Array, NDArray[np.bool_]]:
+    """The normals (P, 3) of a tilted ellipsoid with a dent, and its mask: z = sqrt(1 - u^2 - 2 v^2) - bump."""
+    y, x = -np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
+    x = -x
+    u, v = 0.8 * x + 0.5 * y, 1.1 * y - 0.3 * x
+    inside = u**2 + 1.6 * v**2 < 0.97
+    z = np.sqrt(np.maximum(1 - u**2 - 1.6 * v**2, 0.03)) - 0.12 * np.exp(
+        -((x - 0.2) ** 2 + (y - 0.1) ** 2) / 0.05
+    )
+    z_row, z_x = np.gradient(z, 2 / (SIZE - 1))
+    normals = np.stack((-z_x, z_row, np.ones_like(z)), axis=2)
+    return (normals / np.linalg.norm(normals, axis=2, keepdims=True))[inside], inside
+
+
+def shade(normals: Array, lights: Array) -> Array:
+    """Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise."""
+    half = lights + np.array((0.0, 0.0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    cosine = np.clip(normals @ lights.T, 0, None)
+    highlight = 0.3 * np.clip(normals @ half.T, 0, None) ** 30 * (cosine > 0)
+    noise = np.random.default_rng(5).normal(0, 0.01, cosine.shape)
+    return np.clip(cosine + highlight + noise, 0, None)
+
+
+def check_vase(lights: Array, read_as: Array) -> LightCheck:
+    normals, mask = vase()
+    return check_lights(shade(normals, lights), mask, read_as)
+
+
+@pytest.mark.parametrize("lights", [scattered(), scattered(6), ring(8), ring(12)], ids=len)
+def test_right_lights_are_not_doubted(lights: Array) -> None:
+    check = check_vase(lights, lights)
+    assert (check.order, check.best) == (None, None)
+    assert check.given.curl < 0.2
+    assert check.given.rim is not None and check.given.rim > 0.9
+
+
+@pytest.mark.parametrize("frame", PLANE_FRAMES[1:], ids=str)
+def test_each_wrong_frame_is_named_with_the_frame_that_mends_it(frame: LightFrame) -> None:
+    lights = scattered()
+    # The inverse of the frame writes the file, so that reading it in the frame gives the lights.
+    check = check_vase(lights, lights @ np.linalg.inv(frame.matrix).T)
+    assert check.order is None
+    assert check.best is not None
+    assert check.best.frame == frame
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (np.roll(np.arange(14), 1), "if image 1 belongs to light 2, image 2 to the next, and so on"),
+        (np.arange(14)[::-1], "in reversed order, beginning with light 14"),
+        (np.r_[0, 1, 9, 3:9, 2, 10:14], "with those of 3 and 10 exchanged"),
+        (np.random.default_rng(1).permutation(14), UNKNOWN_ORDER),
+    ],
+    ids=["shifted", "reversed", "swapped", "shuffled"],
+)
+def test_each_wrong_order_is_named(order: NDArray[np.int64], words: str) -> None:
+    lights = scattered()
+    check = check_vase(lights, lights[order])
+    assert check.order == words
+    assert check.best is None
+    assert check.given_misfit is not None and check.given_misfit > 0.3
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (np.roll(np.arange(12), 1), "if image 1 belongs to light 2, image 2 to the next, and so on"),
+        (np.arange(12)[::-1], "in reversed order, beginning with light 12"),
+    ],
+)
+def test_a_ring_that_fits_in_every_shift_is_told_by_its_normals(order: NDArray[np.int64], words: str) -> None:
+    check = check_vase(ring(12), ring(12)[order])
+    assert check.order is None, "a turned ring fits as well"
+    assert check.best is not None
+    assert check.best.name == words
+
+
+def test_a_choice_of_lights_is_checked_in_the_order_of_the_file() -> None:
+    lights, chosen = scattered(20)[np.random.default_rng(2).permutation(20)], [1, 4, 6, 7, 11, 13, 16, 19]
+    normals, mask = vase()
+    observations = shade(normals, lights[chosen])
+    assert check_lights(observations, mask, lights, chosen).order is None
+    check = check_lights(observations, mask, np.roll(lights, 1, axis=0), chosen)
+    assert check.order == "if image 1 belongs to light 2, image 2 to the next, and so on"
+
+
+def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
+    y, x = np.mgrid[0 : 3 : SIZE * 1j, 0 : 3 : SIZE * 1j]
+    z_x, z_y = 0.4 * np.cos(2 * x) * np.sin(3 * y), 0.6 * np.sin(2 * x) * np.cos(3 * y)
+    normals = np.stack((-z_x, z_y, np.ones_like(x)), axis=2).reshape(-1, 3)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mask, lights = np.ones((SIZE, SIZE), np.bool_), scattered()
+    observations = shade(normals, lights)
+    right = check_lights(observations, mask, lights)
+    assert right.best is None and right.given.rim is None
+    flipped = check_lights(observations, mask, lights * (1, -1, 1))
+    # Which of both axes is wrong, the curl does not tell.
+    assert flipped.best is not None and flipped.best.frame is not None
+    assert flipped.best.frame.signs[0] != flipped.best.frame.signs[1]
+
+
+def test_few_lights_abstain_about_the_order() -> None:
+    lights = scattered(5)
+    check = check_vase(lights, lights[::-1])
+    assert check.order is None and check.given.misfit is None
+
+
+def test_misfits_are_those_of_least_squares() -> None:
+    lights = scattered()
+    normals, _ = vase()
+    observations = np.clip(normals @ lights.T, 0, None)
+    observations = observations[(observations > 0.15).all(axis=1)]
+    observations /= observations.max(axis=1, keepdims=True)
+    factors = find_factors(observations)
+    assert factors is not None and factors.residual < 1e-9
+    wrong = np.roll(lights, 1, axis=0)
+    left = observations - observations @ np.linalg.pinv(wrong).T @ wrong.T
+    # The residual of least squares over all pixels, as a share of the brightness.
+    expected = np.sqrt((left**2).sum() / (observations**2).sum())
+    assert factors.misfits(wrong[None])[0] == pytest.approx(expected, rel=1e-6)
+    assert factors.misfits(lights[None])[0] < 1e-7
+    assert random_misfits(factors, lights).min() > 0.01
+
+
+def test_orders() -> None:
+    assert shifted_orders(3).tolist() == [[0, 1, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0], [0, 2, 1], [1, 0, 2]]
+    assert swapped_orders(3).tolist() == [[1, 0, 2], [2, 1, 0], [0, 2, 1]]
+
+
+def test_rough_normals_are_those_of_the_surface() -> None:
+    normals, mask = vase()
+    rough = rough_normals(np.clip(normals @ scattered().T, 0, None), scattered(), mask)
+    cosines = (rough.normals[mask] * normals).sum(axis=1)
+    assert np.degrees(np.arccos(np.median(cosines).clip(-1, 1))) < 2  # they are smoothed
+
+
+@pytest.mark.parametrize("frame", PLANE_FRAMES, ids=str)
+def test_frames_are_read_as_they_are_written(frame: LightFrame) -> None:
+    assert parse_light_frame(str(frame)) == frame
+    twice = frame.after(LightFrame((1, -1, 1), exchanged=True))
+    np.testing.assert_array_equal(twice.matrix, frame.matrix @ LightFrame((1, -1, 1), exchanged=True).matrix)
+
+
+def test_the_columns_of_an_exchanged_file() -> None:
+    # The file has y before x, and its y points down: (y, x, z) = (0.2, 0.5, 0.8) is x = 0.5, y = -0.2.
+    frame = parse_light_frame("exchanged, y-down")
+    np.testing.assert_array_equal(np.array((0.2, 0.5, 0.8)) @ frame.matrix.T, (0.5, -0.2, 0.8))
+    assert frame.describe() == "x and y exchanged, y negated"
+
+
+@pytest.mark.parametrize("text", ["down", "y-down,y-up", ""])
+def test_refused_frames(text: str) -> None:
+    with pytest.raises(UsageError, match="--light-frame is"):
+        parse_light_frame(text)
+
+
+def test_the_medallion_is_not_doubted() -> None:
+    capture = read_capture(MEDALLION)
+    check = check_lights(capture.observations, capture.mask, capture.light_directions)
+    assert (check.order, check.best) == (None, None)
+
+
+@pytest.mark.parametrize(
+    "name", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse"]
+)
+def test_real_captures(shared_data: Path, name: str) -> None:
+    chosen = None if "uw" in name else list(range(3, 96, 7))
+    capture = read_capture(shared_data / name, light_indices=chosen)
+    lights = capture.light_directions
+    right = check_lights(capture.observations, capture.mask, lights)
+    assert (right.order, right.best) == (None, None)
+    flipped = check_lights(capture.observations, capture.mask, lights * (1, -1, 1))
+    assert flipped.best is not None and str(flipped.best.frame) == "y-down"

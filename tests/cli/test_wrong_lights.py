@@ -1,0 +1,88 @@
+"""Wrong light files are told on the command line, with the option that mends them; --strict makes them errors."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
+
+
+@pytest.fixture
+def medallion(tmp_path, monkeypatch):
+    """A copy of the example, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "medallion"
+    shutil.copytree(EXAMPLE, folder)
+    return folder
+
+
+def write_lights(folder: Path, change) -> None:
+    lights = np.loadtxt(EXAMPLE / "light_directions.txt")
+    np.savetxt(folder / "light_directions.txt", change(lights), fmt="%.6f")
+
+
+def test_infer_names_a_flipped_axis_and_the_frame_mends_it(run, medallion):
+    write_lights(medallion, lambda lights: lights * (1, -1, 1))
+    result = run("infer", medallion, "--method", "ls")
+    assert result.code == 0
+    assert "with y negated (curl 0.03 against 0.52, outline +1.00 against -0.00)" in result.err
+    assert "run again with --light-frame y-down." in result.err
+    report = json.loads(Path("out/medallion/report.json").read_text())
+    assert [warning["code"] for warning in report["warnings"]] == ["light_frame"]
+    wrong = report["angular_error_deg"]["mean"]
+
+    mended = run("infer", medallion, "--method", "ls", "--light-frame", "y-down", "--overwrite")
+    assert (mended.code, mended.err) == (0, "")
+    report = json.loads(Path("out/medallion/report.json").read_text())
+    assert report["options"]["light_frame"] == "y-down"
+    assert report["angular_error_deg"]["mean"] < wrong / 5
+
+
+def test_the_advice_counts_from_the_file_not_from_the_frame_given(run, medallion):
+    write_lights(medallion, lambda lights: lights * (-1, 1, -1))
+    result = run("infer", medallion, "--method", "ls", "--light-frame", "z-away")
+    assert "run again with --light-frame x-left,z-away." in result.err
+
+
+def test_lights_that_all_point_away(run, medallion):
+    write_lights(medallion, lambda lights: -lights)
+    result = run("infer", medallion, "--method", "ls")
+    assert result.code == 3
+    assert "z points away from the camera in this file: add --light-frame z-away" in result.err
+
+
+def test_strict_writes_nothing_and_ends_with_3(run, medallion):
+    write_lights(medallion, lambda lights: np.roll(lights, 1, axis=0))
+    result = run("infer", medallion, "--method", "ls", "--strict")
+    assert (result.code, result.out) == (3, "")
+    assert "much better if image 1 belongs to light 2, image 2 to the next, and so on" in result.err
+    assert "Leave --strict out to go on nevertheless." in result.err
+    assert not Path("out/medallion").exists()
+
+
+def test_info_lists_the_readings(run, medallion):
+    good = run("info", medallion, "--strict", "--check-lights", "--json")
+    assert good.code == 0
+    rows = json.loads(good.out)["light_candidates"]
+    assert rows[0]["reading"] == "as given"
+    assert rows[0]["rim"] > 0.99 and max(row["advantage"] for row in rows) == 0
+    assert len(rows) >= 8
+    write_lights(medallion, lambda lights: lights[:, [1, 0, 2]])
+    wrong = run("info", medallion, "--strict", "--check-lights")
+    assert wrong.code == 3
+    assert "--light-frame exchanged" in wrong.err
+    assert "x and y exchanged  " in wrong.out
+
+
+def test_unknown_frames_are_refused_before_anything_is_read(run, medallion):
+    result = run("infer", medallion, "--light-frame", "down")
+    assert result.code == 2
+    assert (
+        "--light-frame is 'down'; expected words of x-right, x-left, y-up, y-down, z-camera, z-away, exchanged"
+        in result.err
+    )
