@@ -115,3 +115,12 @@ def test_diligent_figures(run: Run, tmp_path: Path) -> None:
     assert "| light_noise_deg | 0.0 | 4.0 |" in printed
     assert printed.count("| ball, `ls` | 2.50 | 2.50 |") == 2
     assert len(json.loads(stored.read_text())["results"]) == 3
+
+
+def test_wrong_lights(run: Run) -> None:
+    rows = run("wrong_lights", MEDALLION, "--scenes", "0", "--draws", "1").splitlines()
+    cells = dict(row.strip("| ").split(" | ") for row in rows if row.count("|") == 3 and "---" not in row)
+    assert cells.pop("light file") == "medallion"
+    assert cells.pop("right") == "0 of 1"
+    assert len(cells) == 9
+    assert sum(cell == "1 / 1 of 1" for cell in cells.values()) >= 8

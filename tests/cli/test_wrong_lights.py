@@ -86,3 +86,15 @@ def test_unknown_frames_are_refused_before_anything_is_read(run, medallion):
         "--light-frame is 'down'; expected words of x-right, x-left, y-up, y-down, z-camera, z-away, exchanged"
         in result.err
     )
+
+
+def test_lights_as_angles(run, medallion):
+    def angles(lights):
+        return np.degrees(np.stack((np.arctan2(lights[:, 1], lights[:, 0]), np.arcsin(lights[:, 2])), axis=1))
+
+    write_lights(medallion, angles)
+    refused = run("infer", medallion, "--method", "ls")
+    assert refused.code == 3
+    assert "found 2 columns of angles, expected 3 columns (x y z). If they are" in refused.err
+    read = run("infer", medallion, "--method", "ls", "--lights-format", "azel")
+    assert (read.code, read.err) == (0, "")

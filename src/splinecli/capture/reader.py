@@ -15,9 +15,10 @@ from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.header import is_display_encoded
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
-from splinecli.capture.lights import named_lights
-from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
+from splinecli.capture.lights.light_angles import LightForm
+from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.named_lights import NamedLights, read_lights
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
@@ -38,6 +39,7 @@ def open_capture(
     radiometry: RadiometricCalibration = AS_STORED,
     white_level: float | None = None,
     light_frame: LightFrame = USUAL_FRAME,
+    lights_format: LightForm = "xyz",
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
@@ -50,6 +52,7 @@ def open_capture(
         white_level: stored value from which an observation counts as saturated, such as 4095 for 12 bits. By default it
             is found from the files and their values (see white_level.py).
         light_frame: the frame of the light file.
+        lights_format: whether the rows of a light file of text are vectors or angles.
 
     Raises:
         InputError: the folder contains no capture (see find_capture_files) or a light file is wrong.
@@ -60,7 +63,7 @@ def open_capture(
     equal = intensities is not None and str(intensities) == EQUAL
     named = (lights, None if equal else intensities, mask, ground_truth)
     files = find_capture_files(folder, Overrides(*(None if file is None else Path(file) for file in named)))
-    source = _read_lights(files, radiometry, light_frame, equal=equal)
+    source = _read_lights(files, radiometry, light_frame, lights_format, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     ambient = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     if radiometry.ambient is None and ambient is not None:
@@ -102,7 +105,12 @@ def read_capture(
 
 
 def _read_lights(
-    files: CaptureFiles, radiometry: RadiometricCalibration, frame: LightFrame, *, equal: bool
+    files: CaptureFiles,
+    radiometry: RadiometricCalibration,
+    frame: LightFrame,
+    form: LightForm,
+    *,
+    equal: bool,
 ) -> CaptureSource:
     """Return the capture with its lights; a light file that names images sets their order.
 
@@ -112,8 +120,8 @@ def _read_lights(
     path = files.light_directions
     warnings: list[CaptureWarning] = []
     intensities = None
-    if path.suffix.lower() in named_lights.SUFFIXES:
-        named = named_lights.read_named_lights(path, frame)
+    named = read_lights(path, len(files.images), frame, form)
+    if isinstance(named, NamedLights):
         images, how = named.match(files.images)
         flats = radiometry.flat_field
         if len(flats) == len(files.images) > 1:  # they are in the order of the folder's images
@@ -125,7 +133,7 @@ def _read_lights(
         if how != "name":
             warnings.append(capture_warnings.lights_matched(path.name, how))
     else:
-        directions = read_light_directions(path, len(files.images), frame)
+        directions = named
     if equal:
         intensities = None
     elif files.light_intensities is not None:

@@ -14,7 +14,14 @@ from splinecli.cli import choices
 from splinecli.cli.console import Messages
 from splinecli.cli.failures import batch_error_document
 from splinecli.cli.options import computing, inputs, outputs
-from splinecli.cli.options.values import Device, NormalConvention, Precision, parse_indices, split_commas
+from splinecli.cli.options.values import (
+    Device,
+    LightForm,
+    NormalConvention,
+    Precision,
+    parse_indices,
+    split_commas,
+)
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -44,6 +51,7 @@ def infer(
     flat_field: Path | None = inputs.FLAT_FIELD,
     white_level: float | None = inputs.WHITE_LEVEL,
     light_frame: str | None = inputs.LIGHT_FRAME,
+    lights_format: LightForm = inputs.LIGHTS_FORMAT,
     as_stored: bool = inputs.AS_STORED,
     output: Path = outputs.INFER_FOLDER,
     method: str = computing.METHOD,
@@ -108,6 +116,7 @@ def infer(
             surface=surface,
             convention=convention.value,
             light_frame=light_frame,
+            lights_format=lights_format.value,
             strict=strict,
         )
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"

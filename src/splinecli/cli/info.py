@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
+from splinecli.cli.options.values import LightForm
 from splinecli.errors import InputError
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
@@ -21,6 +22,7 @@ def info(
     flat_field: Path | None = inputs.FLAT_FIELD,
     white_level: float | None = inputs.WHITE_LEVEL,
     light_frame: str | None = inputs.LIGHT_FRAME,
+    lights_format: LightForm = inputs.LIGHTS_FORMAT,
     check_lights: bool = inputs.CHECK_LIGHTS,
     plot: Path | None = outputs.LIGHT_PLOT,
     overwrite: bool = outputs.OVERWRITE_PLOT,
@@ -48,6 +50,7 @@ def info(
         plot=plot,
         overwrite=overwrite,
         light_frame=light_frame,
+        lights_format=lights_format.value,
         check_lights=check_lights,
     )
     report = describe_capture(options, Messages(quiet=quiet))

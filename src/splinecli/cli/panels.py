@@ -12,6 +12,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Lights": (
             "--lights",
             "--light-frame",
+            "--lights-format",
             "--intensities",
             "--n-lights",
             "--seed",
@@ -33,7 +34,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "info": {
         "Input": ("--mask", "--ground-truth", *VALUES),
-        "Lights": ("--lights", "--light-frame", "--intensities", "--check-lights"),
+        "Lights": ("--lights", "--light-frame", "--lights-format", "--intensities", "--check-lights"),
         "Output": ("--plot", "--strict", *REPEAT),
     },
     "calibrate": {

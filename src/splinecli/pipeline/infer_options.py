@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
 
 Device = Literal["auto", "cpu", "cuda"]
+LightForm = Literal["xyz", "azel"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
@@ -28,6 +29,7 @@ class InferOptions:
     Args:
         lights, mask, ground_truth: files that replace those of the capture.
         intensities: a file of light intensities, or "equal".
+        lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
         strict: fail where a warning says that the lights or images are probably wrong.
         auto_mask: find the object where the capture has no mask.
@@ -58,6 +60,7 @@ class InferOptions:
     auto_mask: bool = False
     ground_truth: str | None = None
     light_frame: str | None = None
+    lights_format: LightForm = "xyz"
     transfer: str = "linear"
     ambient: str | None = None
     flat_field: str | None = None
@@ -101,6 +104,7 @@ class InferOptions:
         if self.white_level is not None and not 0 < self.white_level < math.inf:
             raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
         _check_one_of("precision", self.precision, get_args(Precision))
+        _check_one_of("light format", self.lights_format, get_args(LightForm))
         _check_one_of("device", self.device, get_args(Device))
         _check_one_of("convention", self.convention, get_args(Convention))
         for name in self.formats:
@@ -156,6 +160,7 @@ class InferOptions:
             radiometry=self.radiometric_calibration(),
             white_level=self.white_level,
             light_frame=parse_light_frame(self.light_frame),
+            lights_format=self.lights_format,
         )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
-from splinecli.pipeline.infer_options import radiometric_calibration
+from splinecli.pipeline.infer_options import LightForm, radiometric_calibration
 from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ class InfoOptions:
         capture: the folder of the capture.
         lights, intensities, mask, ground_truth: files that replace those of the capture. `intensities` may also be
             "equal".
+        lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down".
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
@@ -56,6 +57,7 @@ class InfoOptions:
     mask: Path | None = None
     ground_truth: Path | None = None
     light_frame: str | None = None
+    lights_format: LightForm = "xyz"
     transfer: str = "linear"
     ambient: Path | None = None
     flat_field: Path | None = None
@@ -78,6 +80,7 @@ class InfoOptions:
             radiometry=radiometric_calibration(self.transfer, self.ambient, self.flat_field),
             white_level=self.white_level,
             light_frame=parse_light_frame(self.light_frame),
+            lights_format=self.lights_format,
         )
 
 

@@ -175,7 +175,7 @@ def test_files_that_are_no_text(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"found a folder, expected a text file with a line x y z for"):
         read_light_directions(tmp_path)
     with pytest.raises(InputError, match=r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."):
-        read_light_directions(write(tmp_path, "0 0 1", encoding="utf-16"))
+        read_light_directions(write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1"))
     cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((3, 3), np.uint8))
     with pytest.raises(
         InputError, match=r"found an image, expected a text file with a line x y z for each image\."

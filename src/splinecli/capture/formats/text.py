@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from splinecli.capture.formats.header import is_image
 from splinecli.errors import InputError
 
 _SEPARATORS = re.compile(r"[\s,;]+")
+_SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
+_NUMBER_WITH_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 """Hint for a line with decimal commas."""
@@ -33,6 +37,18 @@ class NumberRows:
     rows: tuple[tuple[float, ...], ...]
     lines: tuple[int, ...]
     texts: tuple[str, ...] = field(repr=False)
+
+    @classmethod
+    def from_words(cls, path: Path, rows: Sequence[tuple[int, str, list[str]]]) -> NumberRows:
+        """Return the numbers of rows of (line, text, words).
+
+        Raises:
+            InputError: with the line, for a word that is no finite number; also where there are no rows.
+        """
+        if not rows:
+            raise InputError("the file contains no numbers", path=path)
+        numbers = tuple(tuple(parse_number(word, path, line) for word in words) for line, _, words in rows)
+        return cls(path, numbers, tuple(line for line, *_ in rows), tuple(text for _, text, _ in rows))
 
     def drop_first(self) -> NumberRows:
         """Return the rows without the first one (a count line)."""
@@ -64,23 +80,26 @@ def has_decimal_commas(text: str) -> bool:
 
 
 def read_lines(path: Path, *, else_latin_1: bool = False, expected: str = "a text file") -> list[str]:
-    """Return the lines of a UTF-8 file, with or without a byte order mark. Raises InputError.
+    """Return the lines of a file in UTF-8, or in UTF-16 with a byte order mark. Raises InputError.
 
     Args:
         else_latin_1: whether a file that is not UTF-8 is read as Latin-1, which older programs on Windows write.
         expected: what the file should be, for messages.
     """
     try:
-        return path.read_text(encoding="utf-8-sig").split("\n")
+        content = path.read_bytes()
+        # Notepad calls it "Unicode".
+        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+        return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     except FileNotFoundError:
         raise InputError("the file does not exist", path=path) from None
     except IsADirectoryError:
         raise InputError(f"found a folder, expected {expected}", path=path) from None
     except UnicodeDecodeError:
-        if is_image(path.read_bytes()):
+        if is_image(content):
             raise InputError(f"found an image, expected {expected}", path=path) from None
         if else_latin_1:
-            return path.read_text(encoding="latin-1").split("\n")
+            return content.decode("latin-1").replace("\r\n", "\n").split("\n")
         raise InputError(
             "the file is not UTF-8 text", path=path, hint="Save it as plain UTF-8 text"
         ) from None
@@ -96,17 +115,46 @@ def read_number_rows(path: Path, *, expected: str = "a text file") -> NumberRows
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
-    rows, lines, texts = [], [], []
-    for line, text in enumerate(read_lines(path, expected=expected), start=1):
-        content = text.partition("#")[0].strip()
-        words = [word for word in _SEPARATORS.split(content) if word]
-        if words:
-            rows.append(tuple(parse_number(word, path, line) for word in words))
-            lines.append(line)
-            texts.append(content)
-    if not rows:
-        raise InputError("the file contains no numbers", path=path)
-    return NumberRows(path, tuple(rows), tuple(lines), tuple(texts))
+    content = [
+        (line, text.partition("#")[0].strip())
+        for line, text in enumerate(read_lines(path, expected=expected), start=1)
+    ]
+    commas = uses_decimal_commas([text for _, text in content if text], 3)
+    rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
+    return NumberRows.from_words(path, [(line, text, words) for line, text, words in rows if words])
+
+
+def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
+    """Return the words of a line, with points for decimal commas."""
+    separators = _SEPARATORS_BESIDE_COMMAS if decimal_commas else _SEPARATORS
+    words = [word for word in separators.split(text) if word]
+    return [_with_point(word) for word in words] if decimal_commas else words
+
+
+def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
+    """Return whether lines have decimal commas, such as "0,5 0,3 0,8": their last numbers stand apart without them."""
+    tails = [_SEPARATORS_BESIDE_COMMAS.split(text)[-n_numbers:] for text in texts]
+    rows = [words for words in tails if len(words) == n_numbers and any(map(_is_number_with_comma, words))]
+    return any("," in word for words in rows for word in words) and all(
+        _is_number_with_comma(word) for words in rows for word in words
+    )
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a number, finite or not."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_number_with_comma(word: str) -> bool:
+    return any(character.isdigit() for character in word) and bool(_NUMBER_WITH_COMMA.fullmatch(word))
+
+
+def _with_point(word: str) -> str:
+    return word.replace(",", ".") if _is_number_with_comma(word) else word
 
 
 def parse_number(word: str, path: Path, line: int) -> float:

@@ -12,11 +12,11 @@ from splinecli.capture.paths import find_mode, is_file, resolve
 from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
-LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt")
+LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
 NAMED_LIGHTS = (".lp", "lights.json")
 """Endings of the names of light files that name the image of each light."""
-LIGHT_FILES = f"{', '.join(LIGHT_DIRECTIONS)}, *.lp or lights.json"
-"""The names of light files, for messages."""
+LIGHT_FILES = "light_directions.txt, lights.txt, *.lp or lights.json"
+"""The usual names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
 AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)

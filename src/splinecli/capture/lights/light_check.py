@@ -42,7 +42,7 @@ UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
 """An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
 could explain: highlights and shadows."""
 
-CURL_WEIGHT, RIM_WEIGHT = 2.1, 0.83
+CURL_WEIGHT, RIM_WEIGHT = 3.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
 
 NEAR = 0.1

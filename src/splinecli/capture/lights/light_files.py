@@ -1,4 +1,4 @@
-"""Light directions and intensities from text files: N x 3 or 3 x N, with or without a count line.
+"""Light directions and intensities from text and .npy files: N x 3 or 3 x N, with or without a count line.
 
 Frame: x right, y up, z to the camera; a direction points from the object to the light.
 """
@@ -18,34 +18,65 @@ from splinecli.capture.formats.text import (
     has_decimal_commas,
     read_number_rows,
 )
+from splinecli.capture.lights.light_angles import (
+    COLUMNS,
+    LightForm,
+    check_angles,
+    counts_rows,
+    directions_from_angles,
+    refuse_angles,
+)
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.light_rows import read_light_rows
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
+
+NPY = ".npy"
 
 _FILE = "a text file with a line {} for each image"
 
 
 def read_light_directions(
-    path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME
+    path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: LightForm = "xyz"
 ) -> NDArray[np.float64]:
-    """Return unit light directions (F, 3) float64 from a text file.
+    """Return unit light directions (F, 3) float64 from a text file or an .npy file, in the order of the file.
 
-    A row is x y z, separated by spaces, tabs, commas or semicolons. A first line with only the number of lights is
-    accepted (the University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is read as
-    rows. Vectors may have any length above zero.
+    A row is x y z, separated by spaces, tabs, commas or semicolons. A header, and a first line with only the number of
+    lights, are accepted (the University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox);
+    3 x 3 is read as rows. A first column that counts the rows, from 0 or 1, gives their order. Vectors may have any
+    length above zero.
 
     Args:
         path: the file.
         n_images: the number of lights that is expected, if it is known.
         frame: the frame of the file.
+        form: whether a row is a vector or two angles.
 
     Raises:
         InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
             vector or a light below the horizon; also where the count disagrees with the count line or with
-            n_images.
+            n_images, and for angles that are read as vectors.
     """
-    table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("x y z")), n_images)
-    vectors, transposed = _one_light_a_row(table, {3: "x y z"}, "light directions", n_images)
+    path = Path(path)
+    if path.suffix.lower() == NPY:
+        return directions_of(_read_array(path), n_images, frame, form)
+    meaning = COLUMNS[form]
+    rows = read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
+    return directions_of(rows.numbers, n_images, frame, form)
+
+
+def directions_of(
+    table: NumberRows, n_images: int | None, frame: LightFrame, form: LightForm
+) -> NDArray[np.float64]:
+    """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
+    table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
+    if form == "azel":
+        vectors, transposed = _one_light_a_row(table, COLUMNS[form], "lights", n_images)
+        check_angles(table)
+        vectors = directions_from_angles(vectors)
+    else:
+        refuse_angles(table)
+        vectors, transposed = _one_light_a_row(table, COLUMNS[form], "light directions", n_images)
     return unit_directions(
         vectors @ frame.matrix.T + 0.0,  # no -0
         table.path,
@@ -115,6 +146,42 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
             line=table.lines[channel if transposed else light],
         )
     return np.broadcast_to(intensities, (n_images, 3)).copy()
+
+
+def _read_array(path: Path) -> NumberRows:
+    """Return the rows of an .npy file; the lines count them from 1."""
+    try:
+        with path.open("rb") as file:
+            array = np.lib.format.read_array(file, allow_pickle=False)
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
+        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
+        raise InputError(
+            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3",
+            path=path,
+        )
+    rows = tuple(tuple(row) for row in array.astype(np.float64).tolist())
+    return NumberRows(path, rows, tuple(range(1, len(rows) + 1)), ("",) * len(rows))
+
+
+def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
+    """Return the table in the order of a first column that counts the lights, and without that column."""
+    if {len(row) for row in table.rows} != {n_columns + 1} or n_images not in (None, len(table.rows)):
+        return table
+    if n_images is None and len(table.rows) == n_columns:
+        return table  # one light in each column
+    first = counts_rows([row[0] for row in table.rows])
+    if first is None:
+        return table
+    order = np.argsort([row[0] for row in table.rows])
+    return NumberRows(
+        table.path,
+        tuple(table.rows[i][1:] for i in order),
+        tuple(table.lines[i] for i in order),
+        tuple(table.texts[i] for i in order),
+    )
 
 
 def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:

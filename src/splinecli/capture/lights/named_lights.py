@@ -1,4 +1,4 @@
-"""Light files that name the image of each light: RTI's .lp and the JSON of AliceVision (Meshroom).
+"""Light files that name the image of each light: RTI's .lp, the JSON of AliceVision (Meshroom), and text.
 
 The names often come from another machine, with folders that do not exist here, or are only numbers. So the images of
 the folder are matched to them by base name, then by name without suffix, then by order.
@@ -16,10 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import parse_number, read_lines
-from splinecli.capture.lights.light_files import unit_directions
+from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
+from splinecli.capture.lights.light_angles import COLUMNS, LightForm
+from splinecli.capture.lights.light_files import NPY, directions_of, read_light_directions, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.light_rows import image_name, read_light_rows
 from splinecli.errors import InputError
+
+Array = NDArray[np.float64]
 
 SUFFIXES = (".lp", ".json")
 _FOLDERS = re.compile(r"[/\\]")
@@ -78,6 +82,26 @@ class NamedLights:
         )
 
 
+def read_lights(
+    path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: LightForm = "xyz"
+) -> NamedLights | Array:
+    """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
+
+    Raises:
+        InputError: see read_light_directions.
+    """
+    if path.suffix.lower() in SUFFIXES:
+        return read_named_lights(path, frame)
+    if path.suffix.lower() != NPY:
+        meaning = COLUMNS[form]
+        expected = f"a text file with a line {next(iter(meaning.values()))} for each image"
+        rows = read_light_rows(path, expected=expected, n_numbers=min(meaning))
+        if rows.names is not None:
+            directions = directions_of(rows.numbers, None, frame, form)
+            return NamedLights(path, rows.names, rows.numbers.lines, directions)
+    return read_light_directions(path, n_images, frame, form)
+
+
 def read_named_lights(path: Path, frame: LightFrame = USUAL_FRAME) -> NamedLights:
     """Return the lights of an .lp or AliceVision JSON file; the suffix decides which. Raises InputError.
 
@@ -106,12 +130,14 @@ def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
     if not rows:
         raise InputError("the file contains no lights", path=path, line=first)
     names, vectors = [], []
+    commas = uses_decimal_commas([text for _, text in rows], 3)
     for line, text in rows:
         words = text.rsplit(maxsplit=3)
         if len(words) < 4:
             raise InputError(f'found "{text[:40]}", expected a file name and x y z', path=path, line=line)
-        names.append(_FOLDERS.split(words[0].strip('"'))[-1])
-        vectors.append([parse_number(word, path, line) for word in words[1:]])
+        names.append(image_name(words[0], []))
+        numbers = split_words(" ".join(words[1:]), decimal_commas=commas)
+        vectors.append([parse_number(word, path, line) for word in numbers[:3]])
     lines = tuple(line for line, _ in rows)
     directions = unit_directions(np.array(vectors) @ frame.matrix.T + 0.0, path, lines, [""] * len(lines))
     return NamedLights(path, tuple(names), lines, directions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typer import Argument, Option
 
-from splinecli.cli.options.values import NormalConvention, complete_curves, complete_list
+from splinecli.cli.options.values import LightForm, NormalConvention, complete_curves, complete_list
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 
@@ -27,6 +27,10 @@ LIGHT_FRAME = Option(
 )
 CHECK_LIGHTS = Option(
     False, "--check-lights", help="List other readings of the light file, and how well the images fit each."
+)
+LIGHTS_FORMAT = Option(
+    LightForm.xyz,
+    help="Numbers of a light in a text file: a vector x y z, or azel, its azimuth and elevation in degrees.",
 )
 INTENSITIES = Option(
     None,

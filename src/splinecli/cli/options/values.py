@@ -22,6 +22,13 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
+class LightForm(StrEnum):
+    """Numbers of a light: a vector, or azimuth and elevation in degrees."""
+
+    xyz = "xyz"
+    azel = "azel"
+
+
 class NormalConvention(StrEnum):
     """Direction of the green channel of a normal map: up in opengl, down in directx."""
 

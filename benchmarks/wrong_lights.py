@@ -1,0 +1,155 @@
+"""How often wrong light files are recognised, and how often right ones are doubted.
+
+python benchmarks/wrong_lights.py CAPTURE... [--scenes 20] [--measured FILE.npz] [--draws 20] [--lights 12]
+
+Of each capture, draws of lights are checked (all lights where it has no more). Each draw is checked as it is and in
+every wrong way. Scenes that no default seed uses are rendered in all classes of materials, and with --measured also in
+measured ones. Prints a table in Markdown: how many are named / how many get the right mend, of how many.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splinecli.capture import read_capture
+from splinecli.capture.lights.draws import draw_lights
+from splinecli.capture.lights.light_check import UNKNOWN_ORDER, LightCheck, check_lights
+from splinecli.capture.lights.light_frames import parse_light_frame
+from splinecli.capture.sample import sample_observations
+from splinecli.synthesis.measured_files import read_measured
+from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+
+Array = NDArray[np.floating]
+FRAMES = {
+    "x negated": "x-left",
+    "y negated": "y-down",
+    "x and y exchanged": "exchanged",
+    "turned by 90 degrees": "exchanged,y-down",
+    "x and y negated": "x-left,y-down",
+}
+FIRST_SCENE, SEED = 5000, 71
+
+
+def wrong_files(
+    lights: Array, rng: np.random.Generator
+) -> Iterator[tuple[str, Array, Callable[[LightCheck], bool]]]:
+    """Yield the name of each kind of file, the lights as it gives them, and whether a check's mend is the right one."""
+    n_lights = len(lights)
+    yield "right", lights, lambda check: True
+    for name, frame in FRAMES.items():
+        inverse = np.linalg.inv(parse_light_frame(frame).matrix)
+        yield name, lights @ inverse.T, lambda check, frame=frame: mends(check, frame)  # type: ignore[misc]
+    yield (
+        "shifted by one",
+        np.roll(lights, 1, axis=0),
+        lambda check: words(check).startswith("if image 1 belongs to light 2"),
+    )
+    last = f"in reversed order, beginning with light {n_lights}"
+    yield "reversed", lights[::-1], lambda check: words(check) == last
+    yield "shuffled", lights[rng.permutation(n_lights)], lambda check: check.order == UNKNOWN_ORDER
+    one, other = sorted(rng.choice(n_lights, 2, replace=False).tolist())
+    swapped = np.arange(n_lights)
+    swapped[[one, other]] = other, one
+    mend = f"with those of {one + 1} and {other + 1} exchanged"
+    yield "two exchanged", lights[swapped], lambda check: words(check) == mend
+
+
+def mends(check: LightCheck, frame: str) -> bool:
+    return (
+        check.order is None
+        and check.best is not None
+        and str(check.best.frame) == str(parse_light_frame(frame))
+    )
+
+
+def words(check: LightCheck) -> str:
+    return check.order or (check.best.name if check.best is not None else "")
+
+
+def rendered(
+    count: int, measured: Path | None, n_lights: int
+) -> Iterator[tuple[str, Array, Array, NDArray[np.bool_]]]:
+    """Yield class of material, observations, lights and mask of rendered scenes with lights up to 60 degrees."""
+    library = None if measured is None else read_measured(measured)
+    config = SceneConfig(size=80, lights=4, samples=2, directions=48, bounces=2)
+    for index in range(FIRST_SCENE, FIRST_SCENE + count):
+        scene = draw_scene(SEED, index, config)
+        rng = np.random.default_rng([SEED, index])
+        if library is not None:
+            generator = torch.Generator().manual_seed(index)
+            patches = int(scene.patch_of_face.max()) + 1
+            scene = dataclasses.replace(
+                scene, materials={**scene.materials, "measured": library.draw(patches, generator)}
+            )
+        z, azimuth = rng.uniform(0.5, 0.99, n_lights), rng.uniform(0, 2 * np.pi, n_lights)
+        radius = np.sqrt(1 - z * z)
+        lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1).astype(np.float32)
+        result = render_scene(dataclasses.replace(scene, lights=lights), config)
+        for name, observations in result.observations.items():
+            yield f"rendered, {name}", observations, lights.astype(np.float64), result.mask
+
+
+def real(
+    folders: list[Path], n_lights: int, draws: int
+) -> Iterator[tuple[str, Array, Array, NDArray[np.bool_]]]:
+    for folder in folders:
+        capture = read_capture(folder)
+        wanted = n_lights if n_lights < capture.n_lights else None
+        for draw in draw_lights(capture.light_directions, wanted, trials=draws, seed=SEED):
+            chosen = list(draw)
+            yield folder.name, capture.observations[:, chosen], capture.light_directions[chosen], capture.mask
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("captures", nargs="*", type=Path)
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--measured", type=Path)
+    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--lights", type=int, default=12)
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    named: Counter[tuple[str, str]] = Counter()
+    mended, total = named.copy(), named.copy()
+    rng, longest = np.random.default_rng(SEED), 0.0
+    sources = (
+        real(options.captures, options.lights, options.draws),
+        rendered(options.scenes, options.measured, options.lights),
+    )
+    for source in sources:
+        for name, observations, lights, mask in source:
+            sample = sample_observations(observations, mask)
+            for kind, given, is_right in wrong_files(lights, rng):
+                started = time.perf_counter()
+                check = check_lights(sample.observations, sample.mask, given)
+                longest = max(longest, time.perf_counter() - started)
+                doubted = check.order is not None or check.best is not None
+                named[kind, name] += doubted
+                mended[kind, name] += doubted and is_right(check)
+                total[kind, name] += 1
+    names = list(dict.fromkeys(name for _, name in total))
+    print("| light file |", " | ".join(names), "|\n|---|" + "---:|" * len(names))
+    for kind in dict.fromkeys(kind for kind, _ in total):
+        cells = (
+            f"{named[kind, name]}"
+            + ("" if kind == "right" else f" / {mended[kind, name]}")
+            + f" of {total[kind, name]}"
+            for name in names
+        )
+        print(f"| {kind} |", " | ".join(cells), "|")
+    print(f"\nThe longest check took {longest:.2f} s.")
+
+
+if __name__ == "__main__":
+    main()

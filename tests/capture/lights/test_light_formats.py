@@ -1,0 +1,135 @@
+"""Light files as people have them: headers, names, counts, other encodings, decimal commas, angles, arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splinecli.capture.lights.light_files import read_light_directions
+from splinecli.capture.lights.named_lights import NamedLights, read_lights
+from splinecli.errors import InputError
+
+DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
+IMAGES = tuple(Path(f"img{number}.png") for number in (1, 2, 3, 10))
+
+
+def write(folder: Path, text: str, encoding: str = "utf-8") -> Path:
+    path = folder / "lights.txt"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
+        ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
+        ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
+        ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
+        ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
+        ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
+    ],
+    ids=["header", "utf-16", "decimal-commas", "commas-and-semicolons", "counted-from-1", "counted-from-0"],
+)
+def test_plain_files(tmp_path: Path, text: str, encoding: str) -> None:
+    path = write(tmp_path, ("\ufeff" if encoding == "utf-16-le" else "") + text, encoding)
+    np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-15)
+
+
+@pytest.mark.parametrize("n_images", [None, 4])
+def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | None) -> None:
+    # The first column, 1 3 2, would count three lights.
+    path = write(tmp_path, "1 0 0 1\n3 1 0 0\n2 1 1 1")
+    expected = np.array([[1, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
+    expected = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(read_light_directions(path, n_images), expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image,x,y,z\nimg10.png,-0.48,0.36,0.8\nimg2.png,0.6,0,0.8\nimg1.png,0,0,1\nimg3.png,0,-0.6,0.8",
+        'C:\\shoot\\img3.PNG 0 -0,6 0,8\n"img2.png" 0,6 0 0,8\nimg1.png 0 0 1\nimg10.png -0,48 0,36 0,8',
+        "4\nimg1 0 0 1\nimg2 0.6 0 0.8\nimg3 0 -0.6 0.8\nimg10 -0.48 0.36 0.8",
+    ],
+    ids=["csv", "paths", "stems"],
+)
+def test_rows_that_name_their_image(tmp_path: Path, text: str) -> None:
+    lights = read_lights(write(tmp_path, text), 4)
+    assert isinstance(lights, NamedLights)
+    images, how = lights.match(IMAGES)
+    assert how.startswith("name")
+    found = dict(zip(images, lights.directions, strict=True))
+    np.testing.assert_allclose([found[image] for image in IMAGES], DIRECTIONS, atol=1e-15)
+
+
+def test_names_with_spaces(tmp_path: Path) -> None:
+    lights = read_lights(write(tmp_path, "my shot 1.png 0 0 1\nmy shot 2.png, 0.6, 0, 0.8\nb 0 1 1"), 3)
+    assert isinstance(lights, NamedLights)
+    assert lights.names == ("my shot 1.png", "my shot 2.png", "b")
+
+
+def test_lp_files_with_decimal_commas(tmp_path: Path) -> None:
+    path = tmp_path / "a.lp"
+    path.write_text("2\nimg1.png 0,6 0 0,8\nimg2.png 0 -0,6 0,8", encoding="utf-16")
+    lights = read_lights(path, 2)
+    assert isinstance(lights, NamedLights)
+    np.testing.assert_allclose(lights.directions, DIRECTIONS[1:3], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "vectors", [DIRECTIONS * 3, DIRECTIONS.T.astype(np.float32)], ids=["rows", "columns"]
+)
+def test_arrays(tmp_path: Path, vectors: np.ndarray) -> None:
+    np.save(tmp_path / "lights.npy", vectors)
+    np.testing.assert_allclose(read_light_directions(tmp_path / "lights.npy", 4), DIRECTIONS, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((4, 3), "U1"), "expected finite numbers N x 3"),
+        (np.full((4, 3), np.nan), "expected finite numbers N x 3"),
+        (np.array({"a": 1}, object), "is damaged, or contains no array of numbers"),
+        (np.ones((5, 3)), "found 5 light directions, expected 4"),
+    ],
+)
+def test_refused_arrays(tmp_path: Path, array: np.ndarray, message: str) -> None:
+    np.save(tmp_path / "lights.npy", array, allow_pickle=True)
+    with pytest.raises(InputError, match=message):
+        read_light_directions(tmp_path / "lights.npy", 4)
+
+
+@pytest.mark.parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])
+def test_angles(tmp_path: Path, text: str | None) -> None:
+    # atan2(0.36, -0.48) = 143.13 degrees, asin(0.8) = 53.13 degrees.
+    counted = "2 0 53.130102\n1 0 90\n3 270 53.130102\n4 143.130102 53.130102"
+    directions = read_light_directions(write(tmp_path, text or counted), 4, form="azel")
+    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
+
+
+@pytest.mark.parametrize("text", ["0 90\n30 45\n120 45\n240 45", "1 0 90\n2 30 45\n3 120 45\n4 240 45"])
+def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match=r"angles, expected 3 columns.*add --lights-format azel"):
+        read_light_directions(write(tmp_path, text), 4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("30 45\n120 100\n240 45", r":2: found azimuth 120 and elevation 100, expected -360 to 360"),
+        ("30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
+        ("0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians"),
+        ("0 0 1\n1 0 1\n0 1 1\n1 1 1", r"found 3 columns, expected 2 \(azimuth elevation\)"),
+    ],
+)
+def test_refused_angles(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_light_directions(write(tmp_path, text), form="azel")
+
+
+def test_positions_of_lamps_are_no_angles(tmp_path: Path) -> None:
+    directions = read_light_directions(write(tmp_path, "300 400 1200\n-300 0 400\n0 900 1200\n1 2 2"))
+    np.testing.assert_allclose(directions[1], (-0.6, 0, 0.8))
