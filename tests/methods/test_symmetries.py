@@ -61,3 +61,21 @@ def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: 
     found = make(name).estimate(odd, lights[:n_lights])
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
     np.testing.assert_array_equal(found[0], (0, 0, 1))
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) -> None:
+    """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights of their own."""
+    _, lights, observations = glossy_pixels
+    some = observations[:6].astype(np.float32)
+    turned = np.stack([lights @ _about_view_axis(angle) for angle in (0.0, 0.0, 0.4, 0.4, -1.1, -1.1)])
+    together = make(name).estimate(some, turned)
+    pairs = [make(name).estimate(some[first : first + 2], turned[first]) for first in (0, 2, 4)]
+    assert largest_difference_deg(together, np.concatenate(pairs)) < 0.05
+    # The lights matter: without their own, the pixels get other normals.
+    assert largest_difference_deg(together[2:], make(name).estimate(some, lights)[2:]) > 1
+
+
+def _about_view_axis(angle: float) -> NDArray[np.float64]:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])

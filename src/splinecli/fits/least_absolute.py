@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.weighted_least_squares import weighted_least_squares
+from splinecli.observation_map import dot
 
 ITERATIONS = 50
 SMALLEST_RESIDUAL = 1e-7
@@ -20,7 +21,7 @@ def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
 
     Args:
         observations: (P, F) float64, the largest of each pixel 1.
-        light_directions: (F, 3) float64, unit.
+        light_directions: (F, 3) or (P, F, 3) float64, unit.
     """
     weight = torch.ones_like(observations)
     for step in range(ITERATIONS):
@@ -34,4 +35,4 @@ def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
 
 def _fit(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     scaled_normals, _ = weighted_least_squares(observations, light_directions, weight)
-    return scaled_normals, (observations - scaled_normals @ light_directions.T).abs()
+    return scaled_normals, (observations - dot(scaled_normals, light_directions)).abs()

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from splinecli.fits.shadows import lit_observations
+from splinecli.fits.weighted_least_squares import weighted_least_squares
 
 VIEW = (0.0, 0.0, 1.0)
 
@@ -56,7 +57,7 @@ def solve(
     rounds: int = 5,
     steps: int = 4,
 ) -> Tensor:
-    """Return normals (P, 3) from observations (P, F) under lights (F, 3); zero for dark pixels.
+    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for dark pixels.
 
     Args:
         shadow: observations below this share of the pixel's quantile UNSHADED are shadows.
@@ -69,7 +70,8 @@ def solve(
     # The normal equations square the condition number, so single precision would not be exact enough.
     problem = _select(observations.double(), lights, shadow=shadow, share=share, fewest=fewest, spread=spread)
     # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse normals.
-    normals = normalize(observations.double() @ torch.linalg.pinv(lights).mT, dim=1)
+    all_alike = torch.ones_like(observations, dtype=torch.float64)
+    normals = normalize(weighted_least_squares(observations.double(), lights, all_alike)[0], dim=1)
     noise = torch.full_like(normals[:, 0], FIRST_NOISE**2)
     damping = torch.full_like(noise, 1e-2)
     for _ in range(rounds):
@@ -142,7 +144,7 @@ class _Fit(NamedTuple):
 def _select(
     observations: Tensor, lights: Tensor, *, shadow: float, share: float, fewest: int, spread: float
 ) -> _Problem:
-    count = len(lights)
+    count = observations.shape[1]
     view = lights.new_tensor(VIEW)
     ordered, index = observations.sort(dim=1)
     is_lit = lit_observations(observations, shadow, fewest=FEWEST_LIT) & (observations > 0)
@@ -156,8 +158,10 @@ def _select(
     is_kept = rank < kept[:, None]
     intensities = ordered.gather(1, place) * is_kept
     largest = intensities.amax(dim=1, keepdim=True)
-    bisectors = normalize(lights + view, dim=1)
     chosen = index.gather(1, place)
+    lights = lights.expand(*observations.shape, 3)
+    kept_lights = lights.gather(1, chosen[..., None].expand(-1, -1, 3))
+    bisectors = normalize(kept_lights + view, dim=-1)
 
     order = torch.arange(3, dtype=lights.dtype, device=lights.device)
     degree = (order[:, None] + order).flatten()
@@ -165,9 +169,9 @@ def _select(
     return _Problem(
         intensities=intensities / torch.where(largest > 0, largest, 1),
         # A light of length zero does not contribute to any sum below.
-        lights=lights[chosen] * is_kept[..., None],
-        bisectors=bisectors[chosen],
-        light_powers=_powers((lights * bisectors).sum(dim=1))[chosen],
+        lights=kept_lights * is_kept[..., None],
+        bisectors=bisectors,
+        light_powers=_powers((kept_lights * bisectors).sum(dim=-1)),
         precision=torch.where(degree > 0, (spread * 0.5 ** (degree - 1)) ** -2, 0),
         ridge=torch.where(left_out, 1e9, 1e-12),
         facing=torch.cat((lights * is_lit[..., None], view.expand(len(observations), 1, 3)), dim=1),

@@ -24,7 +24,7 @@ def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
 
     Args:
         observations: (P, F) float64, the largest of each pixel 1.
-        light_directions: (F, 3) float64, unit.
+        light_directions: (F, 3) or (P, F, 3) float64, unit.
     """
     count = observations.shape[1]
     trimmed = max(0, min(int(TRIMMED_SHARE * count), (count - FEWEST) // 2))

@@ -16,7 +16,7 @@ from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.observation_map import map_scale
 
 Solve = Callable[[Tensor, Tensor], Tensor]
-"""(observations (P, F), the largest of each pixel 1; light directions (F, 3)) -> normals (P, 3) of any length.
+"""(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3) of any length.
 
 All observations are finite and none is negative. A zero vector means that the pixel has no normal.
 """
@@ -55,7 +55,7 @@ class BatchedEstimator:
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
-        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
 
         def solve_scaled(batch: Tensor, lights: Tensor) -> Tensor:
             batch = batch.clamp(min=0)
@@ -92,14 +92,16 @@ def estimate_in_batches(
     Args:
         solve: returns unit normals in its first three columns. Zero vectors are replaced by (0, 0, 1).
         observations: (P, F); `solve` gets them unscaled.
-        light_directions: (F, 3).
+        light_directions: (F, 3) or (P, F, 3).
         columns: number of columns that `solve` returns. Those behind the normal are not changed.
         progress: called after each batch with the number of its pixels.
     """
-    lights = torch.as_tensor(light_directions, dtype=dtype, device=device)
+    shared = torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
     results = np.empty((len(observations), columns), np.float32)
     for start in range(0, len(observations), batch_size):
         batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)
+        own = light_directions[start : start + batch_size]
+        lights = torch.as_tensor(own, dtype=dtype, device=device) if shared is None else shared
         solved = solve(batch, lights)
         solved[~solved[:, :3].any(dim=1), :3] = solved.new_tensor(TOWARDS_CAMERA)
         results[start : start + batch_size] = solved.cpu().numpy()

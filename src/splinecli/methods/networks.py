@@ -72,7 +72,7 @@ class NetworkEstimator:
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
-        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3); see Estimator."""
+        """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
         return self._in_batches(observations, light_directions, progress)[:, :3]
 
     @property
@@ -100,7 +100,7 @@ class NetworkEstimator:
         light_directions: Directions,
         progress: Progress | None,
     ) -> NDArray[np.float32]:
-        work_per_pixel = 0 if progress is None else self._work_per_pixel(len(light_directions))
+        work_per_pixel = 0 if progress is None else self._work_per_pixel(light_directions.shape[-2])
 
         def solve(batch: Tensor, lights: Tensor) -> Tensor:
             if progress is None:
