@@ -86,6 +86,19 @@ def test_render_accuracy(run: Run) -> None:
     assert printed[-1].count("%") == 3
 
 
+def test_near_lamps(run: Run) -> None:
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    printed = run(
+        "near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8"
+    ).splitlines()
+    assert len(printed) == 8
+    plane = next(row for row in printed if row.split()[:2] == ["matte", "plane"])
+    distant, distant_range, as_distant, bowl, near, near_range, *_ = numbers(plane)
+    assert as_distant > 5 > 1 > near
+    assert bowl > 5 > 1 > near_range
+    assert distant < 1 > distant_range
+
+
 def test_busy_machine(run: Run) -> None:
     """The quiet machine alone: each figure takes a process that loads PyTorch."""
     header, row = run("busy_machine", "--busy", "0", "--pixels", "100", "--repeats", "1").splitlines()

@@ -28,6 +28,7 @@ def estimate_normals(
     mask: ArrayLike | None = None,
     *,
     light_intensities: ArrayLike | None = None,
+    pixel_size: float | None = None,
     method: str = "spline-net",
     as_stored: bool = False,
     white_level: float | None = None,
@@ -53,6 +54,8 @@ def estimate_normals(
             None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown: they are estimated if the images show
             that they differ.
+        pixel_size: for near lamps, the width of a pixel on the object. light_directions are then the positions of the
+            lamps in the same unit, from the middle of the image on the object's mean plane.
         method: "spline-net", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
         as_stored: use the values of the images alone. By default, saturated observations are restored and unknown
             light intensities are estimated.
@@ -90,6 +93,7 @@ def estimate_normals(
         light_directions,
         mask,
         light_intensities=light_intensities,
+        pixel_size=pixel_size,
         white_level=white_level,
         as_stored=as_stored,
     )

@@ -16,6 +16,8 @@ from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import Progress, tells_confidence
+from splinecli.methods.lamp_light import LampLight, rows_of
+from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
 TILE_PIXELS = 16_384
@@ -56,7 +58,9 @@ def estimate_normals(
     tile_pixels: int = TILE_PIXELS,
     progress: Progress | None = None,
 ) -> NormalEstimate:
-    """Estimate the normals of a capture.
+    """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
+
+    The capture of the result has the points of this surface.
 
     Args:
         tile_pixels: number of pixels that the estimator gets at once.
@@ -67,17 +71,19 @@ def estimate_normals(
         SplinecliError: the estimator gave normals that are not unit vectors.
     """
     started = time.perf_counter()
+    capture = find_surface(capture)
     normals = np.empty((capture.n_pixels, 3), np.float32)
     confidence = np.empty(capture.n_pixels, np.float32) if tells_confidence(estimator) else None
     for start in range(0, capture.n_pixels, tile_pixels):
         rows = slice(start, start + tile_pixels)
-        tile = capture.observations[rows]
+        light = _light_on(capture, rows)
         if confidence is not None and tells_confidence(estimator):
-            normals[rows], confidence[rows] = estimator.estimate_with_confidence(
-                tile, capture.light_directions, progress=progress
+            found, confidence[rows] = estimator.estimate_with_confidence(
+                light.observations, light.directions, progress=progress
             )
         else:
-            normals[rows] = estimator.estimate(tile, capture.light_directions, progress=progress)
+            found = estimator.estimate(light.observations, light.directions, progress=progress)
+        normals[rows] = light.in_frame_of_capture(found)
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
@@ -92,6 +98,14 @@ def estimate_normals(
     return NormalEstimate(
         capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map
     )
+
+
+def _light_on(capture: Capture, rows: slice) -> LampLight:
+    """Return the observations and the light directions of some of a capture's pixels."""
+    observations = capture.observations[rows]
+    if capture.lamps is None:
+        return LampLight(observations, capture.light_directions)
+    return LampLight.of(observations, rows_of(capture.lamps, rows))
 
 
 def _check_unit(normals: NDArray[np.float32], method: str) -> None:

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from torch import Tensor
 
 SMALLEST_DETERMINANT = 1e-12
@@ -49,6 +51,16 @@ def multiply_symmetric(entries: Sequence[Any], vector: Sequence[Any]) -> tuple[A
     xx, yy, zz, xy, xz, yz = entries
     x, y, z = vector
     return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+
+
+def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the least-squares solutions b (P, 3) of vectors (P, F, 3) @ b = values (P, F), pixel by pixel."""
+    import numpy as np
+
+    x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
+    entries = [np.einsum("pf,pf->p", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
+    right_side = [np.einsum("pf,pf->p", axis, values) for axis in (x, y, z)]
+    return np.stack(multiply_symmetric(inverse_3x3(entries, SMALLEST_DETERMINANT), right_side), axis=1)
 
 
 def solve_by_cramer(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -25,7 +25,9 @@ def turned(directions: NDArray[np.float64], degrees: float) -> NDArray[np.float6
 def ball(directions: NDArray[np.float64], circle: Circle | None = None) -> BallCalibration:
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
     highlights = tuple(Highlight(1.23456, 2.0, 9, 0.25) for _ in directions)
-    return BallCalibration(files, circle or Circle(50, 40, 30), "--circle", highlights, directions)
+    return BallCalibration(
+        files, circle or Circle(50, 40, 30), "--circle", highlights, directions, (100, 100)
+    )
 
 
 def report(balls: list[BallCalibration], known: NDArray[np.float64] | None = None) -> dict:

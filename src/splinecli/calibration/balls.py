@@ -52,6 +52,7 @@ class BallCalibration:
         circle_from: the source of the outline: "--circle", "mask" or "picture".
         highlights: (F,), one for each image.
         directions: (F, 3) float64, unit vectors; x right, y up, z to the camera.
+        shape: (H, W) of the images.
     """
 
     files: BallFiles
@@ -59,6 +60,7 @@ class BallCalibration:
     circle_from: str
     highlights: tuple[Highlight, ...]
     directions: NDArray[np.float64]
+    shape: tuple[int, int]
 
     @property
     def normals(self) -> NDArray[np.float64]:
@@ -144,7 +146,10 @@ def calibrate_ball(
         highlights.append(highlight)
         if progress is not None:
             progress()
-    return BallCalibration(files, circle, circle_from, tuple(highlights), np.array(directions))
+    assert first is not None  # a ball has images
+    return BallCalibration(
+        files, circle, circle_from, tuple(highlights), np.array(directions), (first[0], first[1])
+    )
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:

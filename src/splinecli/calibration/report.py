@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallCalibration, CalibratedLights
+from splinecli.calibration.lamp_positions import LampPositions
 from splinecli.normals import angle_between_deg
 
 UNSURE_VISIBLE = 0.6
@@ -29,6 +30,7 @@ def calibration_report(
     known_directions: NDArray[np.float64] | None,
     *,
     picture: str,
+    lamps: LampPositions | None = None,
 ) -> dict[str, Any]:
     """Return the report of a calibration as values for JSON, with its warnings.
 
@@ -37,6 +39,7 @@ def calibration_report(
         intensities: (F, 3), or None where they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
         picture: the name of the picture to which warnings refer.
+        lamps: the positions from several balls, or None.
     """
     single = len(lights.balls) == 1
     return {
@@ -44,6 +47,7 @@ def calibration_report(
         "balls": [_ball(ball) for ball in lights.balls],
         "light_directions": _rows(lights.directions),
         "light_intensities": None if intensities is None else _rows(intensities),
+        "lamp_positions": None if lamps is None else _positions(lamps),
         "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg, "mean", "largest"),
         "compared": None
         if known_directions is None
@@ -52,7 +56,7 @@ def calibration_report(
         ),
         "warnings": [
             *_outline_warnings(lights, picture),
-            *_disagreement_warnings(lights, picture),
+            *([] if lamps is not None and lamps.known else _disagreement_warnings(lights, picture)),
             *_comparison_warnings(lights, known_directions),
         ],
     }
@@ -73,6 +77,8 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         lines.append(
             f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
         )
+    if report["lamp_positions"]:
+        lines.append(_lamp_line(report["lamp_positions"]))
     if report["compared"]:
         angles = report["compared"]
         lines.append(
@@ -80,6 +86,31 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             f" at most {angles['largest_deg']:.1f}"
         )
     return lines
+
+
+def _positions(lamps: LampPositions) -> dict[str, Any]:
+    return {
+        "known": lamps.known,
+        "positions": _rows(lamps.positions),
+        "spread": [_round(value) for value in lamps.spread],
+        "pixel_size": _round(lamps.pixel_size, 6),
+    }
+
+
+def _lamp_line(lamps: dict[str, Any]) -> str:
+    """Return the line on triangulated lamps, from the report."""
+    distances = np.linalg.norm(lamps["positions"], axis=1)
+    shares = 100 * np.array(lamps["spread"]) / distances
+    if not lamps["known"]:
+        return (
+            "the rays from the balls are too parallel to tell the lamps' distances: they count as distant"
+            " (balls farther apart would tell more)"
+        )
+    return (
+        f"the lamps are {distances.min():.4g} to {distances.max():.4g} away"
+        f" ({'pixels' if lamps['pixel_size'] == 1 else 'in the unit of --ball-diameter'}),"
+        f" uncertain by {shares.mean():.0f} % on average, at most {shares.max():.0f} %"
+    )
 
 
 def _ball(ball: BallCalibration) -> dict[str, Any]:

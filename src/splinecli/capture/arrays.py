@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.lights.light_files import unit_directions
+from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.white_level import SaturationFinder
@@ -26,6 +28,7 @@ def capture_from_arrays(
     mask: ArrayLike | None = None,
     *,
     light_intensities: ArrayLike | None = None,
+    pixel_size: float | None = None,
     white_level: float | None = None,
     as_stored: bool = False,
     name: str = "capture",
@@ -39,6 +42,8 @@ def capture_from_arrays(
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
             None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
+        pixel_size: for near lamps, the width of a pixel on the object; light_directions are then positions in this
+            unit, from the middle of the image on the object's mean plane. None for distant lights.
         white_level: the value from which an observation is saturated, in the unit of the images. None finds it for
             integer images; floating-point images then have none.
         as_stored: use the values alone. By default, saturated observations are restored and unknown light intensities
@@ -73,7 +78,12 @@ def capture_from_arrays(
         warnings=tuple(found.warnings()),
         white_level=found.saturation.white_level,
     )
-    stored = StoredCapture(capture, found.saturation, intensities_known=light_intensities is not None)
+    known = light_intensities is not None
+    if pixel_size is not None:
+        positions = np.asarray(light_directions, np.float64)
+        lamps = NearLamps.of(positions, pixel_size, (shape[0], shape[1]), equal=not known)
+        capture, known = replace(capture, lamps=lamps), True
+    stored = StoredCapture(capture, found.saturation, intensities_known=known)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
 

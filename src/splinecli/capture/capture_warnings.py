@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 
 
@@ -40,6 +42,7 @@ IMAGES_LEFT_OUT = "images_left_out"
 LIGHTS_MATCHED = "lights_matched"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
+NEAR_LAMPS = "near_lamps"
 SATURATED = "saturated"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
@@ -52,6 +55,9 @@ SATURATED_SHARE = 0.01
 
 BLACK_SHARE = 0.01
 """The share of pixels without light above which the capture carries a warning."""
+
+NEAR_DEG = 2.0
+"""The change of a light direction across the object above which distant lights carry a warning."""
 
 
 def white_level(level: WhiteLevel | None) -> CaptureWarning | None:
@@ -147,6 +153,30 @@ def dark_images(n_images: int, example: str, share: float) -> CaptureWarning:
         f"Images that use less than {100 * share:.0f} % of the range: {n_images}, such as {example};"
         " a longer exposure gives less noise.",
     )
+
+
+def distant_lights(
+    positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]
+) -> list[CaptureWarning]:
+    """Warn that lights count as distant although a file has their positions; with a list of one warning or none.
+
+    Args:
+        positions: the file.
+        lamps: the lamps of the file, or None where their scale is unknown.
+        mask: (H, W), the object.
+    """
+    name = "the lamps' positions" if positions is None else positions.name
+    if lamps is None:
+        text = f"{name} is not used, because nothing tells the size of a pixel. Give --pixel-size or --object-width."
+        return [CaptureWarning(NEAR_LAMPS, text)]
+    angle_deg = lamps.angles_across_deg(mask).max()
+    if angle_deg <= NEAR_DEG:
+        return []
+    text = (
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
+        " and the edge of the object, but the lights count as distant. Use --light-positions instead of --lights."
+    )
+    return [CaptureWarning(NEAR_LAMPS, text)]
 
 
 def few_lights(n_lights: int) -> CaptureWarning:

@@ -15,6 +15,7 @@ from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.header import is_display_encoded
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
+from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
 from splinecli.capture.lights.light_angles import LightForm
 from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
@@ -40,6 +41,7 @@ def open_capture(
     white_level: float | None = None,
     light_frame: LightFrame = USUAL_FRAME,
     lights_format: LightForm = "xyz",
+    lamps: LampOptions = NO_LAMP_OPTIONS,
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
@@ -53,6 +55,7 @@ def open_capture(
             is found from the files and their values (see white_level.py).
         light_frame: the frame of the light file.
         lights_format: whether the rows of a light file of text are vectors or angles.
+        lamps: where near lamps are, if no files in the folder say so.
 
     Raises:
         InputError: the folder contains no capture (see find_capture_files) or a light file is wrong.
@@ -62,8 +65,15 @@ def open_capture(
         raise UsageError(f"the white level is {white_level:g}, expected a number above 0")
     equal = intensities is not None and str(intensities) == EQUAL
     named = (lights, None if equal else intensities, mask, ground_truth)
-    files = find_capture_files(folder, Overrides(*(None if file is None else Path(file) for file in named)))
-    source = _read_lights(files, radiometry, light_frame, lights_format, equal=equal)
+    overrides = Overrides(*(None if file is None else Path(file) for file in named))
+    if lamps.positions is not None and lights is not None:
+        raise UsageError("--lights and --light-positions contradict each other", hint="Leave one out")
+    near = find_lamps(Path(folder), overrides.lights, lamps)
+    if near is not None and near.used and near.positions is not None:
+        # Positions are vectors, whatever form a light file has.
+        overrides, lights_format = replace(overrides, lights=near.positions), "xyz"
+    files = find_capture_files(folder, overrides)
+    source = _read_lights(files, radiometry, light_frame, lights_format, near, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     ambient = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     if radiometry.ambient is None and ambient is not None:
@@ -109,6 +119,7 @@ def _read_lights(
     radiometry: RadiometricCalibration,
     frame: LightFrame,
     form: LightForm,
+    lamps: LampFiles | None,
     *,
     equal: bool,
 ) -> CaptureSource:
@@ -138,7 +149,10 @@ def _read_lights(
         intensities = None
     elif files.light_intensities is not None:
         intensities = read_light_intensities(files.light_intensities, len(files.images))
-    known = equal or intensities is not None
+    near = lamps is not None and lamps.used
+    # Geometry gives the intensities of near lamps that are equally strong.
+    known = equal or near or intensities is not None
+    equal_lamps = intensities is None
     if intensities is None:
         check_exposures(files.images)
         intensities = np.ones((len(files.images), 3))
@@ -150,4 +164,6 @@ def _read_lights(
         radiometry,
         intensities_known=known,
         light_frame=frame,
+        lamps=lamps,
+        equal_lamps=equal_lamps,
     )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
 
@@ -44,6 +45,8 @@ class Capture:
             where no observation was restored.
         white_level: the stored value from which observations counted as saturated; None for floating-point images
             and for captures that are not read from images.
+        lamps: where the lamps are, if they are near; then light_directions are those at the middle of the object. None
+            for distant lights.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the
@@ -60,6 +63,7 @@ class Capture:
     estimated_intensities: NDArray[np.float64] | None = None
     restored: NDArray[np.bool_] | None = None
     white_level: WhiteLevel | None = None
+    lamps: NearLamps | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -108,6 +112,7 @@ class Capture:
             if self.estimated_intensities is None
             else self.estimated_intensities[chosen],
             restored=None if self.restored is None else self.restored[:, chosen],
+            lamps=None if self.lamps is None else self.lamps.choose_lights(chosen),
         )
 
     def choose_pixels(self, positions: NDArray[np.integer]) -> Capture:
@@ -124,6 +129,7 @@ class Capture:
             observations=self.observations[positions],
             mask=mask,
             restored=None if self.restored is None else self.restored[positions],
+            lamps=None if self.lamps is None else self.lamps.choose_pixels(positions),
         )
 
     def _check_lights(self) -> None:

@@ -16,7 +16,9 @@ from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.image_size import check_size
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
+from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration
 from splinecli.capture.masks import read_capture_mask
 from splinecli.capture.observations import StoredPixels, collect_observations
@@ -44,6 +46,8 @@ class CaptureSource:
         white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
         light_frame: the frame of the light file, in which the directions are no longer.
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
+        lamps: what is known of near lamps, or None.
+        equal_lamps: whether near lamps count as equally strong, because nothing gives their intensities.
     """
 
     files: CaptureFiles
@@ -55,6 +59,8 @@ class CaptureSource:
     automatic_mask: NDArray[np.bool_] | None = None
     intensities_known: bool = True
     light_frame: LightFrame = USUAL_FRAME
+    lamps: LampFiles | None = None
+    equal_lamps: bool = False
 
     @property
     def n_lights(self) -> int:
@@ -110,6 +116,8 @@ class CaptureSource:
         warnings = [*self.warnings, *found.warnings()]
         if upside_down:
             warnings.append(capture_warnings.ground_truth_upside_down())
+        lamps, far_from_distant = self._near_lamps(mask)
+        warnings += far_from_distant
         capture = Capture(
             name=self.files.name,
             observations=found.values,
@@ -119,6 +127,7 @@ class CaptureSource:
             ground_truth=ground_truth,
             warnings=tuple(warnings),
             white_level=found.saturation.white_level,
+            lamps=None if lamps is None else lamps.choose_lights(indices),
         )
         return StoredCapture(capture, found.saturation, self.intensities_known)
 
@@ -165,6 +174,23 @@ class CaptureSource:
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """Return the mask (H, W) for images of this shape. Raises InputError."""
         return read_capture_mask(self.files, shape) if self.automatic_mask is None else self.automatic_mask
+
+    def lamps_over(self, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
+        """Return all lamps over a mask (H, W), or over one of every step-th row and column; None for none."""
+        if self.lamps is None:
+            return None
+        return self.lamps.over(
+            self.light_directions, mask, equal=self.equal_lamps, frame=self.light_frame, step=step
+        )
+
+    def _near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
+        """Return all near lamps over a mask (H, W), or None for distant lights, which may deserve a warning."""
+        if self.lamps is None:
+            return None, []
+        lamps = self.lamps_over(mask)
+        if self.lamps.used:
+            return lamps, []
+        return None, capture_warnings.distant_lights(self.lamps.positions, lamps, mask)
 
     def _stored_pixels(
         self, indices: Sequence[int], mask: NDArray[np.bool_], first: NDArray[Any]

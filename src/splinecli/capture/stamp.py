@@ -23,8 +23,9 @@ def stamp_capture(source: CaptureSource) -> list[Any]:
     """
     files = source.files
     small = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
+    lamps = () if source.lamps is None else source.lamps.paths
     stamp: list[Any] = [
-        [_sha256(path) for path in (*files.boundaries, *small) if path is not None],
+        [_sha256(path) for path in (*files.boundaries, *small, *lamps) if path is not None],
         [_path_size_and_time(path) for path in files.images],
         [_path_size_and_time(path) for path in source.radiometry.flat_field],
     ]

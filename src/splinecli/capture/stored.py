@@ -80,7 +80,16 @@ class StoredCapture:
             warnings = (*warnings, capture_warnings.estimated_intensities(intensities))
         saturated = self.saturation.flags
         if saturated is not None:
-            restored = restore_saturated(observations, saturated, self.capture.light_directions)
+            restored = restore_saturated(observations, saturated, self._lights_of)
         if intensities is None and restored is None:
             return self.capture
         return replace(self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored)
+
+    def _lights_of(self, rows: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near lamps on a plane."""
+        lamps = self.capture.lamps
+        if lamps is None:
+            return self.capture.light_directions
+        places = np.flatnonzero(self.capture.mask)[rows]
+        directions, strengths = lamps.light_at(lamps.plane_points(*np.divmod(places, lamps.shape[1])))
+        return np.asarray(directions * strengths[..., None], np.float64)

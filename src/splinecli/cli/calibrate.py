@@ -14,6 +14,7 @@ def calibrate(
     balls: list[Path] = inputs.BALLS,
     circle: list[str] | None = inputs.CIRCLES,
     mask: list[Path] | None = inputs.BALL_MASKS,
+    ball_diameter: float | None = inputs.BALL_DIAMETER,
     gray_ball: Path | None = inputs.GRAY_BALL,
     gray_card: Path | None = inputs.GRAY_CARD,
     transfer: str = inputs.GRAY_TRANSFER,
@@ -31,11 +32,14 @@ def calibrate(
 
     Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the result by eye, and
     calibration.json. With a gray ball or card, it also writes light_intensities.txt, the relative light intensities.
+    With two balls or more, or one ball at two places, and lamps that are near, it also writes light_positions.txt and
+    pixel_size.txt for --light-positions of infer.
     """
     options = CalibrateOptions(
         balls=tuple(balls),
         circles=tuple(parse_circle(text) for text in circle or ()),
         masks=tuple(mask or ()),
+        ball_diameter=ball_diameter,
         gray_ball=gray_ball,
         gray_card=gray_card,
         transfer=transfer,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splinecli.capture.lights.lamp_files import LampOptions
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.cli.options.values import LightForm
@@ -15,6 +16,11 @@ def info(
     capture: Path = inputs.CAPTURE,
     lights: Path | None = inputs.LIGHTS,
     intensities: Path | None = inputs.INTENSITIES,
+    light_positions: Path | None = inputs.LIGHT_POSITIONS,
+    light_distance: float | None = inputs.LIGHT_DISTANCE,
+    pixel_size: float | None = inputs.PIXEL_SIZE,
+    object_width: float | None = inputs.OBJECT_WIDTH,
+    camera_matrix: Path | None = inputs.LAMP_CAMERA_MATRIX,
     mask: Path | None = inputs.MASK,
     ground_truth: Path | None = inputs.GROUND_TRUTH,
     transfer: str = inputs.TRANSFER,
@@ -43,6 +49,13 @@ def info(
         intensities=intensities,
         mask=mask,
         ground_truth=ground_truth,
+        lamps=LampOptions(
+            positions=None if light_positions is None else str(light_positions),
+            distance=light_distance,
+            pixel_size=pixel_size,
+            object_width=object_width,
+            camera_matrix=None if camera_matrix is None else str(camera_matrix),
+        ),
         transfer=transfer,
         ambient=ambient,
         flat_field=flat_field,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 SPEED = ("--device", "--precision", "--batch-size")
 VALUES = ("--transfer", "--ambient", "--flat-field", "--white-level")
+LAMPS = ("--light-positions", "--light-distance", "--pixel-size", "--object-width", "--camera-matrix")
 REPEAT = ("--overwrite", "--json", "--quiet")
 
 PANELS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -14,6 +15,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--light-frame",
             "--lights-format",
             "--intensities",
+            *LAMPS,
             "--n-lights",
             "--seed",
             "--light-indices",
@@ -34,11 +36,18 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "info": {
         "Input": ("--mask", "--ground-truth", *VALUES),
-        "Lights": ("--lights", "--light-frame", "--lights-format", "--intensities", "--check-lights"),
+        "Lights": (
+            "--lights",
+            "--light-frame",
+            "--lights-format",
+            "--intensities",
+            *LAMPS,
+            "--check-lights",
+        ),
         "Output": ("--plot", "--strict", *REPEAT),
     },
     "calibrate": {
-        "Input": ("--circle", "--mask"),
+        "Input": ("--circle", "--mask", "--ball-diameter"),
         "Light intensities": ("--gray-ball", "--gray-card", "--transfer"),
         "Output": ("--output", "--compare", *REPEAT),
     },

@@ -13,6 +13,7 @@ from splinecli.capture.lights.draws import NOISE_STREAM, in_one_plane
 from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Trial
+from splinecli.methods.near_light import find_surface
 
 _RETILTS = 100
 
@@ -38,11 +39,12 @@ class TrialSource:
 
         Args:
             as_stored: whether no trial restores. Otherwise all pixels are kept where the light intensities are
-                unknown, because `infer` estimates them from all pixels.
+                unknown, because `infer` estimates them from all pixels. They are also kept under near lamps, which
+                need the whole surface.
         """
         if len(rows) == stored.capture.n_pixels:
             return cls(stored)
-        if as_stored or stored.intensities_known:
+        if stored.capture.lamps is None and (as_stored or stored.intensities_known):
             return cls(stored.choose_pixels(rows))
         return cls(stored, rows)
 
@@ -51,13 +53,16 @@ class TrialSource:
         position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
         seen = self.stored.choose_lights([position[light] for light in trial.lights])
         if trial.light_noise_deg:
-            directions = _tilted(seen.capture.light_directions, trial)
-            seen = replace(seen, capture=replace(seen.capture, light_directions=directions))
+            seen = replace(seen, capture=_with_noise(seen.capture, trial))
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
         intensities = None if trial.as_stored else seen.estimate_intensities()
-        if self.rows is not None:
-            seen = seen.choose_pixels(self.rows)
-        return seen.capture if trial.as_stored else seen.restore(intensities)
+        if self.rows is None or seen.capture.lamps is None:
+            if self.rows is not None:
+                seen = seen.choose_pixels(self.rows)
+            return seen.capture if trial.as_stored else seen.restore(intensities)
+        # Near lamps need the surface, which only all pixels together have.
+        capture = find_surface(seen.capture if trial.as_stored else seen.restore(intensities))
+        return capture.choose_pixels(self.rows)
 
 
 class SharedDraw:
@@ -74,6 +79,13 @@ class SharedDraw:
             if self._capture is None:
                 self._capture = self._source.see(self._trial)
             return self._capture
+
+
+def _with_noise(capture: Capture, trial: Trial) -> Capture:
+    """Return the capture with the trial's noise on its lights; near lamps keep their distances."""
+    directions = _tilted(capture.light_directions, trial)
+    lamps = None if capture.lamps is None else capture.lamps.turned(directions)
+    return replace(capture, light_directions=directions, lamps=lamps)
 
 
 def _tilted(light_directions: NDArray[np.float64], trial: Trial) -> NDArray[np.float64]:

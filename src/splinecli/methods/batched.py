@@ -16,9 +16,10 @@ from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.observation_map import map_scale
 
 Solve = Callable[[Tensor, Tensor], Tensor]
-"""(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3) of any length.
+"""(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).
 
-All observations are finite and none is negative. A zero vector means that the pixel has no normal.
+The normals may have any length; a zero vector means that the pixel has none. All observations are finite, and none is
+negative.
 """
 
 
@@ -96,7 +97,9 @@ def estimate_in_batches(
         columns: number of columns that `solve` returns. Those behind the normal are not changed.
         progress: called after each batch with the number of its pixels.
     """
-    shared = torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
+    shared = (
+        torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
+    )
     results = np.empty((len(observations), columns), np.float32)
     for start in range(0, len(observations), batch_size):
         batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 Observations = NDArray[np.float32]
 """(P, F): linear, already divided by the light intensities."""
 
-Directions = NDArray[np.float64]
-"""(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to the
-camera."""
+Directions = NDArray[np.floating]
+"""(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
+the camera."""
 
 Progress = Callable[[int], object]
 """A function that an estimator calls with the number of pixels that it has just finished."""

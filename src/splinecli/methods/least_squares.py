@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.methods.estimator import Directions, Observations, Progress
 from splinecli.normals import unit
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
-
-_SMALLEST_PIVOT = 1e-12
-"""Keeps a pixel whose lights lie in one plane solvable."""
+from splinecli.solve_3x3 import solve_each
 
 TOWARDS_CAMERA = (0.0, 0.0, 1.0)
 """The normal of a pixel that is dark under every light."""
@@ -39,17 +36,9 @@ class LeastSquares:
         if light_directions.ndim == 2:
             scaled = values @ np.linalg.pinv(light_directions).T
         else:
-            scaled = _solve_each(values, light_directions)
+            scaled = solve_each(values, light_directions)
         normals: NDArray[np.float64] = unit(scaled)
         normals[~scaled.any(axis=1)] = TOWARDS_CAMERA
         if progress is not None:
             progress(len(normals))
         return normals
-
-
-def _solve_each(observations: NDArray[np.float64], light_directions: Directions) -> NDArray[np.float64]:
-    """Return scaled normals (P, 3) from observations (P, F), each pixel under its own lights (P, F, 3)."""
-    x, y, z = np.moveaxis(np.asarray(light_directions, np.float64), -1, 0)
-    entries = [np.einsum("pf,pf->p", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
-    right_side = [np.einsum("pf,pf->p", axis, observations) for axis in (x, y, z)]
-    return np.stack(multiply_symmetric(inverse_3x3(entries, _SMALLEST_PIVOT), right_side), axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,12 @@ if TYPE_CHECKING:
     from splinecli.calibration.balls import BallCalibration, BallFiles, CalibratedLights
     from splinecli.calibration.circle import Circle
     from splinecli.calibration.gray import Target
+    from splinecli.calibration.lamp_positions import LampPositions
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
+POSITIONS, PIXEL_SIZE = "light_positions.txt", "pixel_size.txt"
 PICTURE, REPORT = "calibration.png", "calibration.json"
-OUTPUT_FILES = (DIRECTIONS, INTENSITIES, PICTURE, REPORT)
+OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, PICTURE, REPORT)
 
 DISPLAY_ENCODED = (
     "The images of the gray target look display-encoded (JPEG, or PNG that says so), but are read as linear."
@@ -37,6 +40,7 @@ class CalibrateOptions:
         balls: a folder of images of a mirror ball each.
         circles: the outline of each ball, or empty.
         masks: a mask of each ball, or empty.
+        ball_diameter: of each ball, in any unit, which becomes that of the lamps' positions.
         gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
         transfer: the curve of the gray target's images: linear, srgb or gamma:G.
         compare: a text file of light directions to compare the result with.
@@ -50,6 +54,7 @@ class CalibrateOptions:
     balls: tuple[Path, ...]
     circles: tuple[Circle, ...] = ()
     masks: tuple[Path, ...] = ()
+    ball_diameter: float | None = None
     gray_ball: Path | None = None
     gray_card: Path | None = None
     transfer: str = "linear"
@@ -62,6 +67,13 @@ class CalibrateOptions:
             raise UsageError(
                 "--transfer needs --gray-ball or --gray-card",
                 hint="Leave it out: the light directions do not depend on the curve",
+            )
+        if self.ball_diameter is not None and not 0 < self.ball_diameter < math.inf:
+            raise UsageError(f"the ball diameter is {self.ball_diameter:g}, expected a number above 0")
+        if self.ball_diameter is not None and len(self.balls) < 2:
+            raise UsageError(
+                "--ball-diameter needs two balls or more",
+                hint="Photograph a second ball, or the same ball at another place: one ball gives no positions",
             )
         if self.gray_ball and self.gray_card:
             raise UsageError("--gray-ball and --gray-card contradict each other", hint="Leave one out")
@@ -89,6 +101,7 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
     """
     from splinecli.calibration.balls import combine_balls, find_ball_files
+    from splinecli.calibration.lamp_positions import triangulate_lamps
     from splinecli.calibration.report import calibration_report, summary_lines
     from splinecli.capture.lights.light_files import read_light_directions
     from splinecli.files import check_free
@@ -110,14 +123,17 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
 
         kind: Target = "ball" if options.gray_ball is not None else "card"
         intensities = measure_light_intensities(target_files, lights.directions, kind, gamma=options.gamma)
-    report = calibration_report(lights, intensities, known, picture=PICTURE)
+    lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
+    report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
     if options.gamma == 1 and target_files is not None and _looks_display_encoded(target_files):
         report["warnings"].append(DISPLAY_ENCODED)
-    _write(options.output, lights, intensities, report)
+    _write(options.output, lights, intensities, lamps, report)
     for line in summary_lines(report):
         observer.say(line)
     if intensities is not None:
         observer.say(f"The light intensities are in {options.output / INTENSITIES}")
+    if lamps is not None and lamps.known:
+        observer.say(f"The positions of the lamps are in {options.output / POSITIONS}, for --light-positions")
     for warning in report["warnings"]:
         observer.warn(warning)
     return report
@@ -145,6 +161,7 @@ def _write(
     folder: Path,
     lights: CalibratedLights,
     intensities: NDArray[np.float64] | None,
+    lamps: LampPositions | None,
     report: dict[str, Any],
 ) -> None:
     from splinecli.files import write_bytes, write_text
@@ -152,10 +169,16 @@ def _write(
     from splinecli.pictures.png import encode_png
 
     write_text(folder / DIRECTIONS, _text(lights.directions))
-    if intensities is None:
-        (folder / INTENSITIES).unlink(missing_ok=True)  # it would belong to earlier lights
-    else:
-        write_text(folder / INTENSITIES, _text(intensities))
+    known = lamps if lamps is not None and lamps.known else None
+    for name, text in (
+        (INTENSITIES, None if intensities is None else _text(intensities)),
+        (POSITIONS, None if known is None else _text(known.positions)),
+        (PIXEL_SIZE, None if known is None else f"{known.pixel_size:.9g}\n"),
+    ):
+        if text is None:
+            (folder / name).unlink(missing_ok=True)  # it would belong to earlier lights
+        else:
+            write_text(folder / name, text)
     write_bytes(folder / PICTURE, encode_png(calibration_picture(lights.balls)))
     write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
 

@@ -14,6 +14,7 @@ from splinecli.normals import Convention
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
+    from splinecli.capture.lights.lamp_files import LampOptions
 
 Device = Literal["auto", "cpu", "cuda"]
 LightForm = Literal["xyz", "azel"]
@@ -32,6 +33,7 @@ class InferOptions:
         lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
         strict: fail where a warning says that the lights or images are probably wrong.
+        light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.
         auto_mask: find the object where the capture has no mask.
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
@@ -56,6 +58,11 @@ class InferOptions:
 
     lights: str | None = None
     intensities: str | None = None
+    light_positions: str | None = None
+    light_distance: float | None = None
+    pixel_size: float | None = None
+    object_width: float | None = None
+    camera_matrix: str | None = None
     mask: str | None = None
     auto_mask: bool = False
     ground_truth: str | None = None
@@ -94,6 +101,7 @@ class InferOptions:
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
+        _ = self.lamps
         check_method(self.method)
         if self.n_lights is not None:
             check_draw_settings(self.n_lights, 1, self.seed)
@@ -131,12 +139,26 @@ class InferOptions:
         """The part of the options that concerns the method."""
         return MethodOptions(self.weights, self.rotations, self.batch_size, self.device, self.precision)
 
+    @property
+    def lamps(self) -> LampOptions:
+        """The part of the options that concerns near lamps. Raises UsageError."""
+        from splinecli.capture.lights.lamp_files import LampOptions
+
+        return LampOptions(
+            positions=self.light_positions,
+            distance=self.light_distance,
+            pixel_size=self.pixel_size,
+            object_width=self.object_width,
+            camera_matrix=self.camera_matrix,
+        )
+
     def check_files(self) -> None:
         """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
         from splinecli.capture.reader import EQUAL
 
         intensities = None if self.intensities == EQUAL else self.intensities
-        for name in (self.lights, intensities, self.mask, self.ground_truth, self.ambient):
+        named = (self.lights, self.light_positions, intensities, self.camera_matrix, self.mask)
+        for name in (*named, self.ground_truth, self.ambient):
             if name is not None and not Path(name).is_file():
                 problem = "is a folder, expected a file" if Path(name).is_dir() else "the file does not exist"
                 raise InputError(problem, path=name)
@@ -161,6 +183,7 @@ class InferOptions:
             white_level=self.white_level,
             light_frame=parse_light_frame(self.light_frame),
             lights_format=self.lights_format,
+            lamps=self.lamps,
         )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions
 from splinecli.errors import UsageError
 from splinecli.pipeline.infer_options import LightForm, radiometric_calibration
 from splinecli.pipeline.observer import SILENT, Observer
@@ -42,6 +43,7 @@ class InfoOptions:
             "equal".
         lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down".
+        lamps: near lamps; see LampOptions.
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
@@ -58,6 +60,7 @@ class InfoOptions:
     ground_truth: Path | None = None
     light_frame: str | None = None
     lights_format: LightForm = "xyz"
+    lamps: LampOptions = NO_LAMP_OPTIONS
     transfer: str = "linear"
     ambient: Path | None = None
     flat_field: Path | None = None
@@ -81,6 +84,7 @@ class InfoOptions:
             white_level=self.white_level,
             light_frame=parse_light_frame(self.light_frame),
             lights_format=self.lights_format,
+            lamps=self.lamps,
         )
 
 
@@ -139,6 +143,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("capture", f"{report['capture']} ({report['layout']})"),
         ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
         ("lights", f"{report['light_directions']}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
+        *([("lamps", report["lamps"])] if report["lamps"] else []),
         ("intensities", report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"),
         ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
         ("ground truth", report["ground_truth"] or "none"),
@@ -198,6 +203,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         ],
         "n_pixels": summary.n_pixels,
         "light_directions": str(files.light_directions),
+        "lamps": None if source.lamps is None else source.lamps.in_words(),
         "light_intensities": None if intensities is None else str(intensities),
         "mask": None if files.mask is None else str(files.mask),
         "ground_truth": None if files.ground_truth is None else str(files.ground_truth),

@@ -9,6 +9,9 @@ from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
 from splinecli.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from splinecli.capture import Capture, CaptureSource
     from splinecli.capture.lights.light_check import LightCheck
     from splinecli.capture.sample import Sample
@@ -29,7 +32,30 @@ def check_source(source: CaptureSource, sample: Sample, indices: Sequence[int]) 
     from splinecli.capture.lights.light_check import check_lights
 
     names = [source.files.images[index].name for index in indices]
-    return check_lights(sample.observations, sample.mask, source.light_directions, indices, names)
+    observations = sample.observations
+    if source.lamps is not None and source.lamps.used:
+        observations = _as_distant(source, sample, indices)
+    return check_lights(observations, sample.mask, source.light_directions, indices, names)
+
+
+def _as_distant(source: CaptureSource, sample: Sample, indices: Sequence[int]) -> NDArray[np.floating]:
+    """Return a sample's observations (p, F) as they would be if the near lamps were distant.
+
+    The surface counts as a plane. What a matte surface explains is exchanged; what it does not explain, such as the
+    misfit of lights in a wrong order, stays.
+    """
+    import numpy as np
+
+    from splinecli.solve_3x3 import solve_each
+
+    lamps = source.lamps_over(sample.mask, step=sample.step)
+    assert lamps is not None
+    lamps = lamps.choose_lights(indices)
+    directions, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(sample.mask)))
+    observations = sample.observations / strengths
+    scaled_normals = solve_each(observations, directions)
+    change = source.light_directions[list(indices)] - directions
+    return np.asarray(observations + np.einsum("pfc,pc->pf", change, scaled_normals))
 
 
 def refuse_if_strict(warnings: Iterable[CaptureWarning], name: str, *, strict: bool) -> None:

@@ -81,6 +81,7 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
     """
     import numpy as np
 
+    from splinecli.capture.lights.lamp_files import read_camera_matrix
     from splinecli.files import check_free, write_text
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
@@ -88,7 +89,7 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
     check_free(options.folder, options.files, overwrite=options.overwrite)
     normal_map = _read_normal_map(options)
     mask = np.asarray(normal_map.any(axis=2))
-    camera_matrix = None if options.camera_matrix is None else _read_camera_matrix(options.camera_matrix)
+    camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
     colours = None if options.colours is None else _read_colours(options.colours, mask.shape)
     started = time.perf_counter()
     with observer.progress("integrating", 1.0) as advance:
@@ -200,16 +201,3 @@ def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     rgb = np.broadcast_to(image, (*shape, 3))
     colours: NDArray[np.uint8] = np.rint(255 * rgb.clip(0, 1)).astype(np.uint8)
     return colours
-
-
-def _read_camera_matrix(path: Path) -> NDArray[np.float64]:
-    from splinecli.capture.formats.text import read_number_rows
-
-    matrix = read_number_rows(path).as_array()
-    if matrix.shape != (3, 3):
-        raise InputError(
-            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
-            path=path,
-            hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
-        )
-    return matrix

@@ -87,6 +87,12 @@ def add_capture(
         # The stamp depends on the white level too, so it is compared last.
         "files": digest(stamp_capture(source)),
     }
+    if source.lamps is not None and source.lamps.used:
+        raise InputError(
+            "the capture has near lamps, and training needs distant lights",
+            path=folder,
+            hint="Leave it out, or render or photograph it under distant lights",
+        )
     if name in writer:
         difference = writer.difference(name, recipe)
         if difference is None:

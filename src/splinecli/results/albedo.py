@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ def albedo_map(
 
     Args:
         source: the source of the capture. Its images are read again, one at a time, for their colours.
-        capture: what the source read.
+        capture: what the source read; under near lamps, with the points of its surface.
         normal_map: (H, W, 3), unit in the capture's mask.
         progress: called once after each image.
 
@@ -46,16 +46,17 @@ def albedo_map(
         InputError: an image can no longer be read.
     """
     normals = normal_map[capture.mask]
-    lights = capture.light_directions.astype(np.float32)
     counts = np.empty(capture.observations.shape, np.bool_)
     for start in range(0, len(normals), _TILE_PIXELS):
         tile = slice(start, start + _TILE_PIXELS)
-        counts[tile] = _agreeing(capture.observations[tile], normals[tile] @ lights.T)
+        cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
+        counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
     read = source.colours(capture.mask)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
     for position, index in enumerate(capture.light_indices):
-        cosine = (normals @ lights[position]) * counts[:, position]
-        colours = read(index)
+        cosines, strengths = _shading(capture, normals, slice(None), [position])
+        cosine = cosines[:, 0] * counts[:, position]
+        colours = read(index) / strengths
         if capture.estimated_intensities is not None:
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine
@@ -72,6 +73,18 @@ def albedo_map(
         total, squares[:, None], out=np.zeros_like(total), where=squares[:, None] > 0
     )
     return albedo
+
+
+def _shading(
+    capture: Capture, normals: NDArray[np.float32], rows: slice, positions: Sequence[int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return n.l (p, K) of some pixels under K lights, and the strengths of these: (p, K), or (1, 1) if distant."""
+    if capture.lamps is None:
+        lights = capture.light_directions[list(positions)].astype(np.float32)
+        return normals[rows] @ lights.T, np.ones((1, 1), np.float32)
+    assert capture.lamps.points is not None
+    directions, strengths = capture.lamps.choose_lights(positions).light_at(capture.lamps.points[rows])
+    return np.einsum("pfc,pc->pf", directions, normals[rows]), strengths
 
 
 def _agreeing(observations: NDArray[np.float32], cosine: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -48,6 +48,7 @@ def report_of(
         "weights": estimator.weights,
         "n_lights": capture.n_lights,
         "light_indices": list(capture.light_indices),
+        "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
         "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
         "n_pixels": capture.n_pixels,
         "image_size": [width, height],

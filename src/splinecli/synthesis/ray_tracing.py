@@ -78,14 +78,20 @@ class Tracer:
         return Hits(triangle, weights, position, normal, self._facet_normals[triangle])
 
     def lit(self, origins: Floats, facing: NDArray[np.bool_], directions: Floats) -> NDArray[np.bool_]:
-        """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`."""
+        """Return whether rays from each origin in directions (F, 3) miss the mesh: (N, F), false if not `facing`.
+
+        With one light, F = 1, the directions may also be those of each origin, (N, 3).
+        """
         free = np.zeros(facing.shape, dtype=bool)
+        own = facing.shape[1] == 1 and len(directions) == len(origins)
         # One light at a time: rays with the same direction need less memory and traverse the tree together.
         for light, asked in enumerate(facing.T):
             rows = asked.nonzero()[0]
             if len(rows):
                 blocked = self._scene.run(
-                    _packed(origins[rows]), _packed(directions[light : light + 1]), query="OCCLUDED"
+                    _packed(origins[rows]),
+                    _packed(directions[rows] if own else directions[light : light + 1]),
+                    query="OCCLUDED",
                 )
                 free[rows, light] = blocked < 0
         return free

@@ -148,7 +148,7 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
         find_capture_files(tmp_path / "dark")
     assert str(caught.value) == (
         f"{tmp_path / 'dark'}: the folder contains 2 images but no light file"
-        " (light_directions.txt, lights.txt, *.lp or lights.json)."
+        " (light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt)."
         " Pass --lights FILE, with one line x y z for each image."
         " 'splinecli calibrate' makes the file from images of a mirror ball."
     )
@@ -192,7 +192,7 @@ def test_find_captures_finds_none(tmp_path: Path) -> None:
     fill(tmp_path, "set/o1/a.png", "set/o1/lights.txt", "empty/notes.txt")
     message = (
         "found no capture, expected folders of images with a light file"
-        " (light_directions.txt, lights.txt, *.lp or lights.json)."
+        " (light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt)."
     )
     with pytest.raises(InputError) as caught:
         find_captures(tmp_path)

@@ -15,7 +15,8 @@ FILENAMES = "filenames.txt"
 LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
 NAMED_LIGHTS = (".lp", "lights.json")
 """Endings of the names of light files that name the image of each light."""
-LIGHT_FILES = "light_directions.txt, lights.txt, *.lp or lights.json"
+LIGHT_POSITIONS = ("light_positions.txt",)
+LIGHT_FILES = "light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt"
 """The usual names of light files, for messages."""
 LIGHT_INTENSITIES = ("light_intensities.txt",)
 MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
@@ -138,7 +139,7 @@ def find_lights(folder: Path) -> Path | None:
             path=folder,
             hint="Choose one with --lights FILE",
         )
-    return named[0] if named else None
+    return named[0] if named else find_named(folder, LIGHT_POSITIONS)
 
 
 def folder_name(folder: Path) -> str:

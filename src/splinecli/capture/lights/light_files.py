@@ -85,6 +85,29 @@ def directions_of(
     )
 
 
+def read_light_positions(
+    path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME
+) -> NDArray[np.float64]:
+    """Return the positions of lamps (F, 3) float64 from a text file, which has the form of light directions.
+
+    Raises:
+        InputError: as read_light_directions, which checks the same numbers as directions from the origin; also for
+            rows that name their images.
+    """
+    read_light_directions(path, n_images, frame)
+    rows = read_light_rows(Path(path), expected=_FILE.format("x y z"), n_numbers=3)
+    if rows.names is not None:
+        raise InputError(
+            f"found the name {rows.names[0]!r}, expected x y z",
+            path=Path(path),
+            line=rows.numbers.lines[0],
+            hint="Positions have a line for each image, in the order of the images",
+        )
+    table = _sort_by_count(_drop_count_line(rows.numbers, n_images), 3, n_images)
+    positions, _ = _one_light_a_row(table, {3: "x y z"}, "lamp positions", n_images)
+    return np.asarray(positions @ frame.matrix.T)
+
+
 def unit_directions(
     vectors: NDArray[np.float64],
     path: Path,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,10 @@ MAX_BRIGHTENING = 8.0
 
 _TILE_PIXELS = 8192
 
+LightsOf = Callable[[NDArray[np.integer]], NDArray[np.float64]]
+"""From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its scaled normal a matte
+pixel shows."""
+
 
 def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels have none."""
@@ -31,7 +36,9 @@ def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def restore_saturated(
-    observations: NDArray[np.float32], saturated: NDArray[np.bool_], light_directions: NDArray[np.float64]
+    observations: NDArray[np.float32],
+    saturated: NDArray[np.bool_],
+    lights: NDArray[np.float64] | LightsOf,
 ) -> NDArray[np.bool_] | None:
     """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or None.
 
@@ -43,15 +50,14 @@ def restore_saturated(
 
     Args:
         saturated: (P, F).
-        light_directions: (F, 3) or (P, F, 3), unit.
+        lights: unit light directions (F, 3), or see LightsOf.
     """
-    lights = light_directions.astype(np.float32)
     everywhere = np.asarray(saturated.all(axis=1))
     rows = np.flatnonzero(saturated.any(axis=1) & ~everywhere)
     for start in range(0, len(rows), _TILE_PIXELS):
         tile = rows[start : start + _TILE_PIXELS]
-        own = lights if lights.ndim == 2 else lights[tile]
-        observations[tile] = _restored(observations[tile], saturated[tile], own)
+        own = lights(tile) if callable(lights) else lights
+        observations[tile] = _restored(observations[tile], saturated[tile], own.astype(np.float32))
     return saturated & ~everywhere[:, None] if len(rows) else None
 
 

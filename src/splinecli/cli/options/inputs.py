@@ -38,6 +38,28 @@ INTENSITIES = Option(
     help="Light intensities: a line r g b for each image. [default: equal, or estimated if the images show that"
     " they differ]",
 )
+LIGHT_POSITIONS = Option(
+    None,
+    metavar="FILE",
+    help="Near lamps: a line x y z for each image, in any unit, from the middle of the object."
+    " [default: light_positions.txt in CAPTURE]",
+)
+LIGHT_DISTANCE = Option(
+    None, metavar="D", help="Near lamps: the distance of all lamps from the middle of the object."
+)
+PIXEL_SIZE = Option(
+    None,
+    metavar="S",
+    help="Near lamps: the width of a pixel on the object. [default: pixel_size.txt in CAPTURE]",
+)
+OBJECT_WIDTH = Option(
+    None, metavar="W", help="Near lamps: the width of the object in its mask, in place of --pixel-size."
+)
+LAMP_CAMERA_MATRIX = Option(
+    None,
+    metavar="FILE",
+    help="Near lamps: the camera matrix in pixels. [default: camera_matrix.txt in CAPTURE, or orthographic]",
+)
 MASK = Option(
     None,
     metavar="FILE",
@@ -115,6 +137,11 @@ BALL_MASKS = Option(
     None,
     metavar="FILE",
     help=f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
+)
+BALL_DIAMETER = Option(
+    None,
+    metavar="D",
+    help="Diameter of each ball in any unit, such as millimeters: the unit of the lamps' positions. [default: pixels]",
 )
 GRAY_BALL = Option(None, metavar="DIR", help="Images of a matte gray ball under the same lights.")
 GRAY_CARD = Option(None, metavar="DIR", help="Images of a matte gray card that faces the camera.")

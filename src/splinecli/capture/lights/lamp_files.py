@@ -1,0 +1,223 @@
+"""The files and options that say where near lamps are, and how large a pixel is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.text import read_number_rows
+from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights, find_named
+from splinecli.capture.lights.light_files import read_light_positions
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.errors import InputError, UsageError
+
+PIXEL_SIZE = ("pixel_size.txt",)
+CAMERA_MATRIX = ("camera_matrix.txt",)
+
+SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LampOptions:
+    """What the user says about near lamps. All lengths have the same unit, such as millimetres.
+
+    Args:
+        positions: a file of lamp positions, which replaces the light file.
+        distance: the distance of all lamps from the middle of the object, in their directions.
+        pixel_size: the width of a pixel on the object's mean plane.
+        object_width: the width of the object, from the first to the last column of the mask.
+        camera_matrix: a file of the 3 x 3 camera matrix in pixels.
+
+    Raises:
+        UsageError: a number is not above 0, or two options contradict each other.
+    """
+
+    positions: str | None = None
+    distance: float | None = None
+    pixel_size: float | None = None
+    object_width: float | None = None
+    camera_matrix: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "pixel_size", "object_width"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"the {name.replace('_', ' ')} is {value:g}, expected a number above 0")
+        for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
+            if getattr(self, one) is not None and getattr(self, other) is not None:
+                raise UsageError(
+                    f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other", hint="Leave one out"
+                )
+        if self.distance is not None and self.pixel_size is None and self.object_width is None:
+            raise UsageError(
+                "--light-distance needs the size of a pixel", hint="Add --pixel-size or --object-width"
+            )
+
+    @property
+    def given(self) -> str | None:
+        """The first option that is given, as the user writes it; None for none."""
+        return next((option for name, option in _OPTIONS.items() if getattr(self, name) is not None), None)
+
+
+_OPTIONS = {
+    "positions": "--light-positions",
+    "distance": "--light-distance",
+    "pixel_size": "--pixel-size",
+    "object_width": "--object-width",
+    "camera_matrix": "--camera-matrix",
+}
+
+NO_LAMP_OPTIONS = LampOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class LampFiles:
+    """What files and options say of near lamps, before the lights and the images are read.
+
+    Args:
+        positions: the file of positions, or None where `distance` puts the lamps in the light directions.
+        distance: see LampOptions.
+        pixel_size, object_width: the scale; see LampOptions. Both are None where it is unknown.
+        camera_matrix: (3, 3), or None for an orthographic camera.
+        paths: the files that were found.
+        used: whether the capture uses the lamps. If not, they are only compared with distant lights.
+    """
+
+    positions: Path | None
+    distance: float | None
+    pixel_size: float | None
+    object_width: float | None
+    camera_matrix: NDArray[np.float64] | None
+    paths: tuple[Path, ...]
+    used: bool
+
+    def in_words(self) -> str:
+        """Return the source of the lamps' positions, for people."""
+        if not self.used:
+            return f"{self.positions} is not used"
+        scale = (
+            f"a pixel is {self.pixel_size:g} wide"
+            if self.pixel_size is not None
+            else f"the object is {self.object_width:g} wide"
+        )
+        where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
+        return f"{where}; {scale}"
+
+    def over(
+        self,
+        light_directions: NDArray[np.float64],
+        mask: NDArray[np.bool_],
+        *,
+        equal: bool,
+        frame: LightFrame = USUAL_FRAME,
+        step: int = 1,
+    ) -> NearLamps | None:
+        """Return the lamps in these directions (F, 3) over images with this mask (H, W); None without a scale.
+
+        Args:
+            equal: whether all lamps count as equally strong; see NearLamps.of.
+            frame: that of the file of positions.
+            step: the mask has every step-th row and column of the images.
+        """
+        if self.positions is not None:
+            positions = read_light_positions(self.positions, len(light_directions), frame)
+        else:
+            assert self.distance is not None
+            positions = light_directions * self.distance
+        pixel_size = None if self.pixel_size is None else step * self.pixel_size
+        if self.object_width is not None:
+            columns = np.flatnonzero(mask.any(axis=0))
+            pixel_size = self.object_width / float(columns[-1] - columns[0] + 1)
+        if pixel_size is None:
+            return None
+        shape = mask.shape[0], mask.shape[1]
+        return NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=self.camera_matrix)
+
+
+def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
+    """Return what the capture's folder and the options say of near lamps; None for nothing.
+
+    A file of positions in the folder is used, unless the user names a file of distant lights. Beside such a file, and
+    where nothing tells the scale, positions are found but not used.
+
+    Args:
+        folder: the folder of the capture.
+        lights: the light file that the user names.
+
+    Raises:
+        InputError: a file is wrong, or positions are the only lights and their scale is unknown.
+        UsageError: an option needs positions, and there are none.
+    """
+    positions, used = _find_positions(folder, lights, options)
+    if positions is None and options.distance is None:
+        if options.given is not None:
+            raise UsageError(
+                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}",
+                hint="Add --light-positions FILE or --light-distance D, or leave it out",
+            )
+        return None
+    folders = [folder, *([] if positions is None else [positions.parent])]
+    pixel_file, pixel_size = None, options.pixel_size
+    if pixel_size is None and options.object_width is None:
+        pixel_file = _find(folders, PIXEL_SIZE)
+        pixel_size = None if pixel_file is None else _read_pixel_size(pixel_file)
+        if pixel_size is None and used and positions in (find_lights(folder), _path(options.positions)):
+            raise InputError(
+                "nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT
+            )
+    matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
+    return LampFiles(
+        positions,
+        options.distance,
+        pixel_size,
+        options.object_width,
+        None if matrix_file is None else read_camera_matrix(matrix_file),
+        tuple(path for path in (positions, pixel_file, matrix_file) if path is not None),
+        used and (pixel_size is not None or options.object_width is not None),
+    )
+
+
+def _find_positions(folder: Path, lights: Path | None, options: LampOptions) -> tuple[Path | None, bool]:
+    """Return the file of positions, and whether to use positions rather than distant lights."""
+    if options.positions is not None or options.distance is not None:
+        return _path(options.positions), True
+    in_folder = find_named(folder, LIGHT_POSITIONS)
+    if lights is None or in_folder is not None or not lights.is_file():
+        return in_folder, lights is None
+    return find_named(lights.parent, LIGHT_POSITIONS), False
+
+
+def _path(name: str | None) -> Path | None:
+    return None if name is None else Path(name)
+
+
+def read_camera_matrix(path: Path) -> NDArray[np.float64]:
+    """Return the 3 x 3 numbers of a text file. Raises InputError."""
+    matrix = read_number_rows(path).as_array()
+    if matrix.shape != (3, 3):
+        raise InputError(
+            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
+            path=path,
+            hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
+        )
+    return matrix
+
+
+def _read_pixel_size(path: Path) -> float:
+    rows = read_number_rows(path, expected="a text file with one number")
+    if len(rows.rows) != 1 or len(rows.rows[0]) != 1 or rows.rows[0][0] <= 0:
+        raise InputError(
+            f'found "{rows.texts[0][:40]}", expected one number above 0, the width of a pixel',
+            path=path,
+            line=rows.lines[0],
+        )
+    return rows.rows[0][0]
+
+
+def _find(folders: list[Path], names: tuple[str, ...]) -> Path | None:
+    return next((path for folder in folders if (path := find_named(folder, names)) is not None), None)

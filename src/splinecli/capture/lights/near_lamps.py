@@ -1,0 +1,132 @@
+"""Lamps at arm's length: their positions, and the scale that ties pixels to the unit of the positions.
+
+The frame is that of light directions: x right, y up, z to the camera. The origin lies on the object's mean plane, at
+the centre of the image. Positions may be in any unit, such as millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.errors import InputError
+from splinecli.normals import angle_between_deg
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NearLamps:
+    """F lamps as points of light, over an image of known scale.
+
+    Args:
+        positions: (F, 3), in any unit, in front of the object's mean plane (z > 0).
+        pixel_size: the width of a pixel on the object's mean plane, in the unit of the positions.
+        shape: (H, W) of the images.
+        reference_distances: (F,), the distances from each lamp at which the observations' light intensities hold. See
+            `of`.
+        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
+        points: (P, 3), the surface in the capture's pixels, in the unit of the positions. None while it is unknown.
+
+    Raises:
+        InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
+    """
+
+    positions: Floats
+    pixel_size: float
+    shape: tuple[int, int]
+    reference_distances: Floats
+    camera_matrix: Floats | None = None
+    points: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
+            raise InputError(f"lamp positions of shape {self.positions.shape}, expected finite (F, 3)")
+        if (self.positions[:, 2] <= 0).any():
+            raise InputError("a lamp lies behind the object (z <= 0)", hint="z points to the camera")
+        if not 0 < self.pixel_size < np.inf:
+            raise InputError(f"the pixel size is {self.pixel_size:g}, expected a number above 0")
+
+    @classmethod
+    def of(
+        cls,
+        positions: Floats,
+        pixel_size: float,
+        shape: tuple[int, int],
+        *,
+        equal: bool,
+        camera_matrix: Floats | None = None,
+    ) -> NearLamps:
+        """Return lamps at positions (F, 3).
+
+        Args:
+            equal: whether the light intensities are unknown, so that all lamps count as equally strong. Otherwise each
+                intensity holds at the origin, where a gray card would measure it.
+        """
+        distances = np.linalg.norm(positions, axis=1)
+        reference = np.full_like(distances, distances.mean()) if equal else distances
+        return cls(positions, pixel_size, shape, reference, camera_matrix)
+
+    @property
+    def directions(self) -> Floats:
+        """The light directions (F, 3) at the origin, unit."""
+        directions: Floats = self.positions / np.linalg.norm(self.positions, axis=1, keepdims=True)
+        return directions
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the lamps as JSON values: their distances from the origin, and the scale."""
+        distances = np.linalg.norm(self.positions, axis=1)
+        return {
+            "distances": distances.round(4).tolist(),
+            "pixel_size": self.pixel_size,
+            "camera": "orthographic" if self.camera_matrix is None else "perspective",
+        }
+
+    def turned(self, directions: Floats) -> NearLamps:
+        """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
+        distances = np.linalg.norm(self.positions, axis=1, keepdims=True)
+        return replace(self, positions=directions * distances)
+
+    def choose_lights(self, positions: Sequence[int]) -> NearLamps:
+        """Return some of the lamps, in the order given."""
+        chosen = list(positions)
+        return replace(
+            self,
+            positions=self.positions[chosen],
+            reference_distances=self.reference_distances[chosen],
+        )
+
+    def choose_pixels(self, rows: NDArray[np.integer]) -> NearLamps:
+        """Return the lamps with the surface in some of the pixels."""
+        return self if self.points is None else replace(self, points=self.points[rows])
+
+    def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Floats:
+        """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the image."""
+        middle_row, middle_column = ((size - 1) / 2 for size in self.shape)
+        across, up = columns - middle_column, middle_row - rows
+        return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
+
+    def angles_across_deg(self, mask: NDArray[np.bool_]) -> Floats:
+        """Return for each lamp (F,) how far its direction differs, at most, from that at the middle of the object.
+
+        Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean plane.
+        """
+        rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
+        directions, _ = self.light_at(self.plane_points(row.ravel(), column.ravel()))
+        largest: Floats = angle_between_deg(directions, directions[-1]).max(axis=0)
+        return largest
+
+    def light_at(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the light at points (P, 3): unit directions (P, F, 3), and strengths (P, F).
+
+        A strength is the inverse square of the distance, relative to the light at the lamp's reference distance.
+        """
+        towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
+        distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
+        towards /= distance[..., None]
+        return towards, np.square(self.reference_distances.astype(np.float32) / distance)

@@ -1,0 +1,166 @@
+"""Near lamps: analytic surfaces under points of light, by Lambert's law and the inverse square of the distance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import splinecli
+from splinecli.capture import Capture
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.methods import make_estimator, near_light
+from splinecli.methods.near_light import Blocks, find_surface
+from splinecli.normals import unit
+from splinecli.surface.camera import pixel_rays
+from splinecli.surface.integration import integrate_normals
+
+Floats = NDArray[np.float64]
+SIDE = 40
+MATRIX = np.array([(60.0, 0, 20.5), (0, 60.0, 18.0), (0, 0, 1)])
+
+
+def light_directions() -> Floats:
+    """Ten lights, 20 to 50 degrees from the view."""
+    zenith, azimuth = np.radians(20 + 30 * np.arange(10) / 9), np.arange(10) * 2.4
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return points (P, 3) with a mean height of 0 in a frame that is 2 wide, normals (P, 3) and the mask."""
+    place = (np.arange(side) + 0.5) * 2 / side - 1
+    x, y = np.meshgrid(place, -place)
+    mask = np.ones(x.shape, np.bool_)
+    if kind == "plane":
+        z, normals = 0 * x, np.dstack((0 * x, 0 * x, 0 * x + 1))
+    elif kind == "tilted":
+        z, normals = 0.3 * x - 0.1 * y, np.dstack((0 * x - 0.3, 0 * x + 0.1, 0 * x + 1))
+    else:
+        mask = np.hypot(x, y) < 0.95
+        z = np.sqrt(np.maximum(1.1 - x**2 - y**2, 0))
+        normals = np.dstack((x, y, z))
+    points = np.dstack((x, y, z))[mask]
+    points[:, 2] -= points[:, 2].mean()
+    return points, unit(normals)[mask], mask
+
+
+def capture_of(
+    points: Floats, normals: Floats, mask: NDArray[np.bool_], positions: Floats, strengths: Floats
+) -> Capture:
+    towards = positions - points[:, None]
+    distance = np.linalg.norm(towards, axis=2)
+    shading = np.clip(np.einsum("pfc,pc->pf", towards / distance[..., None], normals), 0, None)
+    truth = np.zeros((*mask.shape, 3), np.float32)
+    truth[mask] = normals
+    observations = (0.6 * shading * strengths / distance**2).astype(np.float32)
+    return Capture("scene", observations, unit(positions), tuple(range(len(positions))), mask, truth)
+
+
+def near(kind: str, distance: float, side: int = SIDE) -> Capture:
+    positions = light_directions() * distance
+    capture = capture_of(*surface(kind, side), positions, np.ones(10))
+    return replace(capture, lamps=NearLamps.of(positions, 2 / side, capture.mask.shape, equal=True))
+
+
+def error_deg(estimate: NormalEstimate) -> float:
+    assert estimate.errors is not None
+    return estimate.errors.mean
+
+
+@pytest.mark.parametrize(("kind", "limit_deg"), [("plane", 0.001), ("tilted", 0.02), ("dome", 0.2)])
+def test_lamps_at_two_widths(kind: str, limit_deg: float) -> None:
+    """Exact data give exact normals, apart from the integration, whose error is that of a grid of 40 x 40 pixels."""
+    capture = near(kind, 4.0)
+    assert error_deg(estimate_normals(capture, make_estimator("iw12"))) < limit_deg
+    assert error_deg(estimate_normals(replace(capture, lamps=None), make_estimator("iw12"))) > 10
+
+
+def test_a_plane_comes_out_flat_and_is_a_bowl_without_positions() -> None:
+    capture = near("plane", 8.0)
+    for lamps, low, high in ((capture.lamps, 0, 0.01), (None, 5, 50)):
+        estimate = estimate_normals(replace(capture, lamps=lamps), make_estimator("ls"))
+        heights = integrate_normals(estimate.normal_map, capture.mask)
+        assert low <= 100 * np.ptp(heights) / SIDE <= high
+
+
+def test_the_surface_is_found_in_the_unit_of_the_positions() -> None:
+    capture = near("dome", 4.0)
+    in_millimetres = replace(
+        capture, lamps=NearLamps.of(500 * capture.lamps.positions, 1000 / SIDE, (SIDE, SIDE), equal=True)
+    )
+    lamps = find_surface(in_millimetres).lamps
+    assert lamps is not None and lamps.points is not None
+    points, _, _ = surface("dome")
+    # The rim of the dome is steep: half a pixel is 12 there.
+    assert np.abs(lamps.points - 500 * points).mean() < 5
+    assert find_surface(find_surface(in_millimetres)).lamps is not lamps
+
+
+def test_intensities_hold_at_the_origin() -> None:
+    """Lamps of unequal distances: as of equal lamps, or with the intensities that a gray card at the origin shows."""
+    distances = np.linspace(3, 6, 10)
+    positions = light_directions() * distances[:, None]
+    capture = capture_of(*surface("dome"), positions, np.ones(10))
+    equal = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=True)
+    estimator = make_estimator("iw12")
+    assert error_deg(estimate_normals(replace(capture, lamps=equal), estimator)) < 0.2
+    at_origin = capture.observations * (distances**2).astype(np.float32)
+    measured = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=False)
+    estimate = estimate_normals(replace(capture, observations=at_origin, lamps=measured), estimator)
+    assert error_deg(estimate) < 0.2
+
+
+def test_a_perspective_camera() -> None:
+    """A tilted plane before a pinhole camera: points on the rays, and a highlight-free surface."""
+    mask = np.ones((SIDE, SIDE), np.bool_)
+    rays = pixel_rays(mask, MATRIX)
+    normal = unit(np.array((0.2, -0.3, 1.0)))
+    # The pixel size ties the depth of the mean plane: f times the width of a pixel there.
+    pixel_size, depth = 0.05, 60 * 0.05
+    points = rays * (depth * normal[2] / -(rays @ normal))[:, None]
+    middle = np.array(((19.5 - 20.5) / 60, -(19.5 - 18.0) / 60, -1)) * depth
+    positions = light_directions() * 4.0
+    normals = np.tile(normal, (len(points), 1))
+    capture = capture_of(points - middle, normals, mask, positions, np.ones(10))
+    lamps = NearLamps.of(positions, pixel_size, mask.shape, equal=True, camera_matrix=MATRIX)
+    estimate = estimate_normals(replace(capture, lamps=lamps), make_estimator("iw12"))
+    # Depth is known up to its geometric mean, which is not exactly the depth of the middle.
+    assert error_deg(estimate) < 0.3
+    orthographic = replace(lamps, camera_matrix=None)
+    assert error_deg(estimate_normals(replace(capture, lamps=orthographic), make_estimator("iw12"))) > 1
+
+
+def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = near("dome", 4.0, side=101)
+    whole = find_surface(capture).lamps
+    monkeypatch.setattr(near_light, "PIXELS_ON_THE_WAY", 900)
+    assert Blocks.over(capture.mask, 900).step == 3
+    reduced = find_surface(capture).lamps
+    assert whole is not None and reduced is not None and whole.points is not None
+    assert np.abs(reduced.points - whole.points).mean() < 0.01
+    assert error_deg(estimate_normals(capture, make_estimator("iw12"))) < 0.2
+
+
+def test_choices_of_lights_and_pixels_keep_lamps_and_points() -> None:
+    capture = find_surface(near("dome", 4.0))
+    some = capture.choose_lights([7, 2, 4, 9]).choose_pixels(np.array([400, 500, 600]))
+    assert some.lamps is not None and capture.lamps is not None and capture.lamps.points is not None
+    np.testing.assert_array_equal(some.lamps.positions, capture.lamps.positions[[7, 2, 4, 9]])
+    np.testing.assert_array_equal(some.lamps.points, capture.lamps.points[[400, 500, 600]])
+    assert error_deg(estimate_normals(some, make_estimator("iw12"))) < 0.2
+
+
+def test_the_python_door_takes_positions() -> None:
+    capture = near("dome", 4.0)
+    images = np.zeros((10, SIDE, SIDE), np.float32)
+    images[:, capture.mask] = capture.observations.T
+    estimate = splinecli.estimate_normals(
+        images, light_directions() * 4.0, capture.mask, pixel_size=2 / SIDE, method="iw12"
+    )
+    expected = estimate_normals(capture, make_estimator("iw12"))
+    np.testing.assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)
