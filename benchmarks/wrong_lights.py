@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import read_capture
 from splinecli.capture.lights.draws import draw_lights
+from splinecli.capture.lights.light_advice import mirror_twin
 from splinecli.capture.lights.light_check import UNKNOWN_ORDER, LightCheck, check_lights
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.capture.sample import sample_observations
@@ -64,11 +65,10 @@ def wrong_files(
 
 
 def mends(check: LightCheck, frame: str) -> bool:
-    return (
-        check.order is None
-        and check.best is not None
-        and str(check.best.frame) == str(parse_light_frame(frame))
-    )
+    if check.order is not None or check.best is None:
+        return False
+    proposed = (check.best, mirror_twin(check, check.best))
+    return parse_light_frame(frame) in [candidate.frame for candidate in proposed if candidate is not None]
 
 
 def words(check: LightCheck) -> str:

@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -98,3 +99,24 @@ def test_lights_as_angles(run, medallion):
     assert "found 2 columns of angles, expected 3 columns (x y z). If they are" in refused.err
     read = run("infer", medallion, "--method", "ls", "--lights-format", "azel")
     assert (read.code, read.err) == (0, "")
+
+
+def test_a_relief_without_outline_gets_both_mends(run, medallion):
+    mask = cv2.imread(str(medallion / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    height, width = mask.shape
+    inner = np.zeros_like(mask)
+    inner[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 255
+    cv2.imwrite(str(medallion / "mask.png"), inner)
+    write_lights(medallion, lambda lights: lights * (1, -1, 1))
+    err = run("info", medallion).err
+    assert "--light-frame x-left or y-down." in err or "--light-frame y-down or x-left." in err
+    assert "without a closed outline, only you can tell which is right" in err
+
+
+def test_other_faults_of_captures(run, medallion):
+    shutil.copy(medallion / "03.png", medallion / "08.png")
+    result = run("info", medallion, "--intensities", "equal", "--strict", "--json")
+    assert result.code == 3
+    report = json.loads(result.out)
+    assert "repeated_images" in report["warning_codes"]
+    assert any(text.startswith("03.png and 08.png are the same image, but") for text in report["warnings"])

@@ -34,20 +34,35 @@ DARK_IMAGES = "dark_images"
 DIFFERENT_SIZES = "different_sizes"
 DISPLAY_ENCODED = "display_encoded"
 EIGHT_BIT = "eight_bit"
+ENCODED_VALUES = "encoded_values"
 ESTIMATED_INTENSITIES = "estimated_intensities"
+EXIF_ORIENTATION = "exif_orientation"
 FEW_LIGHTS = "few_lights"
+GROUND_TRUTH_Z = "ground_truth_z"
 GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
 IMAGES_LEFT_OUT = "images_left_out"
+LIGHTS_CROWDED = "lights_crowded"
 LIGHTS_MATCHED = "lights_matched"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
 NEAR_LAMPS = "near_lamps"
+LOW_CONFIDENCE = "low_confidence"
+REPEATED_IMAGES = "repeated_images"
 SATURATED = "saturated"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
-PROBABLY_WRONG = frozenset({LIGHT_FRAME, LIGHT_ORDER})
+PROBABLY_WRONG = frozenset(
+    {
+        ENCODED_VALUES,
+        GROUND_TRUTH_Z,
+        LIGHT_FRAME,
+        LIGHT_ORDER,
+        LOW_CONFIDENCE,
+        REPEATED_IMAGES,
+    }
+)
 """Warnings that say that an input is probably wrong. With --strict they are errors."""
 
 SATURATED_SHARE = 0.01
@@ -128,6 +143,61 @@ def display_encoded() -> CaptureWarning:
         DISPLAY_ENCODED,
         "The images look display-encoded (JPEG, or PNG that says so) but are read as linear."
         " Add --transfer srgb if they are sRGB.",
+    )
+
+
+def encoded_values(ratio: float) -> CaptureWarning:
+    """Warn of images whose decoding leaves only a share of what the lights cannot explain."""
+    return CaptureWarning(
+        ENCODED_VALUES,
+        "The images fit the lights much better if their values are decoded: they look display-encoded, but are read as"
+        f" linear (what the lights cannot explain falls to {100 * ratio:.0f} %). Add --transfer srgb or"
+        " --transfer gamma:2.2.",
+    )
+
+
+def exif_orientation(orientation: int) -> CaptureWarning:
+    """Warn of images that viewers turn."""
+    return CaptureWarning(
+        EXIF_ORIENTATION,
+        f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
+        " results are in the frame of the stored pixels.",
+    )
+
+
+def ground_truth_z() -> CaptureWarning:
+    return CaptureWarning(
+        GROUND_TRUTH_Z,
+        "The normals of the ground truth point away from the camera (z < 0): its z is probably negated, so the errors"
+        " mean nothing.",
+    )
+
+
+def lights_crowded(spread: float, *, in_cone: bool) -> CaptureWarning:
+    """Warn of lights that determine a normal badly."""
+    where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
+    return CaptureWarning(
+        LIGHTS_CROWDED,
+        f"The lights {where}, so noise and small errors of their directions grow about {1 / spread:.0f} times in the"
+        " normals. Add lights from other sides.",
+    )
+
+
+def low_confidence(expected_under_5: float) -> CaptureWarning:
+    """Warn of a capture that the network itself finds implausible."""
+    return CaptureWarning(
+        LOW_CONFIDENCE,
+        f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5 degrees. The"
+        " lights, the mask or the images are probably wrong: see docs/troubleshooting.md.",
+    )
+
+
+def repeated_images(first: str, second: str, n_pairs: int) -> CaptureWarning:
+    more = f" (and {n_pairs - 1} more pairs)" if n_pairs > 1 else ""
+    return CaptureWarning(
+        REPEATED_IMAGES,
+        f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by its"
+        " own photograph.",
     )
 
 

@@ -13,6 +13,7 @@ from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.header import is_display_encoded
+from splinecli.capture.formats.orientation import UPRIGHT, common_orientation
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
@@ -81,6 +82,9 @@ def open_capture(
         warnings.append(capture_warnings.ambient_subtracted(ambient.name))
     if radiometry.gamma == 1 and any(is_display_encoded(image) for image in files.images):
         warnings.append(capture_warnings.display_encoded())
+    orientation = common_orientation(files.images)
+    if orientation != UPRIGHT:
+        warnings.append(capture_warnings.exif_orientation(orientation))
     return replace(
         source,
         files=replace(files, ambient=radiometry.ambient),

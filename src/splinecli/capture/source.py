@@ -118,6 +118,8 @@ class CaptureSource:
             warnings.append(capture_warnings.ground_truth_upside_down())
         lamps, far_from_distant = self._near_lamps(mask)
         warnings += far_from_distant
+        if ground_truth is not None and (ground_truth[mask][:, 2] < 0).mean() > 0.5:
+            warnings.append(capture_warnings.ground_truth_z())
         capture = Capture(
             name=self.files.name,
             observations=found.values,

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from splinecli.methods import Estimator
 
 
+LEAST_EXPECTED = 0.1
+"""Smallest expected share of normals within 5 degrees without a warning."""
+
+
 def infer_capture(
     folder: Path, options: InferOptions, observer: Observer = SILENT, *, estimator: Estimator | None = None
 ) -> dict[str, Any]:
@@ -43,6 +47,7 @@ def infer_capture(
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written.
     """
+    from splinecli.capture.capture_warnings import low_confidence
     from splinecli.inference import estimate_normals
     from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
     from splinecli.results.files import write_estimate
@@ -56,6 +61,10 @@ def infer_capture(
     with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
         estimate = estimate_normals(capture, estimator, progress=advance)
     warnings += _method_warnings(estimator, capture)
+    expected = estimate.expected_under_5
+    if expected is not None and expected < LEAST_EXPECTED:
+        warnings.append(low_confidence(expected))
+        refuse_if_strict(warnings, capture.name, strict=options.strict)
     for warning in warnings:
         observer.warn(f"{capture.name}: {warning}")
     report = report_of(

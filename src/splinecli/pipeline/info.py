@@ -98,10 +98,10 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
-    from splinecli.capture.lights.light_advice import candidate_rows, light_warnings
+    from splinecli.capture.lights.light_advice import candidate_rows
     from splinecli.capture.summary import summarise_capture
     from splinecli.files import write_bytes
-    from splinecli.pipeline.input_checks import check_source
+    from splinecli.pipeline.input_checks import check_sample
 
     source = options.open()
     if options.plot is not None:
@@ -112,10 +112,10 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         from splinecli.pictures.light_sky import sky_plot
 
         write_bytes(options.plot, sky_plot(source.light_directions, source.files.name))
-    check = None if summary.sample is None else check_source(source, summary.sample, range(source.n_lights))
-    warnings = summary.warnings()
-    if check is not None:
-        warnings += light_warnings(check, source.light_frame, source.files.light_directions)
+    check, warnings = None, summary.warnings()
+    if summary.sample is not None:
+        check, found = check_sample(source, summary.sample, range(source.n_lights))
+        warnings += found
     for warning in warnings:
         observer.warn(str(warning))
     report = {

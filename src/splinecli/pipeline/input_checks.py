@@ -17,14 +17,43 @@ if TYPE_CHECKING:
     from splinecli.capture.sample import Sample
 
 
+SMALLEST_SPREAD = 0.1
+"""Lights that determine normals worse than this carry a warning; see light_spread."""
+
+
 def check_capture(source: CaptureSource, capture: Capture) -> list[CaptureWarning]:
     """Return warnings about a capture that was read from this source."""
-    from splinecli.capture.lights.light_advice import light_warnings
     from splinecli.capture.sample import sample_observations
 
     sample = sample_observations(capture.observations, capture.mask)
-    check = check_source(source, sample, capture.light_indices)
-    return light_warnings(check, source.light_frame, source.files.light_directions)
+    return check_sample(source, sample, capture.light_indices)[1]
+
+
+def check_sample(
+    source: CaptureSource, sample: Sample, indices: Sequence[int]
+) -> tuple[LightCheck, list[CaptureWarning]]:
+    """Return what a sample of the images with these indices says about the lights, and all warnings."""
+    from splinecli.capture import capture_warnings, image_checks
+    from splinecli.capture.lights.light_advice import light_warnings
+    from splinecli.capture.lights.light_check import light_spread
+
+    check = check_source(source, sample, indices)
+    warnings = light_warnings(check, source.light_frame, source.files.light_directions)
+    names = [source.files.images[index].name for index in indices]
+    lights = source.light_directions[list(indices)]
+    spread, in_cone = light_spread(lights)
+    if spread < SMALLEST_SPREAD:
+        warnings.append(capture_warnings.lights_crowded(max(spread, 1e-3), in_cone=in_cone))
+    pairs = image_checks.repeated_images(sample.observations)
+    if pairs:
+        first, second = (names[place] for place in pairs[0])
+        warnings.append(capture_warnings.repeated_images(first, second, len(pairs)))
+    if check.order is not None or spread < SMALLEST_SPREAD:
+        return check, warnings  # the other checks rely on the lights
+    ratio = image_checks.decoding_ratio(sample.observations, lights) if source.radiometry.gamma == 1 else None
+    if ratio is not None and ratio < image_checks.DISPLAY_RATIO:
+        warnings.append(capture_warnings.encoded_values(ratio))
+    return check, warnings
 
 
 def check_source(source: CaptureSource, sample: Sample, indices: Sequence[int]) -> LightCheck:

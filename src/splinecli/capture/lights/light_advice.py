@@ -11,6 +11,11 @@ from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, Capture
 from splinecli.capture.lights.light_check import UNKNOWN_ORDER, Candidate, LightCheck
 from splinecli.capture.lights.light_frames import LightFrame
 
+BOTH_NEGATED = LightFrame((-1, -1, 1))
+
+TOLD_APART = 0.5
+"""Smallest difference of advantages that tells two frames apart."""
+
 
 def light_warnings(check: LightCheck, frame: LightFrame, light_file: Path) -> list[CaptureWarning]:
     """Return the warnings about lights that were read in a frame.
@@ -52,9 +57,24 @@ def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_fil
     if best.frame is None:
         return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
     advice = f"{text}: run again with --light-frame {best.frame.after(frame)}."
+    twin = mirror_twin(check, best)
+    if twin is not None and twin.frame is not None:
+        return (
+            f"{advice[:-1]} or {twin.frame.after(frame)}. They exchange hollows and bumps; without a closed outline,"
+            " only you can tell which is right."
+        )
     if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
         advice += " If the object is hollow up to its outline, as the inside of a bowl, the lights are right."
     return advice
+
+
+def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
+    """Return the reading with x and y negated in addition, if the evidence cannot tell it from the best one."""
+    if best.frame is None:
+        return None
+    frame = BOTH_NEGATED.after(best.frame)
+    twin = next(candidate for candidate in check.candidates if candidate.frame == frame)
+    return twin if twin is not check.given and twin.advantage > best.advantage - TOLD_APART else None
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:

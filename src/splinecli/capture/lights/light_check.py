@@ -38,6 +38,10 @@ CHANCE = 0.02
 
 MIN_LIGHTS_FOR_CHANCE = 8
 
+MAX_RESIDUAL = 0.2
+"""Above this residual of the factors, images of metal and of shiny hollows do not tell whether an order fits at all:
+their right lights may fit like a random order. Another order that fits much better is still named."""
+
 UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
 """An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
 could explain: highlights and shadows."""
@@ -152,6 +156,16 @@ def check_lights(
     return LightCheck((first, *ranked), order, found.given_misfit, found.misfit, best, weight)
 
 
+def light_spread(light_directions: Array) -> tuple[float, bool]:
+    """Return how well lights (F, 3) determine a normal, and whether they lie in a cone rather than near a plane.
+
+    The first is their smallest singular value over sqrt(F): the error of a normal is about the error of an observation
+    over it. It is 0 for lights in one plane, 0.58 for lights that are spread over the whole sphere.
+    """
+    values = np.linalg.svd(light_directions, compute_uv=False) / np.sqrt(len(light_directions))
+    return float(values[-1]), bool(values[-2] < 2 * values[-1])
+
+
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
     """Return the best candidate, if it is better than the given one.
 
@@ -219,8 +233,9 @@ def _check_order(
         one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
         words = f"with those of {one} and {other} exchanged"
         return _Order(words, lights[swaps[best]], share, float(swap_misfits[best]) / usual)
+    judged = factors.residual < MAX_RESIDUAL
     by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
-    if by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual):
+    if judged and (by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)):
         return _Order(UNKNOWN_ORDER, lights, share, share)
     turns = _turns(lights, shifted, shift_misfits <= max(1.3 * given, 0.05 * usual))
     return _Order(None, lights, share, share, turns)

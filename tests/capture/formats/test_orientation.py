@@ -1,0 +1,31 @@
+"""EXIF orientations: one for all images, or none at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from splinecli.capture.formats.orientation import UPRIGHT, common_orientation
+from splinecli.errors import InputError
+
+
+def write(folder: Path, name: str, orientation: int | None) -> Path:
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    Image.new("L", (4, 3), 90).save(folder / name, exif=exif)
+    return folder / name
+
+
+@pytest.mark.parametrize(("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)])
+def test_one_orientation(tmp_path: Path, tag: int | None, expected: int) -> None:
+    images = [write(tmp_path, "a.jpg", tag), write(tmp_path, "b.tif", tag), write(tmp_path, "c.png", tag)]
+    assert common_orientation(images) == expected
+
+
+def test_different_orientations_are_refused(tmp_path: Path) -> None:
+    images = [write(tmp_path, "a.jpg", None), write(tmp_path, "b.jpg", 1), write(tmp_path, "c.jpg", 8)]
+    with pytest.raises(InputError, match=r"c\.jpg: found EXIF orientation 8, expected 1 as in a\.jpg"):
+        common_orientation(images)

@@ -1,0 +1,80 @@
+"""Images against each other: the same one twice, values that are not linear; lights that crowd."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from splinecli.capture.image_checks import DISPLAY_RATIO, decoding_ratio, repeated_images
+from splinecli.capture.lights.light_check import light_spread
+
+Array = NDArray[np.float64]
+SIZE = 96
+
+
+def lights(count: int = 10) -> Array:
+    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(12, 50, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def images(shine: float = 0.2) -> Array:
+    """Images (SIZE, SIZE, F) of a rough, patterned relief with highlights, by Blinn and Phong."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE * 12
+    z_x, z_y = 0.5 * np.cos(1.3 * x + 0.4 * y), 0.5 * np.sin(1.7 * y)
+    normals = np.stack((-z_x, -z_y, np.ones_like(x)), axis=2)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    albedo = 0.6 + 1.7 * gaussian_filter(rng.normal(size=x.shape), 2)
+    half = lights() + np.array((0.0, 0.0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    cosine = np.clip(normals @ lights().T, 0, None)
+    shaded = albedo[..., None] * cosine + shine * np.clip(normals @ half.T, 0, None) ** 40
+    return np.clip(shaded + rng.normal(0, 0.004, shaded.shape), 0.001, None)
+
+
+@pytest.fixture
+def mask() -> NDArray[np.bool_]:
+    y, x = np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
+    return np.hypot(x, y) < 0.9
+
+
+def test_the_same_image_twice(mask: NDArray[np.bool_]) -> None:
+    observations = images()[mask]
+    assert repeated_images(observations) == []
+    observations[:, 7] = observations[:, 2]
+    assert repeated_images(observations) == [(2, 7)]
+
+
+def test_uniform_images_are_not_repeated() -> None:
+    assert repeated_images(np.ones((50, 4))) == []
+
+
+def test_encoded_images(mask: NDArray[np.bool_]) -> None:
+    linear = images(shine=0.05)[mask]
+    ratio = decoding_ratio(linear, lights())
+    assert ratio is not None and ratio > 1.2
+    ratio = decoding_ratio(linear ** (1 / 2.2), lights())
+    assert ratio is not None and ratio < DISPLAY_RATIO
+
+
+def test_too_few_pixels_are_not_judged() -> None:
+    assert decoding_ratio(np.ones((5, 10)), lights()) is None
+
+
+def test_the_spread_of_lights() -> None:
+    ring = np.array([(np.cos(a), np.sin(a), 1) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)])
+    ring /= np.sqrt(2)
+    # x and y have a mean square of 1/4, z of 1/2.
+    assert light_spread(ring)[0] == pytest.approx(0.5)
+    arc = np.array(
+        [(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))]
+    )
+    assert light_spread(arc)[0] == pytest.approx(0.02, abs=1e-3)
+    assert not light_spread(arc)[1]
+    cone = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), 1) for a in np.linspace(0, 6, 9)])
+    spread, in_cone = light_spread(cone)
+    assert in_cone and spread < 0.1
