@@ -118,7 +118,8 @@ JSON = """\
   "max_pixels": 500,
   "skip_first": {},
   "as_stored": false,
-  "white_level": null
+  "white_level": null,
+  "light_error_deg": null
  },
  "methods": {},
  "results": [

@@ -43,12 +43,14 @@ GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
 IMAGES_LEFT_OUT = "images_left_out"
 LIGHTS_CROWDED = "lights_crowded"
+KEPT_LIGHTS = "kept_lights"
 LIGHTS_MATCHED = "lights_matched"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
 NEAR_LAMPS = "near_lamps"
 LOW_CONFIDENCE = "low_confidence"
 REPEATED_IMAGES = "repeated_images"
+REFINED_LIGHTS = "refined_lights"
 SATURATED = "saturated"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
@@ -222,6 +224,23 @@ def dark_images(n_images: int, example: str, share: float) -> CaptureWarning:
         DARK_IMAGES,
         f"Images that use less than {100 * share:.0f} % of the range: {n_images}, such as {example};"
         " a longer exposure gives less noise.",
+    )
+
+
+def refined_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureWarning:
+    """Say that lights were moved by these angles (F,), and what is left of the misfit."""
+    return CaptureWarning(
+        REFINED_LIGHTS,
+        f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
+        f" {moved_deg.max():.1f}. The images fit them better: {100 * fit_ratio:.0f} % of the misfit is left.",
+    )
+
+
+def kept_lights() -> CaptureWarning:
+    return CaptureWarning(
+        KEPT_LIGHTS,
+        "The light directions were not refined: no others near them fit the images much better, or there are fewer"
+        " than 6 lights or too few pixels.",
     )
 
 

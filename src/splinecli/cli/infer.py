@@ -43,6 +43,8 @@ def infer(
     captures: list[Path] = inputs.CAPTURES,
     lights: Path | None = inputs.LIGHTS,
     intensities: Path | None = inputs.INTENSITIES,
+    refine_lights: bool = inputs.REFINE_LIGHTS,
+    light_error_deg: float | None = inputs.LIGHT_ERROR,
     light_positions: Path | None = inputs.LIGHT_POSITIONS,
     light_distance: float | None = inputs.LIGHT_DISTANCE,
     pixel_size: float | None = inputs.PIXEL_SIZE,
@@ -97,6 +99,8 @@ def infer(
         options = InferOptions(
             lights=_text(lights),
             intensities=_text(intensities),
+            refine_lights=refine_lights,
+            light_error_deg=light_error_deg,
             light_positions=_text(light_positions),
             light_distance=light_distance,
             pixel_size=pixel_size,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 SPEED = ("--device", "--precision", "--batch-size")
 VALUES = ("--transfer", "--ambient", "--flat-field", "--white-level")
+REFINED = ("--refine-lights", "--light-error-deg")
 LAMPS = ("--light-positions", "--light-distance", "--pixel-size", "--object-width", "--camera-matrix")
 REPEAT = ("--overwrite", "--json", "--quiet")
 
@@ -15,6 +16,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--light-frame",
             "--lights-format",
             "--intensities",
+            *REFINED,
             *LAMPS,
             "--n-lights",
             "--seed",
@@ -58,7 +60,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "evaluate": {
         "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level"),
-        "Lights": ("--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg"),
+        "Lights": ("--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg", *REFINED),
         "Method": ("--method", "--weights", "--rotations"),
         "Output": ("--output", "--figures", "--pixel", *REPEAT),
         "Speed": ("--jobs", *SPEED),

@@ -97,6 +97,7 @@ def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
         "skip_first": dict(first.skip_first),
         "as_stored": first.as_stored,
         "white_level": first.white_level,
+        "light_error_deg": first.light_error_deg,
     }
 
 

@@ -32,6 +32,9 @@ class Protocol:
             restored and unknown light intensities are estimated, as `infer` does.
         white_level: stored value from which an observation is saturated; None to find it, see open_capture.
 
+        light_error_deg: usual error of light directions, with which each trial refines its directions (see
+            refine_capture). None refines none.
+
     Raises:
         UsageError: a value is out of its range.
     """
@@ -45,6 +48,7 @@ class Protocol:
     skip_first: Mapping[str, int] = field(default_factory=dict)
     as_stored: bool = False
     white_level: float | None = None
+    light_error_deg: float | None = None
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
@@ -93,5 +97,7 @@ def protocol_in_words(protocol: Protocol) -> str:
         parts.append(f"at most {protocol.max_pixels} pixels of each capture")
     if protocol.white_level is not None:
         parts.append(f"white level {protocol.white_level:g}")
+    if protocol.light_error_deg is not None:
+        parts.append("lights refined")
     parts.append("images as stored" if protocol.as_stored else "images restored")
     return ", ".join(parts)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.capture.lights.draws import NOISE_STREAM, in_one_plane
+from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Trial
@@ -49,7 +50,14 @@ class TrialSource:
         return cls(stored, rows)
 
     def see(self, trial: Trial) -> Capture:
-        """Return the capture under the lights of a trial, with the trial's noise on their directions."""
+        """Return the capture under the lights of a trial, with noise on their directions, and refined if asked."""
+        capture = self._see(trial)
+        if trial.light_error_deg is None:
+            return capture
+        known = self.stored.intensities_known
+        return refine_capture(capture, error_deg=trial.light_error_deg, intensities_known=known)
+
+    def _see(self, trial: Trial) -> Capture:
         position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
         seen = self.stored.choose_lights([position[light] for light in trial.lights])
         if trial.light_noise_deg:

@@ -26,7 +26,7 @@ class Trial:
         method: name of the method.
         number: number of the trial, from 0.
         lights: the draw.
-        light_noise_deg, seed, max_pixels, as_stored: see Protocol.
+        light_noise_deg, seed, max_pixels, as_stored, light_error_deg: see Protocol.
         made_of: digest of the capture's files and of the method's settings.
     """
 
@@ -39,6 +39,7 @@ class Trial:
     max_pixels: int | None
     as_stored: bool
     made_of: str
+    light_error_deg: float | None = None
 
     @classmethod
     def of(
@@ -55,6 +56,7 @@ class Trial:
             protocol.max_pixels,
             protocol.as_stored,
             made_of,
+            protocol.light_error_deg,
         )
 
     @property
@@ -62,6 +64,8 @@ class Trial:
         """SHA-256 of what decides the score. The noise depends on seed and number, the pixels on the seed."""
         values = asdict(self)
         del values["capture"]  # only a name in the tables: made_of has the files themselves
+        if self.light_error_deg is None:
+            del values["light_error_deg"]  # so that earlier trials stay valid
         if self.light_noise_deg == 0:
             del values["number"]
             if self.max_pixels is None:

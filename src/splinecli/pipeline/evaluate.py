@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture import find_captures, open_capture
+from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.devices import count_available_cores
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems
@@ -39,6 +40,7 @@ class EvaluateOptions:
             DEFAULT_LIGHTS, or for the number in the draws file.
         light_noise_deg: standard deviations of the light noise; one evaluation for each.
         trials: number of random draws; None for DEFAULT_TRIALS.
+        refine_lights: refine the light directions of each trial. light_error_deg: see Protocol.
         seed, max_pixels, skip_first, as_stored, white_level: see Protocol.
         draws: path of a draws file, in place of random draws.
         jobs: number of trials at a time; None for the cores, or for 1 on a GPU.
@@ -61,6 +63,8 @@ class EvaluateOptions:
     max_pixels: int | None = None
     skip_first: dict[str, int] = field(default_factory=dict)
     as_stored: bool = False
+    refine_lights: bool = False
+    light_error_deg: float | None = None
     white_level: float | None = None
     jobs: int | None = None
     figures: bool = False
@@ -81,6 +85,8 @@ class EvaluateOptions:
                 "--draws and --trials contradict each other",
                 hint="Leave --trials out: each line of the draws is a trial",
             )
+        if self.light_error_deg is not None:
+            check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
         for name in self.methods:
             check_method(name)
         if self.pixels and not (self.figures and "spline-net" in self.methods):
@@ -105,6 +111,7 @@ class EvaluateOptions:
                 self.skip_first,
                 self.as_stored,
                 self.white_level,
+                (self.light_error_deg or LIGHT_ERROR_DEG) if self.refine_lights else None,
             )
             for count, noise in product(dict.fromkeys(counts), dict.fromkeys(self.light_noise_deg))
         ]

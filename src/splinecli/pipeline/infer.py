@@ -56,6 +56,14 @@ def infer_capture(
     source, capture, read_seconds = _read(folder, options, observer)
     warnings = [*capture.warnings, *check_capture(source, capture)]
     refuse_if_strict(warnings, capture.name, strict=options.strict)
+    if options.refine_lights:
+        from splinecli.capture.restore.light_refinement import refine_capture
+
+        before = len(capture.warnings)
+        capture = refine_capture(
+            capture, error_deg=options.light_error_deg, intensities_known=source.intensities_known
+        )
+        warnings += capture.warnings[before:]
     if estimator is None:
         estimator = make_method(options)
     with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:

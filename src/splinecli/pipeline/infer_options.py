@@ -34,6 +34,7 @@ class InferOptions:
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
         strict: fail where a warning says that the lights or images are probably wrong.
         light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.
+        refine_lights: refine rough light directions. light_error_deg: their usual error; None for the default.
         auto_mask: find the object where the capture has no mask.
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
@@ -63,6 +64,8 @@ class InferOptions:
     pixel_size: float | None = None
     object_width: float | None = None
     camera_matrix: str | None = None
+    refine_lights: bool = False
+    light_error_deg: float | None = None
     mask: str | None = None
     auto_mask: bool = False
     ground_truth: str | None = None
@@ -94,6 +97,7 @@ class InferOptions:
         from splinecli.capture.lights.draws import check_draw_settings
         from splinecli.capture.lights.light_frames import parse_light_frame
         from splinecli.capture.record import check_light_indices
+        from splinecli.capture.restore.light_refinement import check_light_error
         from splinecli.results.files import MAPS, NORMALS
         from splinecli.transfer import parse_transfer
 
@@ -102,6 +106,8 @@ class InferOptions:
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         _ = self.lamps
+        if self.light_error_deg is not None:
+            check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
         check_method(self.method)
         if self.n_lights is not None:
             check_draw_settings(self.n_lights, 1, self.seed)

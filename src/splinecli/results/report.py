@@ -48,6 +48,7 @@ def report_of(
         "weights": estimator.weights,
         "n_lights": capture.n_lights,
         "light_indices": list(capture.light_indices),
+        "light_directions": capture.light_directions.round(6).tolist(),
         "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
         "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
         "n_pixels": capture.n_pixels,

@@ -38,6 +38,12 @@ INTENSITIES = Option(
     help="Light intensities: a line r g b for each image. [default: equal, or estimated if the images show that"
     " they differ]",
 )
+REFINE_LIGHTS = Option(
+    False, "--refine-lights", help="Refine rough light directions so that they fit the images better."
+)
+LIGHT_ERROR = Option(
+    None, metavar="SIGMA", help="With --refine-lights: usual error of the directions in degrees. [default: 5]"
+)
 LIGHT_POSITIONS = Option(
     None,
     metavar="FILE",

@@ -1,0 +1,214 @@
+"""Rough light directions, refined from the images of the object.
+
+Normals and lights are fitted in turn, robustly: with I = l . b for a matte surface, each step is linear. This is
+semi-calibrated photometric stereo (Cho et al., TPAMI 2018) with directions that are free, too, within a prior around
+the given ones. The prior holds what the images leave open: lights and normals may turn together. If the light
+intensities are known, nothing else is open. If not, a prior on them holds the generalised bas-relief ambiguity
+(Belhumeur, Kriegman and Yuille, IJCV 1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import capture_warnings
+from splinecli.capture.record import Capture
+from splinecli.capture.restore.robust_fit import absolute_weights
+from splinecli.errors import UsageError
+from splinecli.normals import angle_between_deg, unit
+from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
+
+Array = NDArray[np.float64]
+
+LIGHT_ERROR_DEG = 5.0
+"""Usual error of a rough direction."""
+
+LARGEST_LIGHT_ERROR_DEG = 30.0
+
+MIN_LIGHTS = 6
+"""With fewer lights, an error of a light looks like one of the normals."""
+
+BETTER_FIT = 0.7
+"""Refined lights are taken if the median residual falls below this share of that under the given lights. On rendered
+captures with exact lights, it seldom does; docs/measurements.md has the figures."""
+
+MAX_MISFIT = 0.018
+"""Largest median residual, as a share of a pixel's brightest observation, with which refined lights are taken. Metals
+have more, and a matte model would move their lights wrongly."""
+
+INTENSITY_ERROR = 0.15
+"""Standard deviation of intensities that nobody measured, in the prior."""
+
+_MAX_PIXELS = 2000
+_MIN_PIXELS = 100
+_DARK_SHARE = 0.02
+_SHADOW_SHARE = 0.1  # of the pixel's quantile below, as in IW12
+_UNSHADED = 0.6
+_WORTH_PIXELS = 50.0
+"""Number of pixels that the data weigh against the prior: errors of a matte model are alike in many pixels."""
+
+_MAX_ROUNDS = 150
+_FIRST_FITS, _FITS_PER_ROUND = 8, 2
+_CONVERGED = 1e-4
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedLights:
+    """Lights (F, 3) that fit the images better.
+
+    Args:
+        directions: (F, 3), unit.
+        intensities: (F,), relative to the given ones.
+        fit_ratio: the median residual, as a share of that under the given lights.
+    """
+
+    directions: Array
+    intensities: Array
+    fit_ratio: float
+
+
+def refine_capture(
+    capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True
+) -> Capture:
+    """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
+
+    Args:
+        capture: under distant lights.
+        error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
+        intensities_known: whether the light intensities were measured.
+
+    Raises:
+        UsageError: the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
+    """
+    if capture.lamps is not None:
+        raise UsageError(
+            "--refine-lights refines distant lights, and this capture has near lamps",
+            hint="Leave --refine-lights out",
+        )
+    error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
+    check_light_error(error_deg)
+    found = refine_lights(
+        capture.observations,
+        capture.light_directions,
+        error_deg=error_deg,
+        intensities_known=intensities_known,
+    )
+    if found is None:
+        return replace(capture, warnings=(*capture.warnings, capture_warnings.kept_lights()))
+    intensities = capture.estimated_intensities
+    if not intensities_known:
+        intensities = found.intensities if intensities is None else intensities * found.intensities
+    moved_deg = angle_between_deg(found.directions, capture.light_directions)
+    warning = capture_warnings.refined_lights(moved_deg, found.fit_ratio)
+    return replace(
+        capture,
+        observations=np.asarray(capture.observations / found.intensities, np.float32),
+        light_directions=found.directions,
+        estimated_intensities=intensities,
+        warnings=(*capture.warnings, warning),
+    )
+
+
+def check_light_error(error_deg: float, *, needs_option: bool = False) -> None:
+    """Raise UsageError for an error of directions that is out of range, or where `needs_option`."""
+    if needs_option:
+        raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
+    if not 0 < error_deg <= LARGEST_LIGHT_ERROR_DEG:
+        raise UsageError(
+            f"the light error is {error_deg:g} degrees, expected above 0 and at most {LARGEST_LIGHT_ERROR_DEG:g}"
+        )
+
+
+def refine_lights(
+    observations: NDArray[np.float32],
+    light_directions: Array,
+    *,
+    error_deg: float = LIGHT_ERROR_DEG,
+    intensities_known: bool = True,
+) -> RefinedLights | None:
+    """Return refined lights; None where the images do not tell, or the given lights fit about as well.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        light_directions: (F, 3), unit.
+        error_deg, intensities_known: see refine_capture.
+    """
+    values = _choose_pixels(observations)
+    if values is None:
+        return None
+    reference = _SHADOW_SHARE * np.quantile(values, _UNSHADED, axis=1, keepdims=True)
+    lit = (values > reference).astype(np.float64)
+    lights = light_directions
+    normals, weights = _fit(values, lights, lit, lit, _FIRST_FITS)
+    before = _misfit(values, normals, lights, lit)
+    precision = _prior(light_directions, error_deg)
+    for _ in range(_MAX_ROUNDS):
+        normals, weights = _fit(values, lights, lit, weights, _FITS_PER_ROUND)
+        moved = _move_lights(values, normals, weights, lights, light_directions, precision)
+        moved = unit(moved) if intensities_known else moved
+        change, lights = np.abs(moved - lights).max(), moved
+        if change < _CONVERGED:
+            break
+    normals, _ = _fit(values, lights, lit, weights, _FIRST_FITS)
+    after = _misfit(values, normals, lights, lit)
+    ratio = after / max(before, 1e-12)
+    intensities = np.linalg.norm(lights, axis=1)
+    directions = unit(lights)
+    better = after < MAX_MISFIT and ratio < BETTER_FIT and bool((directions[:, 2] > 0).all())
+    return RefinedLights(directions, intensities, ratio) if better else None
+
+
+def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
+    """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
+    if observations.shape[1] < MIN_LIGHTS:
+        return None
+    brightest = observations.max(axis=1)
+    lit = np.flatnonzero(brightest > _DARK_SHARE * np.quantile(brightest, 0.99))
+    if len(lit) < _MIN_PIXELS:
+        return None
+    chosen = lit[np.linspace(0, len(lit) - 1, min(len(lit), _MAX_PIXELS)).astype(int)]
+    values = observations[chosen].astype(np.float64).clip(min=0)
+    return np.asarray(values / values.max(axis=1, keepdims=True))
+
+
+def _fit(values: Array, lights: Array, lit: Array, weights: Array, fits: int) -> tuple[Array, Array]:
+    """Return scaled normals (p, 3) of a robust matte fit, and the weights (p, F) for the next."""
+    x, y, z = lights.T
+    products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
+    for _ in range(fits):
+        xx, yy, zz, xy, xz, yz = (weights @ products).T
+        covariance = inverse_3x3((xx + _RIDGE, yy + _RIDGE, zz + _RIDGE, xy, xz, yz), _RIDGE)
+        right_side = (weights * values) @ lights
+        normals = np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
+        weights = lit * absolute_weights(values - normals @ lights.T)
+    return normals, weights
+
+
+def _misfit(values: Array, normals: Array, lights: Array, lit: Array) -> float:
+    return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))
+
+
+def _prior(light_directions: Array, error_deg: float) -> Array:
+    """Return the precision (F, 3, 3) of the given light vectors: of their directions and their lengths."""
+    along = light_directions[:, :, None] * light_directions[:, None, :]
+    # The angle has two components, each with half of its variance.
+    across_variance = np.radians(error_deg) ** 2 / 2
+    return np.asarray((np.eye(3) - along) / across_variance + along / INTENSITY_ERROR**2)
+
+
+def _move_lights(
+    values: Array, normals: Array, weights: Array, lights: Array, given: Array, precision: Array
+) -> Array:
+    """Return the light vectors (F, 3) that fit the observations best, within the prior."""
+    residuals = values - normals @ lights.T
+    variance = (weights * residuals**2).sum() / weights.sum()
+    scale = _WORTH_PIXELS / (weights.sum(axis=0) * max(variance, 1e-12))
+    curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
+    gradient = ((weights * residuals).T @ normals) * scale[:, None]
+    pull = np.einsum("fij,fj->fi", precision, given - lights)
+    step = np.linalg.solve(curvature + precision, (gradient + pull)[..., None])[..., 0]
+    return np.asarray(lights + step)

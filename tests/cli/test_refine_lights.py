@@ -1,0 +1,70 @@
+"""`--refine-lights` on a matte capture whose light file is rough."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bump_capture import POSITIONS, write_bump
+
+
+@pytest.fixture
+def rough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+    """Write a matte bump under distant lights. Returns directions (7, 3) with errors of about 5 degrees."""
+    monkeypatch.chdir(tmp_path)
+    write_bump(Path("bump"), distant=True)
+    directions = POSITIONS / np.linalg.norm(POSITIONS, axis=1, keepdims=True)
+    Path("bump/light_intensities.txt").write_text("1\n" * len(directions))
+    rough = directions + np.random.default_rng(1).normal(scale=0.06, size=directions.shape)
+    np.savetxt("bump/light_directions.txt", rough)
+    return rough / np.linalg.norm(rough, axis=1, keepdims=True)
+
+
+def test_infer(run, rough: np.ndarray) -> None:
+    reports = []
+    for more in ((), ("--refine-lights",)):
+        result = run("infer", "bump", "--method", "ls", "--json", "--overwrite", *more)
+        assert result.code == 0, result.err
+        reports.append(json.loads(result.out)[0])
+    given, refined = reports
+    np.testing.assert_allclose(given["light_directions"], rough, atol=1e-5)
+    moved = np.degrees(np.arccos((np.array(refined["light_directions"]) * rough).sum(axis=1).clip(-1, 1)))
+    assert 1 < moved.mean() < 10
+    assert "refined_lights" in [warning["code"] for warning in refined["warnings"]]
+    # A common rotation of lights and normals stays.
+    assert refined["angular_error_deg"]["mean"] < 0.9 * given["angular_error_deg"]["mean"]
+
+
+def test_evaluate(run, rough: np.ndarray) -> None:
+    """Both protocols share a folder: trials with refined lights are other trials."""
+    errors = []
+    for more in ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3")):
+        result = run(
+            "evaluate", "bump", "--method", "ls", "--n-lights", "all", "--json", "-o", "scores", *more
+        )
+        assert result.code == 0, result.err
+        document = json.loads(result.out)
+        errors.append(document["results"][0]["mae_deg"])
+    assert document["protocol"]["light_error_deg"] == 3
+    assert errors[1] < 0.9 * errors[0]
+    assert errors[2] not in errors[:2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--light-error-deg", "4"], "--light-error-deg needs --refine-lights"),
+        (["--refine-lights", "--light-error-deg", "40"], "the light error is 40 degrees, expected above 0"),
+        (
+            ["--refine-lights", "--light-distance", "200", "--pixel-size", "2"],
+            "--refine-lights refines distant lights, and this capture has near lamps",
+        ),
+    ],
+)
+def test_refusals(run, rough: np.ndarray, arguments: list[str], message: str) -> None:
+    result = run("infer", "bump", "--method", "ls", *arguments)
+    assert result.code == 2
+    assert message in result.err
