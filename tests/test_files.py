@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from splinecli.errors import OutputError
-from splinecli.files import held_folder, write_bytes, write_text
+from splinecli.files import parse_json, write_bytes, write_text
 
 
 def names_in(folder: Path) -> list[str]:
@@ -67,25 +68,22 @@ def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: 
         assert names_in(tmp_path) == ["out.bin"]
 
 
-def test_a_folder_is_written_into_by_one_at_a_time(tmp_path: Path) -> None:
-    pytest.importorskip("fcntl", reason="this system has no such locks")
-    folder = tmp_path / "run"
-    with held_folder(folder):
-        with (
-            pytest.raises(OutputError, match=r"run: another splinecli process is writing into this folder"),
-            held_folder(folder),
-        ):
-            pytest.fail("two at once")
-        (folder / "content").touch()
-    with held_folder(folder):
-        assert (folder / "content").exists()
+def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("splinecli.files.sync", fail)
+    with pytest.raises(OutputError, match="No space left"):
+        write_bytes(tmp_path / "a" / "b" / "out.bin", b"content")
+    assert names_in(tmp_path) == []
 
 
-def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), held_folder(tmp_path / "new"):
-        raise ZeroDivisionError
-    assert not (tmp_path / "new").exists()
-    (tmp_path / "old").mkdir()
-    with pytest.raises(ZeroDivisionError), held_folder(tmp_path / "old"):
-        raise ZeroDivisionError
-    assert (tmp_path / "old").exists()
+@pytest.mark.parametrize("text", ["[" * 200_000, '{"a": ' + "9" * 400 + "}", "9" * 5000, "{", ""])
+def test_json_that_cannot_be_used_is_a_value_error(text: str) -> None:
+    with pytest.raises(ValueError):
+        parse_json(text)
+
+
+def test_json(tmp_path: Path) -> None:
+    values = {"a": [1, -2.5, None, True, "x"], "b": 10**299}
+    assert parse_json(json.dumps(values)) == values

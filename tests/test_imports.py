@@ -21,8 +21,8 @@ ROOMS = [
     {"methods", "metrics"},
     {"networks", "devices"},
     {"fits", "calibration"},
-    {"capture", "observation_map", "surface"},
-    {"normals", "files", "transfer", "solve_3x3"},
+    {"capture", "observation_map", "publishing", "surface"},
+    {"normals", "files", "memory", "transfer", "solve_3x3"},
     {"extras"},
     {"errors", "__init__"},
 ]

@@ -5,6 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 
+def printable(text: object) -> str:
+    """Return the text in one line, with escapes such as \\n for all characters that are not printable.
+
+    Names of files may contain anything, also what moves a terminal's cursor or forges a line.
+    """
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in str(text)
+    )
+
+
 class SplinecliError(Exception):
     """A failure that one message explains: "PATH:LINE: PROBLEM. HINT.".
 
@@ -30,7 +40,7 @@ class SplinecliError(Exception):
         self.line = line
         self.hint = hint
         place = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
-        super().__init__(f"{place}{problem}." + (f" {hint}." if hint else ""))
+        super().__init__(printable(f"{place}{problem}." + (f" {hint}." if hint else "")))
 
 
 class UsageError(SplinecliError):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import json
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from splinecli.errors import OutputError
 
-LOCK = ".lock"
-"""The lock file in a folder that only one process at a time may write into."""
+UNFINISHED = ".unfinished"
+"""The ending of hidden files and folders that are being written. What a killed process left is removed later."""
+
+_MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
 
 
 def file_sha256(path: Path) -> str:
@@ -30,20 +34,66 @@ def write_bytes(path: Path, content: bytes) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
+    made: list[Path] = []
     temporary: Path | None = None
     with refusals_as_output_errors(path):
         try:
+            made = [place for place in path.parents if not place.exists()]
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+            handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=UNFINISHED, dir=path.parent)
             temporary = Path(name)
             with os.fdopen(handle, "wb") as file:
                 file.write(content)
             temporary.chmod(0o666 & ~current_umask())
+            sync(temporary)
             temporary.replace(path)
         finally:
-            # This also runs on Ctrl-C, so no partial file is left.
+            # This also runs on Ctrl-C, so no partial file and no empty folder is left.
             if temporary is not None:
                 temporary.unlink(missing_ok=True)
+            with suppress(OSError):
+                for place in made:
+                    place.rmdir()
+
+
+def sync(path: Path) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk. Raises OSError."""
+    windows = os.name == "nt"
+    if windows and path.is_dir():  # Windows opens no folders
+        return
+    handle = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some network drives cannot sync
+            raise
+    finally:
+        os.close(handle)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text.
+
+    Raises:
+        ValueError: the text is no JSON, is nested too deeply, or has a number that no float can hold.
+    """
+    try:
+        return json.loads(text, parse_int=_whole_number)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def read_json(path: Path) -> Any:
+    """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and for what is no file."""
+    if not path.is_file() and path.exists():
+        raise ValueError("it is no file")  # a device might never end
+    return parse_json(path.read_text("utf-8"))
+
+
+def _whole_number(digits: str) -> int:
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number has {len(digits)} digits")
+    return int(digits)
 
 
 @contextmanager
@@ -52,8 +102,10 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        # NumPy tells only how much was written.
+        reason = error.strerror or f"{error}; the disk may be full"
         raise OutputError(
-            f"cannot be written ({error.strerror or error})", path=path, hint="Choose another place with -o"
+            f"cannot be written ({reason})", path=path, hint="Choose another place with -o"
         ) from error
 
 
@@ -93,47 +145,6 @@ def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
                 path=folder,
                 hint="Add --overwrite, or choose another place with -o",
             )
-
-
-@contextmanager
-def held_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and lock it, so that no other process of splinecli writes into it.
-
-    If the context fails, a folder that was made here and is still empty is removed.
-
-    Raises:
-        OutputError: the folder cannot be made, or another process has locked it.
-    """
-    made = not folder.exists()
-    with refusals_as_output_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / LOCK).open("a")
-    try:
-        _lock(lock, folder)
-        yield
-    except BaseException:
-        if made and [path.name for path in folder.iterdir()] == [LOCK]:
-            (folder / LOCK).unlink()
-            folder.rmdir()
-        raise
-    finally:
-        # The lock file stays. If it were removed, two processes could lock two files of the same name.
-        lock.close()
-
-
-def _lock(file: IO[str], folder: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # this system has no such locks
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise OutputError(
-            "another splinecli process is writing into this folder",
-            path=folder,
-            hint="Wait for it to end, or choose another -o",
-        ) from error
 
 
 def write_text(path: Path, content: str) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import builtins
 import os
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,14 +70,14 @@ def forbid(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
     def forbid_file(path: Path) -> None:
         path.chmod(0)
         if os.access(path, os.R_OK):
-            original = Path.open
+            for owner, original in ((Path, Path.open), (builtins, builtins.open)):
 
-            def refuse(self: Path, *args: object, **kwargs: object) -> object:
-                if self == path:
-                    raise PermissionError(13, "Permission denied", str(self))
-                return original(self, *args, **kwargs)  # type: ignore[call-overload]
+                def refuse(file: Any, *args: Any, original: Any = original, **kwargs: Any) -> Any:
+                    if isinstance(file, str | Path) and Path(file) == path:
+                        raise PermissionError(13, "Permission denied", str(file))
+                    return original(file, *args, **kwargs)
 
-            monkeypatch.setattr(Path, "open", refuse)
+                monkeypatch.setattr(owner, "open", refuse)
 
     return forbid_file
 

@@ -309,23 +309,6 @@ def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
     assert names == ["normals.npy", "normals.png", "notes.txt", "report.json"]
 
 
-def test_interrupted_overwriting_keeps_the_earlier_results(capture, run, monkeypatch):
-    run("infer", capture, "--method", "ls")
-    before = {path.name: path.read_bytes() for path in Path("out/sphere").iterdir()}
-    replace, calls = Path.replace, []
-
-    def interrupt_at_the_sixth(path: Path, target: Path) -> Path:
-        calls.append(path)
-        if len(calls) == 6:  # the four earlier files are aside, the second new one is on its way
-            raise KeyboardInterrupt
-        return replace(path, target)
-
-    monkeypatch.setattr(Path, "replace", interrupt_at_the_sixth)
-    assert run("infer", capture, "--method", "ls", "--n-lights", 5, "--overwrite").code == 130
-    assert {path.name: path.read_bytes() for path in Path("out/sphere").iterdir()} == before
-    assert [path.name for path in Path("out").iterdir()] == ["sphere"]
-
-
 def test_output_that_cannot_be_written(capture, run, golden):
     Path("out").write_text("a file where the folder should be")
     result = run("infer", capture, "--method", "ls")
@@ -349,7 +332,7 @@ def test_interrupted_while_writing(capture, run, monkeypatch):
 
     monkeypatch.setattr("splinecli.results.files.encode_png", interrupt)
     assert run("infer", capture, "--method", "ls").code == 130
-    assert list(Path("out").iterdir()) == []
+    assert not Path("out").exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
@@ -368,8 +351,9 @@ def test_ctrl_c_ends_a_real_process(capture):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "splinecli: interrupted.\n")
-    # Nothing half-written stays; the lock is a file of its own.
-    assert [path.name for path in Path("run").iterdir() if path.name.startswith(".")] == [".lock"]
+    assert not [
+        path.name for path in Path("run").iterdir() if path.name.startswith(".")
+    ]  # nothing half-written
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX redirections")

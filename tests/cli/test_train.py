@@ -48,7 +48,7 @@ def rows() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-FILES = {".lock",
+FILES = {
     "weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv", "curves.png", "maps.png",
 }  # fmt: skip
 
@@ -194,6 +194,34 @@ def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
     assert run("train", "-o", "other", "--steps", 1, "--quiet").code == 0
 
 
+def test_resuming_a_finished_run_says_so(run, no_pictures):
+    run("train", "-o", "run", "--steps", 1)
+    before = {path.name: path.read_bytes() for path in Path("run").iterdir()}
+    result = run("train", "-o", "run", "--resume", "--steps", 1)
+    assert (result.code, result.out) == (0, "run/weights.safetensors\n")
+    assert result.err == "run: the run is at its end already. Give it more --steps or --minutes to go on.\n"
+    assert {path.name: path.read_bytes() for path in Path("run").iterdir()} == before
+
+
+def test_identical_runs_have_identical_files(run, no_pictures):
+    for name in ("one", "two"):
+        assert run("train", "-o", name, "--steps", 2, "-q").code == 0
+    one, two = (Path(name, "weights.safetensors").read_bytes() for name in ("one", "two"))
+    assert one == two
+
+
+@pytest.mark.parametrize("damage", [b"\xff\xfe\x00", b"step,pixels\n1,2\n3,4\n", b"\x00" * 50 + b"\n1,2\n"])
+def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
+    assert run("train", "-o", "run", "--steps", 1, "-q").code == 0
+    damaged = Path("run/metrics.csv").read_bytes() + damage
+    Path("run/metrics.csv").write_bytes(damaged)
+    result = run("train", "-o", "run", "--resume", "--steps", 2)
+    assert result.code == 0
+    assert "splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv" in result.err
+    assert Path("run/metrics.damaged.csv").read_bytes() == damaged
+    assert [row["step"] for row in rows()] == ["2"]
+
+
 def test_refusals(run, golden, no_pictures):
     run("train", "-o", "run", "--steps", 1)
     Path("unknown.toml").write_text("[pixels]\nlights = 5\n")
@@ -207,7 +235,6 @@ def test_refusals(run, golden, no_pictures):
     messages = []
     for code, arguments in (
         (5, ["-o", "run"]),
-        (4, ["-o", "run", "--resume", "--steps", 1]),
         (4, ["-o", "other", "--resume"]),
         (2, ["-o", "other", "--preset", "huge"]),
         (2, ["-o", "other", "--steps", 1, "--minutes", 1]),

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from kills import killed_at
 from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, open_pixel_set
 from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.publishing import held_folder
 
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 MakeSet = Callable[..., PixelSet]
@@ -72,7 +74,7 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
         save(path, array, **kwargs)
 
     monkeypatch.setattr(np, "save", full)
-    with pytest.raises(OutputError, match=r"b: cannot be written \(No space left on device\)"):
+    with pytest.raises(OutputError, match=r"cannot be written \(No space left on device\)"):
         writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
     assert len(saved) == 3
     assert everything(tmp_path) == before
@@ -84,25 +86,6 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
     writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
     writer.finish()
     assert [entry.name for entry in open_pixel_set(tmp_path).entries] == ["a", "b"]
-
-
-def test_the_manifest_names_an_entry_only_after_it_is_written(
-    tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # The process is killed after the entry has its name and before the manifest has it. The next one writes it again.
-    writer = PixelSetWriter(tmp_path)
-    monkeypatch.setattr(
-        writer, "_write_manifest", lambda *, complete: (_ for _ in ()).throw(KeyboardInterrupt)
-    )
-    with pytest.raises(KeyboardInterrupt):
-        writer.add("a", "a", "a test", RECIPE, matte_pixels(9, 4, seed=1))
-    assert read_manifest(tmp_path)["entries"] == []
-    again = PixelSetWriter(tmp_path)
-    assert "a" not in again
-    again.add("a", "a", "a test", RECIPE, matte_pixels(7, 5, seed=2))
-    finished = again.finish()
-    assert open_pixel_set(tmp_path) == finished
-    assert finished.entries[0].n_pixels == 7
 
 
 def test_continuing_keeps_existing_entries(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
@@ -148,20 +131,36 @@ def test_an_entry_is_replaced_as_a_whole(tmp_path: Path, matte_pixels: Callable[
     assert open_pixel_set(tmp_path).entries == (entry,)
 
 
-def test_a_killed_replacement_leaves_an_unfinished_set(
-    tmp_path: Path, matte_pixels: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(
+    tmp_path: Path, matte_pixels: Callable[..., Any]
 ) -> None:
-    writer = PixelSetWriter(tmp_path)
-    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    writer.finish()
-    # Killed after the earlier entry was removed and before the new one has its name.
-    monkeypatch.setattr(Path, "rename", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        PixelSetWriter(tmp_path).add("a", "a", "a test", {"seed": 2}, matte_pixels(9, 4))
-    monkeypatch.undo()
-    with pytest.raises(InputError, match="not finished"):
-        open_pixel_set(tmp_path)
-    assert "a" not in PixelSetWriter(tmp_path)
+    old, new, kept, step = matte_pixels(7, 5), matte_pixels(9, 4), [], 0
+    while True:
+        folder = tmp_path / str(step)
+        folder.mkdir()
+        writer = PixelSetWriter(folder)
+        writer.add("a", "a", "a test", RECIPE, old)
+        writer.finish()
+
+        def replace(folder: Path = folder) -> None:
+            PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
+
+        if not killed_at(step, replace):
+            break
+        with held_folder(folder):
+            again = PixelSetWriter(folder)
+        kept.append(again.recipe_of("a") == RECIPE)
+        if kept[-1]:
+            assert [entry.n_pixels for entry in open_pixel_set(folder).entries] == [7]
+        else:
+            with pytest.raises(InputError, match="not finished"):
+                open_pixel_set(folder)
+            (entry,) = again.finish().entries
+            assert (entry.n_pixels, entry.recipe) == (9, {"seed": 2})
+            assert open_pixel_set(folder).entries == (entry,)
+        step += 1
+    assert True in kept
+    assert False in kept
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:

@@ -114,16 +114,16 @@ def test_what_is_wrong_on_the_command_line_does_not(tmp_path: Path) -> None:
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"none\.toml: cannot be read \(No such file or directory\)"):
+    with pytest.raises(ModelError, match=r"none\.toml: the file does not exist"):
         read_config_file(tmp_path / "none.toml")
-    with pytest.raises(ModelError, match="cannot be read"):
+    with pytest.raises(ModelError, match="found a folder, expected a text file"):
         read_config_file(tmp_path)
     with pytest.raises(ModelError, match=r"a\.json: is not JSON"):
         read_config_file(write(tmp_path / "a.json", "{"))
     with pytest.raises(ModelError, match=r"a\.json: is not a table of settings"):
         read_config_file(write(tmp_path / "a.json", "[1]"))
     (tmp_path / "b.toml").write_bytes(b"preset = '\xff'")
-    with pytest.raises(ModelError, match=r"b\.toml: is not TOML"):
+    with pytest.raises(ModelError, match=r"b\.toml: the file is not UTF-8 text"):
         read_config_file(tmp_path / "b.toml")
 
 

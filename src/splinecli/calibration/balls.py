@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask, to_linear
 from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
@@ -125,12 +125,11 @@ def calibrate_ball(
     if circle is None:
         circle, circle_from = _find_outline(files)
     highlights, directions = [], []
-    first: tuple[int, ...] | None = None
+    expected: ExpectedSize | None = None
     for path in files.images:
-        stored = decode_image(path)
-        first = first or stored.shape[:2]
-        check_size(stored.shape, first, path, like=files.images[0].name)
-        if not circle.inside(first).any():
+        stored = decode_image(path, expected)
+        expected = expected or ExpectedSize(stored.shape, path.name)
+        if not circle.inside(stored.shape[:2]).any():
             raise InputError(
                 "the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels"
             )
@@ -146,9 +145,14 @@ def calibrate_ball(
         highlights.append(highlight)
         if progress is not None:
             progress()
-    assert first is not None  # a ball has images
+    assert expected is not None  # a ball has images
     return BallCalibration(
-        files, circle, circle_from, tuple(highlights), np.array(directions), (first[0], first[1])
+        files,
+        circle,
+        circle_from,
+        tuple(highlights),
+        np.array(directions),
+        (expected.shape[0], expected.shape[1]),
     )
 
 
@@ -197,9 +201,8 @@ def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
     """Return the mean (H, W) of the gray values of images."""
     total: NDArray[np.float32] | None = None
     for path in images:
-        gray = to_linear(decode_image(path), path).mean(axis=2)
-        if total is not None:
-            check_size(gray.shape, total.shape, path, like=images[0].name)
+        expected = None if total is None else ExpectedSize(total.shape, images[0].name)
+        gray = to_linear(decode_image(path, expected), path).mean(axis=2)
         total = gray if total is None else total + gray
     assert total is not None
     return total / np.float32(len(images))

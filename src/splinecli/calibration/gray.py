@@ -12,7 +12,7 @@ from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.exposure import check_exposures
-from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import AMBIENT, find_named
 from splinecli.capture.linearise import Lineariser, RadiometricCalibration
@@ -68,9 +68,11 @@ def _target_normals(
     files: BallFiles, shape: tuple[int, ...], target: Target
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
-    mask = np.ones(shape, np.bool_) if files.mask is None else read_mask(files.mask)
-    if files.mask is not None:
-        check_size(mask.shape, shape, files.mask, like=files.images[0].name, what="a mask")
+    mask = (
+        np.ones(shape, np.bool_)
+        if files.mask is None
+        else read_mask(files.mask, ExpectedSize(shape, files.images[0].name, "a mask"))
+    )
     if target == "card":
         return mask, np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     if files.mask is None:
@@ -87,8 +89,7 @@ def _intensity(
     path: Path, linearise: Lineariser, index: int, cosine: NDArray[np.float64], first: Path
 ) -> NDArray[np.float64]:
     """Return the intensity (3,) of the light of one image; cosine (P,) is n.l at the pixels of the mask."""
-    stored = decode_image(path)
-    check_size(stored.shape, linearise.mask.shape, path, like=first.name)
+    stored = decode_image(path, ExpectedSize(linearise.mask.shape, first.name))
     pixels = stored[linearise.mask]
     usable = (cosine > SMALLEST_COSINE) & ~find_saturated(pixels)
     values = linearise(pixels, path, index)[usable]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import to_linear
 from splinecli.errors import InputError
 from splinecli.transfer import decode_transfer
@@ -74,6 +74,5 @@ class Lineariser:
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
 
     def _linear(self, path: Path) -> NDArray[np.float32]:
-        stored = decode_image(path)
-        check_size(stored.shape, self.mask.shape, path, like="the other images")
+        stored = decode_image(path, ExpectedSize(self.mask.shape, "the other images"))
         return decode_transfer(to_linear(stored[self.mask], path), self.radiometry.gamma)

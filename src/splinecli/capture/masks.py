@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_boundary, read_mask
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.errors import InputError
@@ -21,18 +21,14 @@ def read_capture_mask(files: CaptureFiles, shape: tuple[int, ...]) -> NDArray[np
         return _read_boundaries(files, shape)
     if files.mask is None:
         return np.ones(shape, np.bool_)
-    mask = read_mask(files.mask)
-    check_size(mask.shape, shape, files.mask, like=files.images[0].name, what="a mask")
-    return mask
+    return read_mask(files.mask, ExpectedSize(shape, files.images[0].name, "a mask"))
 
 
 def _read_boundaries(files: CaptureFiles, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return the union of the masks of CyclesPS."""
     union = np.zeros(shape, np.bool_)
     for path in files.boundaries:
-        boundary = read_boundary(path)
-        check_size(boundary.shape, shape, path, like=files.images[0].name, what="a mask")
-        union |= boundary
+        union |= read_boundary(path, ExpectedSize(shape, files.images[0].name, "a mask"))
     if not union.any():
         names = " and ".join(path.name for path in files.boundaries)
         raise InputError(

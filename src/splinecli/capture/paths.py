@@ -5,9 +5,19 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 from splinecli.errors import InputError
+
+_OPEN_FILES = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")
+
+_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (lambda _: True, "a device"),
+)
 
 StrPath = str | os.PathLike[str]
 """A path in any form that the standard library takes."""
@@ -30,6 +40,27 @@ def find_mode(path: Path) -> int | None:
 def is_file(path: Path) -> bool:
     """Return whether there is a file; False also if the system refuses to answer."""
     return stat.S_ISREG(_mode_or_zero(path))
+
+
+def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
+    """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
+
+    Args:
+        path: the path.
+        expected: what the file should be, for messages.
+        pipe: whether the shell's process substitution `<(...)` may stand in its place, see is_substitution.
+    """
+    mode = find_mode(path)
+    if mode is None:
+        raise InputError("the file does not exist", path=path)
+    if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
+        kind = next(words for matches, words in _KINDS if matches(mode))
+        raise InputError(f"found {kind}, expected {expected}", path=path)
+
+
+def is_substitution(path: Path) -> bool:
+    """Return whether the path is a pipe that the shell has opened for this process: `<(...)`, or standard input."""
+    return str(path).startswith(_OPEN_FILES) and stat.S_ISFIFO(_mode_or_zero(path))
 
 
 def is_folder(path: Path) -> bool:

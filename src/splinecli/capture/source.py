@@ -13,7 +13,7 @@ from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.header import stated_white_level
-from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.lights.lamp_files import LampFiles
@@ -143,8 +143,7 @@ class CaptureSource:
 
         def read(index: int) -> NDArray[np.float32]:
             path = self.files.images[index]
-            stored = decode_image(path)
-            check_size(stored.shape, mask.shape, path, like=self.files.images[0].name)
+            stored = decode_image(path, ExpectedSize(mask.shape, self.files.images[0].name))
             return self._colours(linearise, stored[mask], index)
 
         return read
@@ -157,14 +156,14 @@ class CaptureSource:
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
-        linearise = None
+        linearise, expected = None, None
         for index, path in enumerate(self.files.images):
-            stored = decode_image(path)
+            stored = decode_image(path, expected)
             if linearise is None:
                 shape = stored.shape[:2]
+                expected = ExpectedSize(shape, path.name)
                 linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
                 total = np.zeros(shape[0] * shape[1], np.float32)
-            check_size(stored.shape, shape, path, like=self.files.images[0].name)
             total += self._colours(linearise, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
             if progress is not None:
                 progress()
@@ -199,13 +198,13 @@ class CaptureSource:
     ) -> Iterator[StoredPixels]:
         """Yield the mask's pixels under these lights; `first` is the first image, decoded."""
         linearise = Lineariser(self.radiometry, mask, len(self.files.images))
+        expected = ExpectedSize(mask.shape, self.files.images[indices[0]].name)
         stored: NDArray[Any] | None = first
         del first
         for index in indices:
             path = self.files.images[index]
             if stored is None:
-                stored = decode_image(path)
-            check_size(stored.shape, mask.shape, path, like=self.files.images[indices[0]].name)
+                stored = decode_image(path, expected)
             pixels = stored[mask]
             stored = None  # free this image before the next one is decoded
             linear, intensity = linearise(pixels, path, index), self.light_intensities[index]

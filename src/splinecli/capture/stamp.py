@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from splinecli.capture.formats.text import read_text
+from splinecli.capture.paths import is_substitution
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 from splinecli.files import file_sha256
@@ -40,6 +42,8 @@ def digest(stamp: list[Any]) -> str:
 
 def _sha256(path: Path) -> str:
     try:
+        if is_substitution(path):
+            return hashlib.sha256(read_text(path)).hexdigest()
         return file_sha256(path)
     except OSError as error:
         raise _unreadable(path, error) from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from splinecli.cli.choices import fill_in
 from splinecli.cli.failures import ParserError, print_error_document
 from splinecli.cli.panels import sort_into_panels
+from splinecli.memory import check_address_space
 
 TERM_WIDTH = 30
 """Columns of the names of options in the help; a longer name has a line of its own."""
@@ -50,7 +52,8 @@ class Command(TyperCommand):
         """Run the command. A shell expands `~` in `-o ~/x`, but not in `--output=~/x`."""
         ctx.params = {name: _expand(value) for name, value in ctx.params.items()}
         try:
-            return super().invoke(ctx)
+            check_address_space()
+            return _without_end_of_file(super().invoke, ctx)
         except Exception as error:
             # infer prints its list itself, with what it has done until then.
             if (
@@ -76,6 +79,14 @@ class Command(TyperCommand):
             with formatter.section(title):
                 # All panels have their texts in one column.
                 formatter.write_dl([(term.ljust(longest), meaning) for term, meaning in rows], TERM_WIDTH)
+
+
+def _without_end_of_file(invoke: Callable[[Any], Any], ctx: Any) -> Any:
+    """Call `invoke(ctx)`. An EOFError becomes a defect, because click takes it for an interruption by the user."""
+    try:
+        return invoke(ctx)
+    except EOFError as error:
+        raise RuntimeError("unexpected end of a file") from error
 
 
 class Group(TyperGroup):

@@ -9,18 +9,26 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from splinecli.errors import printable
 from splinecli.pipeline.observer import Advance, Observer
 
 LINE_SECONDS = 30.0
 """Seconds between two lines of progress where stderr is not a terminal."""
 
 
-def print_report(report: dict[str, Any], text: str, *, as_json: bool, quiet: bool) -> None:
-    """Print a report on stdout: as JSON, or its text unless `quiet` or empty."""
+def print_report(report: dict[str, Any], *lines: str, as_json: bool, quiet: bool) -> None:
+    """Print a report on stdout: as JSON, or as lines of text unless `quiet`."""
     if as_json:
         print(json.dumps(report, indent=2))
-    elif text and not quiet:
-        print(text)
+    elif not quiet:
+        for line in lines:
+            print(printable(line))
+
+
+def print_lines(text: str) -> None:
+    """Print a text of several lines on stderr, such as a traceback."""
+    for line in text.rstrip("\n").split("\n"):
+        print(printable(line), file=sys.stderr)
 
 
 class Messages(Observer):
@@ -35,7 +43,7 @@ class Messages(Observer):
     def say(self, message: str) -> None:
         """Print a line."""
         if not self.quiet:
-            print(message, file=sys.stderr)
+            print(printable(message), file=sys.stderr)
 
     def warn(self, message: str) -> None:
         """Print a line that begins with "splinecli: warning:"."""
@@ -43,7 +51,7 @@ class Messages(Observer):
 
     def error(self, message: str) -> None:
         """Print a line that begins with "splinecli:", with `quiet` as well."""
-        print(f"splinecli: {message}", file=sys.stderr)
+        print(f"splinecli: {printable(message)}", file=sys.stderr)
 
     def table(self, rows: Sequence[Sequence[str]]) -> None:
         """Print a table: a header row, then rows of a name and numbers."""
@@ -57,7 +65,7 @@ class Messages(Observer):
         for position, name in enumerate(header):
             table.add_column(name, justify="right" if position else "left")
         for row in body:
-            table.add_row(*row)
+            table.add_row(*(printable(cell) for cell in row))
         Console(stderr=True, markup=False, highlight=False).print(table)
 
     @contextmanager
@@ -98,7 +106,7 @@ def _bar(label: str, total: float, start: float) -> Iterator[Advance]:
         TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(label, total=total, note="")
+        task = bar.add_task(printable(label), total=total, note="")
         bar.update(task, completed=start)
 
         def advance(amount: float, note: str = "") -> None:

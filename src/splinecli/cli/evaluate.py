@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splinecli.cli.console import Messages
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import Device, Precision, parse_light_count, parse_pixel, parse_skip
+from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ def evaluate(
     light_error_deg: float | None = inputs.LIGHT_ERROR,
     as_stored: bool = inputs.AS_STORED,
     white_level: float | None = inputs.WHITE_LEVEL,
+    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
+    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     max_pixels: int | None = inputs.MAX_PIXELS,
     skip_first: list[str] | None = inputs.SKIP_FIRST,
     rotations: int | None = computing.ROTATIONS,
@@ -55,6 +57,7 @@ def evaluate(
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
     from splinecli.pipeline.evaluate import EvaluateOptions, evaluate_captures
 
+    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
     options = EvaluateOptions(
         methods=tuple(
             name
@@ -93,9 +96,9 @@ def evaluate(
 def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
     """Print what went wrong, warnings and notes on stderr."""
     for entry in outcome.document["skipped"]:
-        print(f"splinecli: {entry['capture']} was skipped: {entry['reason']}", file=sys.stderr)
+        talk.error(f"{entry['capture']} was skipped: {entry['reason']}")
     for problem in outcome.figure_problems:
-        print(f"splinecli: no figure: {problem}", file=sys.stderr)
+        talk.error(f"no figure: {problem}")
     for warning in outcome.warnings:
         talk.warn(warning)
     for note in outcome.document["notes"]:

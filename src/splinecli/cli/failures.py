@@ -9,8 +9,10 @@ import typer
 
 from splinecli.cli.usage_errors import usage_message
 from splinecli.errors import OutputError, SplinecliError
+from splinecli.memory import is_out_of_memory
 
 USAGE = 2
+NO_MEMORY = "there is not enough memory. Close other programs, use smaller images, or lower --batch-size."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
 ParserError: type[Exception] = typer.BadParameter.__mro__[1]
 """What the parser raises for arguments that it cannot use."""
@@ -22,6 +24,8 @@ def explain(error: Exception) -> tuple[str, int]:
         return str(error), error.exit_code
     if isinstance(error, ParserError):
         return usage_message(error), USAGE
+    if is_out_of_memory(error):
+        return NO_MEMORY, SplinecliError.exit_code
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code
@@ -30,7 +34,7 @@ def explain(error: Exception) -> tuple[str, int]:
 
 def is_defect(error: Exception) -> bool:
     """Return whether splinecli did not expect the error."""
-    return not isinstance(error, SplinecliError | ParserError | OSError)
+    return not isinstance(error, SplinecliError | ParserError | OSError) and not is_out_of_memory(error)
 
 
 def error_document(error: Exception) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splinecli.cli.options import outputs, training
-from splinecli.errors import OutputError
+from splinecli.errors import OutputError, printable
 
 
 def import_weights(
@@ -32,4 +32,4 @@ def import_weights(
 
     save_weights(import_official(li_net, ne_net), output)
     if not quiet:
-        print(output)
+        print(printable(output))

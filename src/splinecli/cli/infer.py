@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.cli import choices
-from splinecli.cli.console import Messages
+from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.failures import batch_error_document
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import (
@@ -22,7 +21,8 @@ from splinecli.cli.options.values import (
     parse_indices,
     split_commas,
 )
-from splinecli.errors import UsageError
+from splinecli.cli.reading_limits import limit_reading
+from splinecli.errors import UsageError, printable
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome, Redo
@@ -60,6 +60,8 @@ def infer(
     light_frame: str | None = inputs.LIGHT_FRAME,
     lights_format: LightForm = inputs.LIGHTS_FORMAT,
     as_stored: bool = inputs.AS_STORED,
+    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
+    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     output: Path = outputs.INFER_FOLDER,
     method: str = computing.METHOD,
     weights: str | None = computing.WEIGHTS,
@@ -96,6 +98,7 @@ def infer(
     with _json_documents(as_json) as documents:
         if overwrite and update:
             raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
+        limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
         options = InferOptions(
             lights=_text(lights),
             intensities=_text(intensities),
@@ -187,11 +190,13 @@ def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: b
     """Print what became of a capture. Failures are printed even with --quiet."""
     if outcome.status == "done":
         if with_summary:
-            print(_summary(outcome.report, output))
+            print(printable(_summary(outcome.report, output)))
     elif outcome.status == "skipped":
         messages.say(f"{output / outcome.capture}: already done, skipped")
     else:
-        print(f"{outcome.trace}splinecli: {outcome.report['error']}", file=sys.stderr)
+        if outcome.trace:
+            print_lines(outcome.trace)
+        messages.error(outcome.report["error"])
 
 
 def _show_table(outcomes: Sequence[Outcome], output: Path, messages: Messages) -> None:

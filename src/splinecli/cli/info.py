@@ -8,6 +8,7 @@ from splinecli.capture.lights.lamp_files import LampOptions
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.cli.options.values import LightForm
+from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import InputError
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
@@ -30,6 +31,8 @@ def info(
     light_frame: str | None = inputs.LIGHT_FRAME,
     lights_format: LightForm = inputs.LIGHTS_FORMAT,
     check_lights: bool = inputs.CHECK_LIGHTS,
+    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
+    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     plot: Path | None = outputs.LIGHT_PLOT,
     overwrite: bool = outputs.OVERWRITE_PLOT,
     strict: bool = outputs.STRICT,
@@ -43,6 +46,7 @@ def info(
     """
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
 
+    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
     options = InfoOptions(
         capture=capture,
         lights=lights,
@@ -67,6 +71,6 @@ def info(
         check_lights=check_lights,
     )
     report = describe_capture(options, Messages(quiet=quiet))
-    print_report(report, "\n".join(summary_lines(report)), as_json=as_json, quiet=quiet)
+    print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)
     wrong = strict and not PROBABLY_WRONG.isdisjoint(report["warning_codes"])
     return InputError.exit_code if wrong else 0

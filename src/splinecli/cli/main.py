@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -15,9 +14,10 @@ import typer
 
 from splinecli.cli.app import app
 from splinecli.cli.closed_pipes import UntilClosed
+from splinecli.cli.console import print_lines
 from splinecli.cli.failures import explain, is_defect
-
-INTERRUPTED = 130
+from splinecli.cli.signals import INTERRUPTED, end_on_sigterm, ignore_signals
+from splinecli.errors import printable
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -37,11 +37,11 @@ def _run_command(args: Sequence[str] | None) -> int:
         result = command.main(
             args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False
         )
-    except (KeyboardInterrupt, typer.Abort):
+    except KeyboardInterrupt:
         return fail("interrupted.", INTERRUPTED)
     except Exception as error:
         if is_defect(error):
-            traceback.print_exc()
+            print_lines(traceback.format_exc())
         return fail(*explain(error))
     if result == INTERRUPTED:
         return fail("interrupted.", INTERRUPTED)
@@ -50,7 +50,7 @@ def _run_command(args: Sequence[str] | None) -> int:
 
 def fail(message: str, exit_code: int) -> int:
     """Print the message on stderr, in one line, and return the exit code."""
-    print(f"splinecli: {message}", file=sys.stderr)
+    print(f"splinecli: {printable(message)}", file=sys.stderr)
     return exit_code
 
 
@@ -75,9 +75,13 @@ def _let_threads_sleep() -> None:
 
 
 def run() -> None:
-    """Run the console script. SIGTERM, which job schedulers send, is treated like Ctrl-C."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    code = main()
+    """Run the console script. SIGTERM is treated like Ctrl-C."""
+    try:
+        end_on_sigterm()
+        code = main()
+    except KeyboardInterrupt:  # outside of the command
+        code = fail("interrupted.", INTERRUPTED)
+    ignore_signals()
     if "TORCHELASTIC_RUN_ID" in os.environ:
         # PyTorch's communication threads sometimes abort a process of torchrun after its work is done, and torchrun
         # counts that as a failure. os._exit does not wait for these threads.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 SPEED = ("--device", "--precision", "--batch-size")
+LIMITS = ("--max-pixels-per-image", "--images-elsewhere")
 VALUES = ("--transfer", "--ambient", "--flat-field", "--white-level")
 REFINED = ("--refine-lights", "--light-error-deg")
 LAMPS = ("--light-positions", "--light-distance", "--pixel-size", "--object-width", "--camera-matrix")
@@ -10,7 +11,7 @@ REPEAT = ("--overwrite", "--json", "--quiet")
 
 PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     "infer": {
-        "Input": ("--mask", "--auto-mask", "--ground-truth", *VALUES, "--as-stored"),
+        "Input": ("--mask", "--auto-mask", "--ground-truth", *VALUES, "--as-stored", *LIMITS),
         "Lights": (
             "--lights",
             "--light-frame",
@@ -37,7 +38,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Speed": SPEED,
     },
     "info": {
-        "Input": ("--mask", "--ground-truth", *VALUES),
+        "Input": ("--mask", "--ground-truth", *VALUES, *LIMITS),
         "Lights": (
             "--lights",
             "--light-frame",
@@ -49,24 +50,24 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Output": ("--plot", "--strict", *REPEAT),
     },
     "calibrate": {
-        "Input": ("--circle", "--mask", "--ball-diameter"),
+        "Input": ("--circle", "--mask", "--ball-diameter", "--max-pixels-per-image"),
         "Light intensities": ("--gray-ball", "--gray-card", "--transfer"),
         "Output": ("--output", "--compare", *REPEAT),
     },
     "integrate": {
-        "Input": ("--mask", "--camera-matrix", "--convention", "--colours"),
+        "Input": ("--mask", "--camera-matrix", "--convention", "--colours", "--max-pixels-per-image"),
         "Method": ("--stiffness", "--largest-step"),
         "Output": ("--output", "--format", *REPEAT),
     },
     "evaluate": {
-        "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level"),
+        "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level", *LIMITS),
         "Lights": ("--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg", *REFINED),
         "Method": ("--method", "--weights", "--rotations"),
         "Output": ("--output", "--figures", "--pixel", *REPEAT),
         "Speed": ("--jobs", *SPEED),
     },
     "prepare": {
-        "Input": ("--as-stored", "--update", "--white-level"),
+        "Input": ("--as-stored", "--update", "--white-level", *LIMITS),
         "Scenes": ("--scenes", "--mesh", "--size", "--n-lights", "--measured", "--measured-share", "--seed"),
         "Output": ("--output", *REPEAT),
     },

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs, training
+from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ def prepare(
     sources: list[Path] | None = training.SOURCES,
     as_stored: bool = inputs.AS_STORED,
     white_level: float | None = inputs.WHITE_LEVEL,
+    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
+    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     update: bool = outputs.UPDATE,
     scenes: int = training.SCENES,
     mesh: list[Path] | None = training.MESHES,
@@ -44,6 +47,7 @@ def prepare(
     from splinecli.pipeline.batch import worst_exit_code
     from splinecli.pipeline.prepare import PrepareOptions, prepare_pixel_set
 
+    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
     options = PrepareOptions(
         output=output,
         captures=tuple(folder for source in sources or [] for folder in find_captures(source)),
@@ -53,7 +57,7 @@ def prepare(
         update=update,
     )
     summary = prepare_pixel_set(options, Messages(quiet=quiet))
-    print_report(summary, _in_words(summary), as_json=as_json, quiet=quiet)
+    print_report(summary, *_in_words(summary), as_json=as_json, quiet=quiet)
     return worst_exit_code(capture["exit_code"] for capture in summary["skipped"])
 
 
@@ -79,11 +83,11 @@ def _plan(
     return ScenePlan(config, seed, scenes, tuple(meshes), measured)
 
 
-def _in_words(summary: dict[str, Any]) -> str:
-    """Return the summary as a line, empty for an empty set."""
+def _in_words(summary: dict[str, Any]) -> list[str]:
+    """Return the summary as a line; no line for an empty set."""
     if not summary["entries"]:
-        return ""
-    return (
+        return []
+    return [
         f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes, {summary['n_pixels']} pixels,"
         f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"
-    )
+    ]

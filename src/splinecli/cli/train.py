@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from splinecli.cli.console import Messages
 from splinecli.cli.options import computing, outputs, training
 from splinecli.cli.options.values import Device
-from splinecli.errors import UsageError
+from splinecli.errors import UsageError, printable
 from splinecli.training.defaults import (
     WEIGHTS,
 )
@@ -60,7 +60,7 @@ def train(
     with open_run(settings, output, device.value, resume=resume, tensorboard=tensorboard) as trainer:
         _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
         if not quiet and trainer.workers.leads:
-            print(output / WEIGHTS)
+            print(printable(output / WEIGHTS))
 
 
 def _changes(
@@ -92,7 +92,13 @@ def _run(trainer: Trainer, messages: Messages) -> None:
     if trainer.single_scene_sets:
         names = ", ".join(trainer.single_scene_sets)
         messages.warn(f"{names}: the set has a single scene, so training and validation use the same pixels")
+    if trainer.workers.leads and trainer.log.set_aside:
+        messages.warn(f"metrics.csv was damaged and is now {trainer.log.set_aside}")
     shown = trainer.progress
+    if shown >= 1:
+        messages.say(
+            f"{trainer.folder}: the run is at its end already. Give it more --steps or --minutes to go on."
+        )
     with messages.progress("training", 1.0, start=shown) as advance:
 
         def report(progress: float, metrics: Metrics) -> None:

@@ -20,6 +20,7 @@ SCHEMA = 1
 
 _DEGREE_DIGITS, _SECOND_DIGITS = 4, 4
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _COLUMNS = (
     "method", "capture", "n_lights", "light_noise_deg", "mae_deg", "std_deg", "trials", "seconds", "as_stored",
 )  # fmt: skip
@@ -81,8 +82,14 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(_records(evaluations))
+    for record in _records(evaluations):
+        writer.writerow({name: _as_text_cell(value) for name, value in record.items()})
     return text.getvalue()
+
+
+def _as_text_cell(value: Any) -> Any:
+    """Return a value as a cell that no spreadsheet takes for a formula: an apostrophe marks it as text."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
 def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:

@@ -13,9 +13,10 @@ from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.tables import latex, markdown
-from splinecli.files import refusals_as_output_errors, write_bytes, write_text
+from splinecli.files import write_bytes, write_text
+from splinecli.publishing import new_files
 
-TRIALS, REPORT, FIGURES = "trials.jsonl", "report.html", "figures"
+TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
 
 Plots = Mapping[str, tuple[str, bytes]]
@@ -34,39 +35,34 @@ def make_plots(evaluations: Sequence[Evaluation]) -> Plots:
     return plots
 
 
-def write_results(output: Path, evaluations: Sequence[Evaluation], plots: Plots) -> dict[str, Any]:
-    """Write all files except the figures, and delete plots of an earlier evaluation.
+def write_results(
+    output: Path, evaluations: Sequence[Evaluation], plots: Plots, figures: Sequence[CaptureFigure] | None
+) -> dict[str, Any]:
+    """Write all files in place of those of an earlier evaluation, all or none. The caller holds the folder.
+
+    Args:
+        figures: None leaves the figures of an earlier evaluation.
 
     Returns:
         The content of results.json.
     """
     document = results_document(evaluations)
-    write_text(output / "results.csv", results_csv(evaluations))
-    write_text(output / "table.md", markdown(evaluations))
-    write_text(output / "table.tex", latex(evaluations))
-    for name in (LIGHTS_PLOT, LIGHT_NOISE_PLOT):
-        if name in plots:
-            write_bytes(output / name, plots[name][1])
-        else:
-            with refusals_as_output_errors(output / name):
-                (output / name).unlink(missing_ok=True)
-    write_text(output / REPORT, html_report(evaluations, list(plots.values()), document["notes"]))
-    write_text(output / "results.json", json.dumps(document, indent=2) + "\n")
+    shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
+    texts = {
+        "results.csv": results_csv(evaluations),
+        "table.md": markdown(evaluations),
+        "table.tex": latex(evaluations),
+        REPORT: html_report(evaluations, shown, document["notes"]),
+        RESULTS: json.dumps(document, indent=2) + "\n",
+    }
+    stale = [LIGHTS_PLOT, LIGHT_NOISE_PLOT]
+    if figures is not None:
+        stale += [f"{FIGURES}/{path.name}" for path in (output / FIGURES).glob("*.png")]
+    with new_files(output, report=RESULTS, stale=stale) as stage:
+        for name, text in texts.items():
+            write_text(stage / name, text)
+        for name, (_, png) in plots.items():
+            write_bytes(stage / name, png)
+        for figure in figures or ():
+            write_bytes(stage / FIGURES / f"{figure.stem}.png", figure.png)
     return document
-
-
-def write_figures(
-    output: Path, evaluations: Sequence[Evaluation], plots: Plots, figures: Sequence[CaptureFigure]
-) -> None:
-    """Write the figures and the report that shows them, and delete figures of an earlier evaluation."""
-    folder = output / FIGURES
-    names = {f"{figure.stem}.png" for figure in figures}
-    with refusals_as_output_errors(folder):
-        for path in folder.glob("*.png"):
-            if path.name not in names:
-                path.unlink()
-    for figure in figures:
-        write_bytes(folder / f"{figure.stem}.png", figure.png)
-    shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures)]
-    notes = results_document(evaluations)["notes"]
-    write_text(output / REPORT, html_report(evaluations, shown, notes))

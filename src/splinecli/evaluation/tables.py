@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
+from splinecli.errors import printable
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.protocol import heading, protocol_in_words
 from splinecli.evaluation.statistics import AVERAGE
@@ -30,7 +31,7 @@ _LATEX = str.maketrans(
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
     """Return a header row, then a row for each method: name, MAE on each capture, average; two decimals."""
     mae_deg = {(result.method, result.capture): result.mae_deg for result in evaluation.results}
-    rows = [["method", *evaluation.captures, AVERAGE]]
+    rows = [["method", *(printable(name) for name in evaluation.captures), AVERAGE]]
     for method, average in evaluation.averages.items():
         values = [*(mae_deg[method, capture] for capture in evaluation.captures), average]
         rows.append([method, *(f"{value:.2f}" for value in values)])

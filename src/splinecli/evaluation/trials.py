@@ -13,7 +13,7 @@ from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
 from splinecli.capture.stamp import digest
 from splinecli.evaluation.protocol import Protocol
-from splinecli.files import refusals_as_output_errors
+from splinecli.files import parse_json, refusals_as_output_errors
 from splinecli.methods import Estimator
 
 
@@ -110,7 +110,7 @@ class TrialStore:
         with refusals_as_output_errors(path):
             if fresh:
                 path.unlink(missing_ok=True)
-            content = path.read_text("utf-8", errors="replace") if path.exists() else ""
+            content = path.read_text("utf-8", errors="replace") if path.is_file() else ""
         for line in content.splitlines():
             record = _read_line(line)
             if record is not None:
@@ -149,7 +149,7 @@ def plan_trials(
 
 def _read_line(line: str) -> dict[str, Any] | None:
     try:
-        record = json.loads(line)
+        record = parse_json(line)
         numbers, estimated = (record["mae_deg"], record["seconds"]), record["estimated_intensities"]
     except (ValueError, TypeError, KeyError):
         return None

@@ -109,6 +109,8 @@ class NetworkConfig:
 
 def _fits(names: Any) -> tuple[str, ...]:
     known = ", ".join(STARTING_FITS)
-    if not isinstance(names, list | tuple) or not all(name in STARTING_FITS for name in names):
+    if not isinstance(names, list | tuple) or not all(
+        isinstance(name, str) and name in STARTING_FITS for name in names
+    ):
         raise ModelError(f"network setting 'fits' is {names!r}; expected a list of {known}")
     return tuple(names)

@@ -21,7 +21,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from splinecli.errors import ModelError
+from splinecli.capture.paths import check_file
+from splinecli.errors import InputError, ModelError
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_strictly
@@ -148,9 +149,12 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     """Read the tensors of a file that torch.save wrote. Only tensors and plain containers are unpickled."""
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:
+        check_file(path, "a checkpoint")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the errors below cover what PyTorch warns of
             state = torch.load(path, map_location="cpu", weights_only=True)
+    except InputError as error:
+        raise ModelError(error.problem, path=path, hint=hint) from error
     except OSError as error:
         raise ModelError(f"cannot be read ({error.strerror or error})", path=path, hint=hint) from error
     except Exception as error:  # damaged pickles raise many kinds of errors

@@ -15,11 +15,12 @@ from safetensors.torch import save
 from torch import Tensor
 
 from splinecli.errors import ModelError
-from splinecli.files import file_sha256, write_bytes
+from splinecli.files import file_sha256, parse_json, write_bytes
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 
 FORMAT = "splinecli-weights-1"
+_LENGTH_BYTES = 8  # of the number at the start of a safetensors file, the length of its header
 SHIPPED = resources.files("splinecli") / "assets"
 
 
@@ -48,6 +49,20 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
+def serialise(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
+    """Return the bytes of a safetensors file, the same ones for the same content.
+
+    The library writes the metadata in a random order.
+    """
+    content = save(tensors, metadata)
+    length = int.from_bytes(content[:_LENGTH_BYTES], "little")
+    header = json.loads(content[_LENGTH_BYTES : _LENGTH_BYTES + length])
+    header["__metadata__"] = dict(sorted(metadata.items()))
+    ordered = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    ordered += b" " * (-len(ordered) % _LENGTH_BYTES)  # tensors start at a multiple of 8 bytes
+    return len(ordered).to_bytes(_LENGTH_BYTES, "little") + ordered + content[_LENGTH_BYTES + length :]
+
+
 def save_weights(network: SplineNet, path: Path) -> None:
     """Write the parameters of a network as float16, with its configuration. Raises OutputError."""
     tensors = {
@@ -59,7 +74,7 @@ def save_weights(network: SplineNet, path: Path) -> None:
         "config": json.dumps(network.config.to_dict(), sort_keys=True),
         "tensors_sha256": tensors_sha256(tensors),
     }
-    write_bytes(path, save(tensors, metadata))
+    write_bytes(path, serialise(tensors, metadata))
 
 
 def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -95,8 +110,8 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
 def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str, Any]:
     """Return the JSON object under a key of a file's metadata. The checksum does not cover it. Raises ModelError."""
     try:
-        values = json.loads(metadata.get(key, ""))
-    except json.JSONDecodeError as error:
+        values = parse_json(metadata.get(key, ""))
+    except ValueError as error:
         raise ModelError(f"the entry {key!r} in the file is not JSON", path=path) from error
     if not isinstance(values, dict):
         raise ModelError(f"the entry {key!r} in the file is not a JSON object", path=path)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
+from splinecli.memory import is_out_of_memory
 from splinecli.pipeline.finished import find_earlier
 from splinecli.pipeline.infer import infer_capture, make_method
 from splinecli.pipeline.infer_options import InferOptions
@@ -82,7 +83,7 @@ def infer_batch(
     outcomes = []
     for folder, name in zip(folders, names, strict=True):
         try:
-            outcome = missing.get(folder) or _earlier_outcome(folder, name, options, redo)
+            outcome = missing.get(folder) or _earlier_outcome(folder, name, options, observer, redo)
         except Exception as error:
             outcome = _failure(name, folder, error)
         if outcome is None:
@@ -165,15 +166,19 @@ def _check_names(names: Mapping[Path, str]) -> None:
             )
 
 
-def _earlier_outcome(folder: Path, name: str, options: InferOptions, redo: Redo) -> Outcome | None:
+def _earlier_outcome(
+    folder: Path, name: str, options: InferOptions, observer: Observer, redo: Redo
+) -> Outcome | None:
     """Return the outcome of a capture that is not to be computed, or None."""
     from splinecli.files import check_writable
+    from splinecli.publishing import held_folder
 
     target = Path(options.output) / name
     check_writable(target)
     if redo == "all":
         return None
-    earlier = find_earlier(target, folder, options)
+    with held_folder(target, observer.warn):
+        earlier = find_earlier(target, folder, options)
     if earlier.report is not None:
         return Outcome(name, "skipped", earlier.report)
     if not earlier.changed or (redo == "changed" and earlier.ours):
@@ -188,16 +193,21 @@ def _earlier_outcome(folder: Path, name: str, options: InferOptions, redo: Redo)
 
 
 def _failure(name: str, folder: Path, error: Exception) -> Outcome:
-    """Return what became of a capture that failed. Raises OutputError again: it ends the batch."""
-    if isinstance(error, OutputError):
+    """Return what became of a capture that failed. Raises OutputError again, but for BusyError: it ends the batch."""
+    from splinecli.publishing import BusyError
+
+    if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     if isinstance(error, SplinecliError):
         return _failed(name, error)
-    if isinstance(error, OSError):
+    if isinstance(error, OSError) and not is_out_of_memory(error):
         reason = error.strerror or str(error)
         if error.errno in _NO_ROOM:
             raise OutputError(f"cannot be written ({reason})", path=error.filename) from error
         return _failed(name, InputError(f"cannot be read ({reason})", path=error.filename or folder))
+    if is_out_of_memory(error):
+        hint = "Use smaller images, or lower --batch-size"
+        return _failed(name, SplinecliError("there is not enough memory", path=folder, hint=hint))
     defect = SplinecliError(
         f"{name}: {type(error).__name__}: {error}. This is a defect of splinecli",
         hint="Please report it with the lines above",
@@ -212,7 +222,9 @@ def _failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
 def _write_index(outcomes: Sequence[Outcome], output: Path) -> None:
     """Write the page of all captures. Of those that changed it shows the results that were kept."""
     from splinecli.files import write_text
+    from splinecli.publishing import held_folder
     from splinecli.results.index import INDEX, index_page, with_earlier
 
     reports = [outcome.report for outcome in outcomes if outcome.status != "changed"]
-    write_text(output / INDEX, index_page(with_earlier(reports, output)))
+    with held_folder(output, wait=True):
+        write_text(output / INDEX, index_page(with_earlier(reports, output)))

@@ -100,13 +100,21 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         InputError: an image or file cannot be used, or the numbers of images and lights differ.
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
     """
+    from splinecli.files import check_free
+    from splinecli.publishing import held_folder
+
+    with held_folder(options.output, observer.warn):
+        check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
+        return _calibrate_into(options, observer)
+
+
+def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, Any]:
+    """Do the work of calibrate_lights in the folder of results, which the caller holds."""
     from splinecli.calibration.balls import combine_balls, find_ball_files
     from splinecli.calibration.lamp_positions import triangulate_lamps
     from splinecli.calibration.report import calibration_report, summary_lines
     from splinecli.capture.lights.light_files import read_light_directions
-    from splinecli.files import check_free
 
-    check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
     target = options.gray_ball or options.gray_card
     # A wrong path must not come to light after all images are read.
     target_files = None if target is None else find_ball_files(target)
@@ -164,23 +172,24 @@ def _write(
     lamps: LampPositions | None,
     report: dict[str, Any],
 ) -> None:
-    from splinecli.files import write_bytes, write_text
     from splinecli.pictures.calibration import calibration_picture
     from splinecli.pictures.png import encode_png
+    from splinecli.publishing import new_files
 
-    write_text(folder / DIRECTIONS, _text(lights.directions))
     known = lamps if lamps is not None and lamps.known else None
-    for name, text in (
-        (INTENSITIES, None if intensities is None else _text(intensities)),
-        (POSITIONS, None if known is None else _text(known.positions)),
-        (PIXEL_SIZE, None if known is None else f"{known.pixel_size:.9g}\n"),
-    ):
-        if text is None:
-            (folder / name).unlink(missing_ok=True)  # it would belong to earlier lights
-        else:
-            write_text(folder / name, text)
-    write_bytes(folder / PICTURE, encode_png(calibration_picture(lights.balls)))
-    write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
+    texts = {
+        DIRECTIONS: _text(lights.directions),
+        INTENSITIES: None if intensities is None else _text(intensities),
+        POSITIONS: None if known is None else _text(known.positions),
+        PIXEL_SIZE: None if known is None else f"{known.pixel_size:.9g}\n",
+        REPORT: json.dumps(report, indent=2) + "\n",
+    }
+    # Files that are not written anew would belong to earlier lights. They are removed.
+    with new_files(folder, report=REPORT, stale=OUTPUT_FILES) as stage:
+        for name, text in texts.items():
+            if text is not None:
+                (stage / name).write_text(text, "utf-8")
+        (stage / PICTURE).write_bytes(encode_png(calibration_picture(lights.balls)))
 
 
 def _text(values: NDArray[np.float64]) -> str:

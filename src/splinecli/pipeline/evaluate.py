@@ -15,15 +15,16 @@ from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_li
 from splinecli.devices import count_available_cores
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems
-from splinecli.evaluation.files import TRIALS, make_plots, write_figures, write_results
+from splinecli.evaluation.files import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
-from splinecli.files import check_writable, held_folder
+from splinecli.files import check_writable
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
 from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.publishing import held_folder
 
 DEFAULT_TRIALS = 100
 DEFAULT_LIGHTS = 10
@@ -157,7 +158,7 @@ def evaluate_captures(
     read_draws_file(protocols[0])
     _check_counts(captures, protocols)
     estimators = _make_estimators(options)
-    with held_folder(output):
+    with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(
                 captures,
@@ -168,11 +169,11 @@ def evaluate_captures(
                 on_progress=_follow(advance),
             )
         plots = make_plots(evaluations)
-        document = write_results(output, evaluations, plots)
+        figures: list[CaptureFigure] | None = None
         problems: list[str] = []
         if options.figures:
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
-            write_figures(output, evaluations, plots, figures)
+        document = write_results(output, evaluations, plots, figures)
     return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
 
 

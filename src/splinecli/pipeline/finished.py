@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import SplinecliError
+from splinecli.files import read_json
 from splinecli.pipeline.infer_options import InferOptions
 
 if TYPE_CHECKING:
@@ -36,12 +36,14 @@ class EarlierResults:
 def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierResults:
     """Compare the results in `target` with the capture in `folder` and the options. Raises InputError."""
     from splinecli.results.files import OWN_FILES, REPORT
+    from splinecli.results.index import row_of
 
     try:
-        report = json.loads((target / REPORT).read_text("utf-8"))
+        report = read_json(target / REPORT)
         earlier = InferOptions.from_dict(report["options"])
-        version, stamp, names = report["version"], report["inputs_sha256"], list(report["files"])
-    except (OSError, ValueError, KeyError, TypeError, SplinecliError):
+        version, stamp, names = report["version"], report["inputs_sha256"], [str(n) for n in report["files"]]
+        row_of(report)  # raises if the report is not whole
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, SplinecliError):
         found = next((name for name in OWN_FILES if (target / name).exists()), None)
         if found is None:
             return EarlierResults()

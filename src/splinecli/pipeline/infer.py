@@ -32,8 +32,8 @@ def infer_capture(
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
-    The results go to `options.output`/<capture name>/, where they replace earlier ones. They appear whole or not at
-    all.
+    The results go to `options.output`/<capture name>/, where they replace earlier ones, all or none. Meanwhile no other
+    process may write there.
 
     Args:
         folder: the capture.
@@ -45,8 +45,20 @@ def infer_capture(
         InputError: the capture cannot be read, or with options.strict, its lights or images are probably wrong.
         UsageError: the options do not fit the capture or the method.
         ModelError: the weights cannot be used.
-        OutputError: the results cannot be written.
+        OutputError: the results cannot be written, or another process writes into that folder (BusyError).
     """
+    from splinecli.capture import capture_name
+    from splinecli.publishing import held_folder
+
+    target = Path(options.output) / capture_name(folder)
+    with held_folder(target, observer.warn):
+        return _infer_into(folder, target, options, observer, estimator)
+
+
+def _infer_into(
+    folder: Path, target: Path, options: InferOptions, observer: Observer, estimator: Estimator | None
+) -> dict[str, Any]:
+    """Do the work of infer_capture in the folder of results, which the caller holds."""
     from splinecli.capture.capture_warnings import low_confidence
     from splinecli.inference import estimate_normals
     from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
@@ -87,7 +99,7 @@ def infer_capture(
     return write_estimate(
         estimate,
         report,
-        Path(options.output) / capture.name,
+        target,
         formats=options.formats,
         convention=options.convention,
         more=_further_files(source, estimate, report, options, observer),

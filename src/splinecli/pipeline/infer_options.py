@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import UsageError
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.normals import Convention
 
@@ -160,14 +160,14 @@ class InferOptions:
 
     def check_files(self) -> None:
         """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
+        from splinecli.capture.paths import check_file
         from splinecli.capture.reader import EQUAL
 
         intensities = None if self.intensities == EQUAL else self.intensities
         named = (self.lights, self.light_positions, intensities, self.camera_matrix, self.mask)
         for name in (*named, self.ground_truth, self.ambient):
-            if name is not None and not Path(name).is_file():
-                problem = "is a folder, expected a file" if Path(name).is_dir() else "the file does not exist"
-                raise InputError(problem, path=name)
+            if name is not None:
+                check_file(Path(name), "a file", pipe=name == self.lights)
         self.radiometric_calibration()
 
     def radiometric_calibration(self) -> RadiometricCalibration:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import InputError, UsageError
+from splinecli.files import read_json
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, write_surface
 
@@ -79,14 +80,23 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
         UsageError: the stiffness or the largest step is negative.
     """
+    from splinecli.files import check_free
+    from splinecli.publishing import held_folder
+
+    with held_folder(options.folder, observer.warn):
+        check_free(options.folder, options.files, overwrite=options.overwrite)
+        return _integrate_into(options, observer)
+
+
+def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, Any]:
+    """Do the work of integrate_normal_map in the folder of results, which the caller holds."""
     import numpy as np
 
     from splinecli.capture.lights.lamp_files import read_camera_matrix
-    from splinecli.files import check_free, write_text
+    from splinecli.publishing import new_files
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
 
-    check_free(options.folder, options.files, overwrite=options.overwrite)
     normal_map = _read_normal_map(options)
     mask = np.asarray(normal_map.any(axis=2))
     camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
@@ -104,8 +114,9 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
     report = _report(options, depth, mesh, perspective=camera_matrix is not None)
     report["seconds"] = round(time.perf_counter() - started, 3)
     report["files"] = list(options.files)
-    write_surface(options.folder, depth, mesh, options.formats)
-    write_text(options.folder / SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
+    with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as stage:
+        write_surface(stage, depth, mesh, options.formats)
+        (stage / SURFACE_REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     return report
 
 
@@ -133,6 +144,15 @@ def _report(
         "n_triangles": len(mesh.triangles),
         "stiffness": options.stiffness,
     }
+
+
+def _earlier_files(folder: Path) -> list[str]:
+    """Return the files of a surface that an earlier `integrate` wrote into the folder. Those of `infer` stay."""
+    try:
+        named = read_json(folder / SURFACE_REPORT)["files"]
+        return [name for name in SURFACE_FILES.values() if name in named]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
@@ -165,8 +185,15 @@ def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
 
 
 def _find_normal_map(folder: Path) -> Path:
+    from splinecli.publishing import is_unfinished
     from splinecli.results.files import NORMALS
 
+    if is_unfinished(folder):
+        raise InputError(
+            "holds new files of an interrupted run, which are not all in their places",
+            path=folder,
+            hint="Run the same 'splinecli infer' again, which finishes this",
+        )
     names = [NORMALS[name] for name in INPUT_FORMATS]
     for name in names:
         if (folder / name).is_file():
@@ -183,7 +210,7 @@ def _was_written_as_directx(path: Path) -> bool:
     from splinecli.results.files import REPORT
 
     try:
-        report = json.loads((path.parent / REPORT).read_text("utf-8"))
+        report = read_json(path.parent / REPORT)
         return path.suffix == ".png" and report["options"]["convention"] == "directx"
     except (OSError, ValueError, KeyError, TypeError):
         return False
@@ -194,10 +221,9 @@ def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     import numpy as np
 
     from splinecli.capture import read_image
-    from splinecli.capture.formats.image_size import check_size
+    from splinecli.capture.formats.image_size import ExpectedSize
 
-    image = read_image(path)
-    check_size(image.shape, shape, path, like="the normal map")
+    image = read_image(path, ExpectedSize(shape, "the normal map"))
     rgb = np.broadcast_to(image, (*shape, 3))
     colours: NDArray[np.uint8] = np.rint(255 * rgb.clip(0, 1)).astype(np.uint8)
     return colours

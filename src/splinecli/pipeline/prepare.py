@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.files import check_writable, held_folder, write_bytes
+from splinecli.files import check_writable, write_bytes
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.observer import SILENT, Advance, Observer
@@ -15,6 +15,7 @@ from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name
 from splinecli.pixel_sets.rendered import ScenePlan, add_scene
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.publishing import held_folder
 
 CONTACT_SHEET = "contact_sheet.png"
 
@@ -64,7 +65,7 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     """
     check_writable(options.output)
     options.scenes.check_inputs()
-    with held_folder(options.output):
+    with held_folder(options.output, observer.warn):
         writer = PixelSetWriter(options.output)
         options.scenes.check_set(writer)
         captures = name_captures(options.captures, writer)
@@ -73,8 +74,9 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
             _add_scenes(writer, options.scenes, observer, advance)
         if not len(writer):
             return _summary(PixelSet(options.output, ()), skipped)
+        # Before the set counts as finished, so that a finished set has its own overview.
+        write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
         pixel_set = writer.finish()
-        write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(pixel_set)))
     return _summary(pixel_set, skipped)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
-from splinecli.files import file_sha256
+from splinecli.files import file_sha256, read_json
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"
@@ -105,7 +105,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of a set, finished or not. Raises InputError."""
     path = folder / MANIFEST
     try:
-        manifest: Any = json.loads(path.read_text("utf-8"))
+        manifest: Any = read_json(path)
     except OSError as error:
         raise InputError(
             f"not a pixel set: its {MANIFEST} cannot be read ({error.strerror})",
@@ -170,6 +170,6 @@ def _load(folder: Path) -> Pixels:
         try:
             # As plain arrays, because slicing an np.memmap object takes ten times as long.
             arrays.append(np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, EOFError) as error:
             raise InputError(f"cannot be read as an array ({error})", path=path) from error
     return Pixels(*arrays)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,14 +11,7 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.files import (
-    LOCK,
-    check_writable,
-    current_umask,
-    file_sha256,
-    refusals_as_output_errors,
-    write_text,
-)
+from splinecli.files import check_writable, file_sha256, write_text
 from splinecli.pixel_sets.store import (
     ARRAYS,
     FORMAT,
@@ -31,14 +22,13 @@ from splinecli.pixel_sets.store import (
     parse_entries,
     read_manifest,
 )
-
-_TEMPORARY = ".unfinished-"
+from splinecli.publishing import LOCK, new_files
 
 
 class PixelSetWriter:
     """Writes a new set, or adds entries to an existing one, finished or not.
 
-    An entry is written to a temporary folder, renamed, and only then named in the manifest.
+    An entry and the manifest that names it replace earlier ones together (see new_files).
     """
 
     def __init__(self, folder: Path) -> None:
@@ -56,15 +46,18 @@ class PixelSetWriter:
         elif folder.is_dir() and any(path.name != LOCK for path in folder.iterdir()):
             raise OutputError("has files in it but is not a pixel set", path=folder, hint="Choose another -o")
         else:
-            self._write_manifest(complete=False)
-        for unfinished in folder.glob(f"{_TEMPORARY}*"):  # left by a process that was killed
-            shutil.rmtree(unfinished, ignore_errors=True)
+            write_text(folder / MANIFEST, _manifest({}, complete=False))
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
+
+    @property
+    def pixel_set(self) -> PixelSet:
+        """The set with its entries so far."""
+        return PixelSet(self.folder, tuple(self._entries.values()))
 
     def recipe_of(self, name: str) -> dict[str, Any]:
         """Return the recipe of an entry of the set."""
@@ -93,41 +86,33 @@ class PixelSetWriter:
         Raises:
             OutputError: it cannot be written. The set is then as it was before.
         """
-        folder = self.folder / name
-        with (
-            refusals_as_output_errors(folder),
-            tempfile.TemporaryDirectory(prefix=_TEMPORARY, dir=self.folder) as temporary,
-        ):
-            work = Path(temporary) / "entry"
+        n_pixels, n_lights = pixels.observations.shape
+        with new_files(self.folder, report=MANIFEST) as stage:
+            work = stage / name
             work.mkdir()
             for array in ARRAYS:
                 np.save(work / f"{array}.npy", getattr(pixels, array), allow_pickle=False)
             checksums = {array: file_sha256(work / f"{array}.npy") for array in ARRAYS}
-            work.chmod(0o777 & ~current_umask())
-            if self._entries.pop(name, None):
-                # Remove the earlier entry from the manifest before its files are replaced.
-                self._write_manifest(complete=False)
-            if folder.exists():
-                shutil.rmtree(folder)
-            work.rename(folder)
-        n_pixels, n_lights = pixels.observations.shape
-        self._entries[name] = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
-        self._write_manifest(complete=False)
+            entry = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
+            entries = {**self._entries, name: entry}
+            write_text(stage / MANIFEST, _manifest(entries, complete=False))
+        self._entries = entries
 
     def finish(self) -> PixelSet:
         """Mark the set as finished and return it. Raises OutputError."""
-        self._write_manifest(complete=True)
-        return PixelSet(self.folder, tuple(self._entries.values()))
+        write_text(self.folder / MANIFEST, _manifest(self._entries, complete=True))
+        return self.pixel_set
 
-    def _write_manifest(self, *, complete: bool) -> None:
-        manifest = {
-            "format": FORMAT,
-            "version": __version__,
-            "complete": complete,
-            "n_pixels": sum(entry.n_pixels for entry in self._entries.values()),
-            "entries": [asdict(entry) for entry in self._entries.values()],
-        }
-        write_text(self.folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+
+def _manifest(entries: dict[str, Entry], *, complete: bool) -> str:
+    manifest = {
+        "format": FORMAT,
+        "version": __version__,
+        "complete": complete,
+        "n_pixels": sum(entry.n_pixels for entry in entries.values()),
+        "entries": [asdict(entry) for entry in entries.values()],
+    }
+    return json.dumps(manifest, indent=1) + "\n"
 
 
 def _plain(recipe: dict[str, Any]) -> dict[str, Any]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.files import current_umask, refusals_as_output_errors
 from splinecli.inference import NormalEstimate
 from splinecli.normals import Convention, encode_picture
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
+from splinecli.publishing import new_files
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT
 
 NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
@@ -58,13 +56,12 @@ def write_estimate(
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report.
 
-    The files replace those of an earlier run in the folder. They are first written into a temporary folder beside it,
-    so that a failure or Ctrl-C leaves the earlier files as they were.
+    The files replace those of an earlier run in the folder, all or none. The caller holds the folder (see held_folder).
 
     Args:
         estimate: the result.
         report: what report_of returned.
-        folder: the capture's folder of results; it need not exist.
+        folder: the capture's folder of results.
         formats: keys of NORMALS.
         convention: whether green is y up or y down in pictures of normals.
         more: functions that write further files of OWN_FILES into a folder, such as write_albedo.
@@ -73,24 +70,19 @@ def write_estimate(
         OutputError: a file cannot be written.
     """
     started = time.perf_counter()
-    with refusals_as_output_errors(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        try:
-            for form in formats:
-                write_normals(estimate, form, stage / NORMALS[form], convention)
-            if estimate.error_map_deg is not None:
-                write_error_map(estimate.error_map_deg, stage)
-            for write in more:
-                write(stage)
-            files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
-            seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
-            report = {**report, "seconds": seconds, "files": files}
-            (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
-            _publish(stage, folder)
-        finally:
-            # This also runs on Ctrl-C.
-            shutil.rmtree(stage, ignore_errors=True)
+    # The user may have edited the mask of an earlier run and passed it to this run: keep it.
+    stale = [name for name in OWN_FILES if name != FOUND_MASK]
+    with new_files(folder, report=REPORT, stale=stale) as stage:
+        for form in formats:
+            write_normals(estimate, form, stage / NORMALS[form], convention)
+        if estimate.error_map_deg is not None:
+            write_error_map(estimate.error_map_deg, stage)
+        for write in more:
+            write(stage)
+        files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
+        seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
+        report = {**report, "seconds": seconds, "files": files}
+        (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     return report
 
 
@@ -136,28 +128,3 @@ def write_preview(estimate: NormalEstimate, folder: Path) -> None:
     """Write a shaded picture of the surface."""
     picture = preview_picture(estimate.normal_map, estimate.capture.mask)
     (folder / PREVIEW).write_bytes(encode_png(picture))
-
-
-def _publish(stage: Path, folder: Path) -> None:
-    """Move the files from `stage` to `folder`. If that fails, put back the files of the earlier run."""
-    if not folder.exists():
-        stage.chmod(0o777 & ~current_umask())
-        stage.rename(folder)
-        return
-    new = [path.name for path in stage.iterdir()]
-    earlier = stage / "earlier"
-    earlier.mkdir()
-    try:
-        for name in OWN_FILES:
-            # The user may have edited the mask of an earlier run and passed it to this run: keep it.
-            if (folder / name).exists() and (name != FOUND_MASK or name in new):
-                (folder / name).replace(earlier / name)
-        for name in new:
-            (stage / name).replace(folder / name)
-    except BaseException:
-        for name in new:
-            if not (stage / name).exists():
-                (folder / name).unlink()
-        for path in earlier.iterdir():
-            path.replace(folder / path.name)
-        raise

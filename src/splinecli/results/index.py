@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from splinecli.errors import OutputError
+from splinecli.files import read_json
 from splinecli.results.files import NORMALS, PAGE, REPORT
 from splinecli.results.templates import render
 
@@ -73,7 +73,7 @@ def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Map
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
         try:
-            report = json.loads(path.read_text("utf-8"))
+            report = read_json(path)
             row_of(report)  # raises if this is not a report
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
@@ -85,7 +85,7 @@ def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Map
 def has_index(folder: Path) -> bool:
     """Return whether the folder has an index.html that splinecli wrote."""
     try:
-        return _OURS in (folder / INDEX).read_bytes()
+        return (folder / INDEX).is_file() and _OURS in (folder / INDEX).read_bytes()
     except OSError:
         return False
 

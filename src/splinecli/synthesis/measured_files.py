@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.synthesis.measured import MeasuredLibrary, evaluate, half_and_difference
 
@@ -137,13 +138,10 @@ def _evaluate_all(
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    check_file(path, "an .npz file of measured materials")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {key: archive[key] for key in ("names", *_LAYERS) if key in archive.files}
-    except FileNotFoundError:
-        raise InputError("the file does not exist", path=path) from None
-    except IsADirectoryError:
-        raise InputError("found a folder, expected an .npz file of measured materials", path=path) from None
     except Exception:  # damaged archives and array headers raise many kinds of errors
         raise InputError("not an .npz file of plain arrays, or damaged", path=path) from None
 

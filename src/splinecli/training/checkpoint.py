@@ -11,13 +11,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from splinecli.errors import ModelError
 from splinecli.files import write_bytes
 from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, tensors_sha256
+from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, serialise, tensors_sha256
 from splinecli.training.config import TrainingConfig
 
 FORMAT = "splinecli-checkpoint-2"
@@ -72,7 +71,7 @@ def save_checkpoint(
         "sets": json.dumps(sets),
         "tensors_sha256": tensors_sha256(plain),
     }
-    write_bytes(path, save(plain, metadata))
+    write_bytes(path, serialise(plain, metadata))
 
 
 def read_checkpoint_config(path: Path) -> TrainingConfig:
@@ -109,13 +108,14 @@ def load_checkpoint(
     load_strictly(network, groups["network"], path)
     load_strictly(average, groups["average"], path)
     states: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in groups["optimizer"].items():
-        index, _, key = name.partition(".")
-        states.setdefault(int(index), {})[key] = tensor
-    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
     try:
-        return RunCounters(**read_json_entry(metadata, _COUNTERS_KEY, path))
-    except TypeError as error:
+        for name, tensor in groups["optimizer"].items():
+            index, _, key = name.partition(".")
+            states.setdefault(int(index), {})[key] = tensor
+        optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+        counters = RunCounters(**read_json_entry(metadata, _COUNTERS_KEY, path))
+        return RunCounters(int(counters.step), int(counters.pixels), float(counters.seconds))
+    except (TypeError, ValueError, KeyError) as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
 
 

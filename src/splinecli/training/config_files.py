@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splinecli.errors import ModelError, UsageError
+from splinecli.capture.formats.text import read_lines
+from splinecli.errors import InputError, ModelError, UsageError
+from splinecli.files import parse_json
 from splinecli.networks.weights import shipped_names
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 from splinecli.training.defaults import DEFAULT_PRESET
@@ -24,11 +25,13 @@ Settings = dict[str, Any]
 def read_config_file(path: Path) -> Settings:
     """Read the settings of a TOML file or of a run's config.json. Raises ModelError."""
     try:
-        text = path.read_text("utf-8")
-        values: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise ModelError(f"cannot be read ({error.strerror})", path=path) from error
-    except ValueError as error:  # raised by both decoders, and for text that is not UTF-8
+        text = "\n".join(read_lines(path))
+        values: Any = parse_json(text) if path.suffix == ".json" else tomllib.loads(text)
+    except InputError as error:
+        raise ModelError(error.problem, path=path, hint=error.hint) from error
+    except RecursionError:
+        raise ModelError("is nested too deeply", path=path) from None
+    except ValueError as error:  # raised by both decoders
         raise ModelError(
             f"is not {'JSON' if path.suffix == '.json' else 'TOML'} ({error})", path=path
         ) from error
@@ -51,7 +54,7 @@ def parse_parameter(text: str) -> Settings:
         raise UsageError(f"--param is {text!r}; expected NAME=VALUE such as pixels.wall_share=0.3")
     try:
         parsed: Any = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         parsed = value.strip()
     for key in reversed(keys):
         parsed = {key: parsed}

@@ -148,20 +148,15 @@ class Trainer:
         return min(1.0, self.counters.step / self.config.steps)
 
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
-        """Train to the end, save on the way, and return the last metrics on the leader.
+        """Train to the end, save on the way, and return the last metrics on the leader. A run at its end stays.
 
         Args:
             report: called with progress and metrics at each entry of the log.
 
         Raises:
-            ModelError: the loss or its gradient is no longer finite, or the run is at its end already; the
-                last checkpoint stays.
+            ModelError: the loss or its gradient is no longer finite; the last checkpoint stays.
             OutputError: a file cannot be written.
         """
-        if self.progress >= 1:
-            raise ModelError(
-                "the run is at its end already", path=self.folder, hint="Give it more --steps or --minutes"
-            )
         metrics = None
         losses: dict[Part, list[Tensor]] = {}
         count = 0

@@ -59,6 +59,7 @@ class RunLog:
             UsageError: `tensorboard` is set and the package is not installed.
         """
         self.folder = folder
+        self.set_aside = _set_aside_if_damaged(folder / METRICS)
         _drop_lines_after(step, folder / METRICS)
         self._events: Any = _open_events(folder / EVENTS, step) if tensorboard else None
 
@@ -68,7 +69,7 @@ class RunLog:
         try:
             is_new = not path.exists()
             with path.open("a", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, row.keys())
+                writer = csv.DictWriter(file, row.keys(), lineterminator="\n")
                 if is_new:
                     writer.writeheader()
                 writer.writerow({key: f"{x:.6g}" if isinstance(x, float) else x for key, x in row.items()})
@@ -92,10 +93,11 @@ class RunLog:
         write_bytes(self.folder / MAPS, figure)
 
 
-def read_metrics(path: Path) -> list[Metrics]:
-    """Return the lines of a metrics.csv."""
+def read_metrics(path: Path, *, leave_out_last: bool = False) -> list[Metrics]:
+    """Return the lines of a metrics.csv. Raises ValueError, TypeError, KeyError or csv.Error for a damaged one."""
     with path.open(newline="", encoding="utf-8") as file:
-        return [_parse(row) for row in csv.DictReader(file)]
+        rows = list(csv.DictReader(file))
+    return [_parse(row) for row in (rows[:-1] if leave_out_last else rows)]
 
 
 def none_for_nan(value: float) -> float | None:
@@ -106,6 +108,22 @@ def none_for_nan(value: float) -> float | None:
 def _parse(row: dict[str, str]) -> Metrics:
     values: dict[str, Any] = {key: float(value) if value else None for key, value in row.items()}
     return Metrics(**{**values, "step": int(row["step"]), "pixels": int(row["pixels"])})
+
+
+def _set_aside_if_damaged(path: Path) -> Path | None:
+    """Rename a metrics.csv that cannot be read, and return its new path; None where nothing is wrong."""
+    try:
+        if path.exists():
+            if not path.is_file():
+                raise ValueError("it is no file")
+            # A full disk may cut the last line.
+            read_metrics(path, leave_out_last=True)
+        return None
+    except (ValueError, TypeError, KeyError, csv.Error):
+        aside = path.with_suffix(".damaged.csv")
+        with refusals_as_output_errors(aside):
+            path.replace(aside)
+        return aside
 
 
 def _drop_lines_after(step: int, path: Path) -> None:

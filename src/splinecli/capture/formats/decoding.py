@@ -20,13 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.header import stated_size
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
 from splinecli.capture.formats.raw import RAW_SUFFIXES, decode_raw
 from splinecli.capture.formats.tiff import decode_tiff
+from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
+from splinecli.memory import is_out_of_memory
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_START_BYTES = 8  # as many as the longest of these
 
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -38,34 +43,38 @@ _DAMAGE = re.compile(
 _STDERR_LOCK = threading.Lock()
 
 
-def decode_image(path: Path) -> NDArray[Any]:
+def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[Any]:
     """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
 
     The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
     and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
     EXIF orientation is ignored, because all images of a capture share one pixel grid.
 
+    Args:
+        path: the file.
+        expected: the size that the image must have, if it is known. It is compared with the file's header.
+
     Raises:
-        InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy.
+        InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy; or the
+            image has not the expected size, or is too large (see check_stored_size).
     """
-    return decode_with_alpha(path)[0]
+    return decode_with_alpha(path, expected)[0]
 
 
-def decode_with_alpha(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
+def decode_with_alpha(
+    path: Path, expected: ExpectedSize | None = None
+) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
-    data = _read_bytes(path)
-    if data and path.suffix.lower() in RAW_SUFFIXES:
-        pixels = decode_raw(data, path, native_stderr)
-    elif data.startswith(_TIFF):
-        pixels = decode_tiff(path, lambda: _decode_with_opencv(data, path))
-    elif data.startswith(_PNG):
-        _check_png(data, path)
-        pixels = _decode_with_opencv(data, path)
-    elif data.startswith(_JPEG):
-        _check_jpeg(data, path)
-        pixels = _decode_with_opencv(data, path)
-    else:
-        raise InputError("the file is empty" if not data else "found neither PNG, TIFF nor JPEG", path=path)
+    try:
+        pixels = _decode(path, expected)
+    except InputError:
+        raise
+    except Exception as error:  # decoders raise a dozen types for damaged files
+        if is_out_of_memory(error):
+            raise
+        raise damaged(path) from error
+    if expected is not None:
+        expected.check(pixels.shape, path)
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] not in (1, 2, 3, 4):
@@ -83,15 +92,33 @@ def decode_with_alpha(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
     return pixels, None
 
 
-def _read_bytes(path: Path) -> bytes:
+def _decode(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
+    """Return the pixels (H, W) or (H, W, C) of a file of any format, with alpha. The size is checked first."""
+
+    def check(shape: tuple[int, ...], item_bytes: int) -> None:
+        check_stored_size(shape, item_bytes, path, expected)
+
+    check_file(path, "an image")
     try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError("the file does not exist", path=path) from None
-    except IsADirectoryError:
-        raise InputError("found a folder, expected an image", path=path) from None
+        with path.open("rb") as file:
+            start = file.read(_START_BYTES)
+        if start and path.suffix.lower() in RAW_SUFFIXES:
+            return decode_raw(path.read_bytes(), path, native_stderr, check)
+        if start.startswith(_TIFF):
+            return decode_tiff(path, lambda: _decode_with_opencv(path.read_bytes(), path), check)
+        if start.startswith((_PNG, _JPEG)):
+            check(*stated_size(path))
+            data = path.read_bytes()
+            (_check_png if start.startswith(_PNG) else _check_jpeg)(data, path)
+            return _decode_with_opencv(data, path)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    raise InputError("found neither PNG, TIFF nor JPEG" if start else "the file is empty", path=path)
+
+
+def damaged(path: Path) -> InputError:
+    """Return the error for a file that its decoder refuses."""
+    return InputError("the image is damaged and cannot be read", path=path, hint="Copy or export it again")
 
 
 def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
@@ -102,10 +129,12 @@ def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
             pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
+        except cv2.error as error:
+            if error.code == cv2.Error.StsNoMem:
+                raise MemoryError from None
             pixels = None
     if pixels is None or _DAMAGE.search("".join(messages)):
-        raise InputError("the image is damaged and cannot be read", path=path, hint="Copy or export it again")
+        raise damaged(path)
     if pixels.ndim == 3 and pixels.shape[2] == 3:
         return pixels[:, :, ::-1]  # BGR becomes RGB; a view, because copying a large image takes long
     if pixels.ndim == 3 and pixels.shape[2] == 4:

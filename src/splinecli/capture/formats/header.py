@@ -18,6 +18,49 @@ def is_image(content: bytes) -> bool:
     return content.startswith((_PNG, _JPEG, *_TIFF))
 
 
+def stated_size(path: Path) -> tuple[tuple[int, int, int], int]:
+    """Return the shape (H, W, C) that the header of a PNG or JPEG states, and the bytes of each number.
+
+    Raises:
+        InputError: the file ends before, or cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            kind = "PNG" if file.read(len(_PNG)) == _PNG else "JPEG"
+            size = _png_size(file) if kind == "PNG" else _jpeg_size(file)
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    if size is None:
+        raise InputError(f"the {kind} is truncated", path=path, hint="Copy or export it again")
+    return size
+
+
+def _png_size(file: BinaryIO) -> tuple[tuple[int, int, int], int] | None:
+    header = file.read(18)  # length, name and content of IHDR
+    if len(header) < 18 or header[4:8] != b"IHDR":
+        return None
+    width, height = (int.from_bytes(header[place : place + 4], "big") for place in (8, 12))
+    channels = {0: 1, 4: 2, 6: 4}.get(header[17], 3)
+    return (height, width, channels), 2 if header[16] == 16 else 1
+
+
+def _jpeg_size(file: BinaryIO) -> tuple[tuple[int, int, int], int] | None:
+    """Return the size in the header of a JPEG's frame, which stands behind segments of any length."""
+    file.seek(2)
+    while len(start := file.read(2)) == 2 and start[0] == 0xFF:
+        if start[1] == 0xFF:  # fill
+            file.seek(-1, 1)
+            continue
+        segment = file.read(8)
+        if len(segment) < 8:
+            return None
+        if 0xC0 <= start[1] <= 0xCF and start[1] not in (0xC4, 0xC8, 0xCC):
+            height, width = (int.from_bytes(segment[place : place + 2], "big") for place in (3, 5))
+            return (height, width, segment[7]), 1
+        file.seek(int.from_bytes(segment[:2], "big") - 8, 1)
+    return None
+
+
 def is_display_encoded(path: Path) -> bool:
     """Return whether the file says that its values are display-encoded: JPEG, or PNG with a chunk sRGB or gAMA.
 

@@ -1,28 +1,78 @@
-"""The one check, and the one message, for images of different sizes."""
+"""The one check, and the one message, for the sizes of images: before they are decoded, from what their header says.
+
+A few kilobytes may claim gigabytes of pixels, by mistake or by intent.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from splinecli.errors import InputError
+from splinecli.memory import LARGEST_IMAGE, available_memory
+
+_max_pixels = LARGEST_IMAGE
 
 
-def check_size(
-    found: tuple[int, ...], expected: tuple[int, ...], path: Path, *, like: str, what: str = "an image"
-) -> None:
-    """Raise InputError where two pictures differ in height or width.
+@dataclass(frozen=True)
+class ExpectedSize:
+    """The size that an image must have.
 
     Args:
-        found: shape of the picture at `path`, (H, W) or (H, W, C).
-        expected: shape that it should have, (H, W) or (H, W, C).
-        like: where the expected size comes from, such as the name of the first image.
-        what: what the picture is, with its article.
+        shape: (H, W) or (H, W, C).
+        like: where it comes from, such as the name of the first image.
+        what: what the image is, with its article.
     """
-    if found[:2] != expected[:2]:
+
+    shape: tuple[int, ...]
+    like: str
+    what: str = "an image"
+
+    def check(self, found: tuple[int, ...], path: Path) -> None:
+        """Raise InputError where an image (H, W) or (H, W, C) at `path` has another height or width."""
+        if found[:2] != self.shape[:2]:
+            raise InputError(
+                f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in {self.like}",
+                path=path,
+            )
+
+
+def limit_pixels(count: int) -> None:
+    """Set the largest number of pixels of an image for this process."""
+    global _max_pixels
+    _max_pixels = count
+
+
+def check_stored_size(
+    shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
+) -> None:
+    """Raise InputError where an image is not of the expected size, or too large to be read.
+
+    Args:
+        shape: what the file says, (H, W) or (H, W, C).
+        item_bytes: bytes of each number.
+        path: the file.
+        expected: the size that the image must have, if it is known.
+    """
+    if expected is not None:
+        expected.check(shape, path)
+    n_pixels, n_bytes = math.prod(shape[:2]), math.prod(shape) * (item_bytes + 4)  # as stored, and in float32
+    found = f"found an image of {_size(shape)} pixels, which takes {_gigabytes(n_bytes)} of memory"
+    if n_pixels > _max_pixels:
         raise InputError(
-            f"found {what} of {_size(found)} pixels, expected {_size(expected)} as in {like}", path=path
+            f"{found}; expected at most {_max_pixels / 1e6:g} megapixels",
+            path=path,
+            hint="If the size is right, raise --max-pixels-per-image",
         )
+    available = available_memory()
+    if n_bytes > available:
+        raise InputError(f"{found}, but {_gigabytes(available)} are available", path=path)
 
 
 def _size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} x {shape[0]}"
+
+
+def _gigabytes(n_bytes: float) -> str:
+    return f"{n_bytes / 1e9:.1f} GB"

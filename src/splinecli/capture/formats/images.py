@@ -9,21 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image, decode_with_alpha
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
 
 
-def read_image(path: StrPath) -> NDArray[np.float32]:
+def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.float32]:
     """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be linear.
 
     The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1. Floating-point values
     are kept. Alpha is dropped, and an EXIF orientation is ignored.
 
+    Args:
+        path: the file.
+        expected: the size that the image must have, if it is known.
+
     Raises:
-        InputError: the file is missing, of another format, truncated or damaged, or contains floating-point
-            values that are negative or not finite.
+        InputError: see decode_image; also for floating-point values that are negative or not finite.
     """
-    return to_linear(decode_image(Path(path)), Path(path))
+    return to_linear(decode_image(Path(path), expected), Path(path))
 
 
 def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
@@ -52,17 +56,17 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     return values
 
 
-def read_boundary(path: StrPath) -> NDArray[np.bool_]:
+def read_boundary(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.bool_]:
     """Return a mask (H, W) of CyclesPS: true where any channel is above zero; it may be empty.
 
     Raises:
         InputError: the image cannot be read.
     """
-    above: NDArray[np.bool_] = decode_image(Path(path)).max(axis=2) > 0
+    above: NDArray[np.bool_] = decode_image(Path(path), expected).max(axis=2) > 0
     return above
 
 
-def read_mask(path: StrPath) -> NDArray[np.bool_]:
+def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.bool_]:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
     So 0 and 1 serve as well as 0 and 255. If an alpha channel cuts something out, it alone is the mask, because colours
@@ -72,7 +76,7 @@ def read_mask(path: StrPath) -> NDArray[np.bool_]:
         InputError: the image cannot be read, or no pixel is above zero.
     """
     path = Path(path)
-    stored, alpha = decode_with_alpha(path)
+    stored, alpha = decode_with_alpha(path, expected)
     opaque = None if alpha is None else cut_out(alpha)
     if opaque is not None:
         return opaque

@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_with_alpha
-from splinecli.capture.formats.text import read_number_rows
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
+from splinecli.capture.formats.matlab import read_mat
+from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
+from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
+from splinecli.memory import is_out_of_memory
 
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 """Pictures of normals."""
 
-_MAT_KEY = "Normal_gt"
+_LONGEST_NUMBER = 32  # characters of a number in a text, with what separates it from the next
 
 
 class StoredVectors(NamedTuple):
@@ -33,7 +37,7 @@ class StoredVectors(NamedTuple):
     is_picture: bool
 
 
-def read_vectors(path: Path, *, text_shape: tuple[int, int] | None = None) -> StoredVectors:
+def read_vectors(path: Path, expected: ExpectedSize | None = None, *, text: bool = False) -> StoredVectors:
     """Return the vectors of a file of normals.
 
     The suffix decides: .mat and .npy are arrays, .txt is text, all others are pictures. Unsigned integers in a .npy
@@ -41,88 +45,78 @@ def read_vectors(path: Path, *, text_shape: tuple[int, int] | None = None) -> St
     normals of a plane.
 
     Args:
-        text_shape: (H, W), which text files do not state; None to take no text.
+        path: the file.
+        expected: the size that the map must have, if it is known. It is compared before the values are read.
+        text: whether to read text, which does not state its size, so that `expected` must give it.
 
     Raises:
-        InputError: the file cannot be read, or contains no array H x W x 3.
+        InputError: the file cannot be read, contains no array H x W x 3, or has not the expected size.
     """
     alpha = None
     suffix = path.suffix.lower()
+    check_file(path, "a normal map")
     if suffix == ".mat":
-        values = _read_file(path, _read_mat)
+        values = _read_file(path, "the MATLAB file is damaged and cannot be read", read_mat, expected)
     elif suffix == ".npy":
-        values = _read_file(path, _read_npy)
-    elif suffix == ".txt" and text_shape is not None:
-        values = _read_text(path, text_shape)
+        problem = "the .npy file is damaged, or contains no array of numbers"
+        values = _read_file(path, problem, _read_npy, expected)
+    elif suffix == ".txt" and text and expected is not None:
+        values = _read_text(path, expected.shape)
     else:
-        values, alpha = decode_with_alpha(path)
-    if values.ndim != 3 or values.shape[2] != 3:
-        raise InputError(
-            f"found an array of {_times(values.shape)}, expected a normal map, H x W x 3", path=path
-        )
+        values, alpha = decode_with_alpha(path, expected)
+        check_vectors(values.shape, path)
     return StoredVectors(values, alpha, suffix != ".mat" and values.dtype.kind == "u")
 
 
-def _read_file(path: Path, read: Callable[[Any, Path], NDArray[Any]]) -> NDArray[Any]:
-    try:
-        with path.open("rb") as file:
-            return read(file, path)
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-
-
-def _read_mat(file: Any, path: Path) -> NDArray[Any]:
-    from scipy.io import loadmat
-
-    try:
-        variables = loadmat(file)
-    except NotImplementedError:
+def check_vectors(shape: tuple[int, ...], path: Path) -> None:
+    """Raise InputError where an array is not H x W x 3."""
+    if len(shape) != 3 or shape[2] != 3:
         raise InputError(
-            "found a MATLAB 7.3 file, which is not supported",
-            path=path,
-            hint="Save it with MATLAB's option -v7",
-        ) from None
-    except Exception:  # a damaged file causes a dozen types of errors
-        raise InputError("the MATLAB file is damaged and cannot be read", path=path) from None
-    if isinstance(variables.get(_MAT_KEY), np.ndarray):
-        return np.asarray(variables[_MAT_KEY])
-    maps = {
-        name: value
-        for name, value in variables.items()
-        if isinstance(value, np.ndarray) and value.ndim == 3 and value.shape[2] == 3
-    }
-    if len(maps) != 1:
-        found = ", ".join(maps) if maps else "none"
-        raise InputError(
-            f"found no {_MAT_KEY}, and of other H x W x 3 arrays {found}, expected one", path=path
+            f"found an array of {' x '.join(map(str, shape))}, expected a normal map, H x W x 3", path=path
         )
-    return next(iter(maps.values()))
 
 
-def _read_npy(file: Any, path: Path) -> NDArray[Any]:
+def _read_file(
+    path: Path,
+    problem: str,
+    read: Callable[[Path, ExpectedSize | None], NDArray[Any]],
+    expected: ExpectedSize | None,
+) -> NDArray[Any]:
+    """Return what a reader returns. Whatever it raises for a damaged file becomes an InputError."""
     try:
-        # Not np.load, which also opens archives.
-        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
-        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
-    return array
+        return read(path, expected)
+    except InputError:
+        raise
+    except PermissionError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    except Exception as error:  # the readers raise a dozen types
+        if is_out_of_memory(error):
+            raise
+        raise InputError(problem, path=path) from error
 
 
-def _read_text(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _read_npy(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
+    # A map of the file, which reads the header alone. It refuses a file that is shorter than its header says.
+    array = np.lib.format.open_memmap(path, mode="r")
+    check_vectors(array.shape, path)
+    check_stored_size(array.shape, array.dtype.itemsize, path, expected)
+    return np.array(array)
+
+
+def _read_text(path: Path, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    height, width = shape[:2]
+    most = 3 * height * width * _LONGEST_NUMBER + MOST_TEXT
+    check_length(path, most)
     try:
         rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
     except (ValueError, OSError):
         # This reader is slower, but it reads commas and names the line of an error.
-        rows = read_number_rows(path).as_array()
-    expected = (shape[0] * shape[1], 3)
+        rows = read_number_rows(path, most=most).as_array()
+    expected = (height * width, 3)
     if rows.shape != expected:
         raise InputError(
             f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {expected[0]} rows of 3,"
-            f" one for each pixel of {_times(shape)}",
+            f" one for each pixel of {height} x {width}",
             path=path,
         )
-    return rows.reshape(*shape, 3)
-
-
-def _times(shape: tuple[int, ...]) -> str:
-    return " x ".join(str(size) for size in shape)
+    return rows.reshape(height, width, 3)

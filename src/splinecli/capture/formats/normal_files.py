@@ -13,17 +13,16 @@ Vectors are scaled to unit length. Zero and non-finite vectors are no normals.
 
 from __future__ import annotations
 
-import stat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.image_size import check_size
+from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import cut_out
 from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors
-from splinecli.capture.paths import StrPath, find_mode
+from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
 from splinecli.normals import SHORTEST_IN_PICTURE, decode_picture
 
@@ -47,11 +46,9 @@ def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | None = None) -> NDA
         InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
     """
     path = Path(path)
-    _check_file(path, "normal map")
-    stored = read_vectors(path)
-    shape = stored.values.shape[:2]
-    wanted = np.ones(shape, np.bool_) if mask is None else mask
-    check_size(shape, wanted.shape, path, like="the mask", what="a normal map")
+    expected = None if mask is None else ExpectedSize(mask.shape, "the mask", "a normal map")
+    stored = read_vectors(path, expected)
+    wanted = np.ones(stored.values.shape[:2], np.bool_) if mask is None else mask
     opaque = None if stored.alpha is None else cut_out(stored.alpha)
     if opaque is not None:
         wanted = wanted & opaque
@@ -80,24 +77,16 @@ def read_ground_truth(
         InputError: the file cannot be read, has another size, or has no normal inside the mask.
     """
     path = Path(path)
-    _check_file(path, "ground truth")
     suffix = path.suffix.lower()
     if suffix not in _GROUND_TRUTH_SUFFIXES:
         raise InputError(
             f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png or .tif', path=path
         )
-    stored = read_vectors(path, text_shape=shape)
-    check_size(stored.values.shape, shape, path, like="the images", what="a ground truth")
+    stored = read_vectors(path, ExpectedSize(shape, "the images", "a ground truth"), text=True)
     upside_down = suffix == ".txt" and _is_upside_down(stored.values, mask)
     if upside_down:
         stored = stored._replace(values=stored.values[::-1])
     return _to_normals(stored, mask, path), upside_down
-
-
-def _check_file(path: Path, what: str) -> None:
-    mode = find_mode(path)
-    if mode is None or not stat.S_ISREG(mode):
-        raise InputError(f"the {what} does not exist or is no file", path=path)
 
 
 def _to_normals(

@@ -26,7 +26,10 @@ RAW_SUFFIXES = (
 
 
 def decode_raw(
-    data: bytes, path: Path, quiet: Callable[[], AbstractContextManager[object]]
+    data: bytes,
+    path: Path,
+    quiet: Callable[[], AbstractContextManager[object]],
+    check: Callable[[tuple[int, ...], int], None],
 ) -> NDArray[np.uint16]:
     """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
 
@@ -37,6 +40,7 @@ def decode_raw(
         data: content of the file.
         path: the file, for messages.
         quiet: catches what LibRaw prints. It is used only around reading, because it stops progress bars, too.
+        check: receives the size (H, W, C) and the bytes of a number before the pixels are read.
 
     Raises:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
@@ -45,6 +49,8 @@ def decode_raw(
     try:
         with quiet():
             raw = rawpy.imread(io.BytesIO(data))
+        check((raw.sizes.height, raw.sizes.width, 3), 2)
+        with quiet():
             raw.unpack()
         with raw:
             pixels = raw.postprocess(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,12 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.header import is_image
+from splinecli.capture.paths import check_file, is_substitution
 from splinecli.errors import InputError
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
 _NUMBER_WITH_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
-_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+_LINE_END = re.compile(r"\r\n|\r|\n")
+
+MOST_TEXT = 1 << 26
+"""Bytes of the longest text file that is read, unless a file's content says how long it may be."""
+
+_FROM_PIPES: dict[Path, bytes] = {}
 
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 """Hint for a line with decimal commas."""
@@ -79,45 +86,79 @@ def has_decimal_commas(text: str) -> bool:
     return "." not in text and re.search(r"\d,\d", text) is not None and re.search(r"[\s;]", text) is not None
 
 
-def read_lines(path: Path, *, else_latin_1: bool = False, expected: str = "a text file") -> list[str]:
-    """Return the lines of a file in UTF-8, or in UTF-16 with a byte order mark. Raises InputError.
+def check_length(path: Path, most: int) -> None:
+    """Raise InputError for a text file of more than `most` bytes, or for something that is no file."""
+    check_file(path, "a text file")
+    try:
+        length = path.stat().st_size
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    if length > most:
+        raise InputError(
+            f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB", path=path
+        )
+
+
+def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
+    """Return the bytes of a text file, or of a pipe in its place: the shell's `<(...)`, which can be read only once.
 
     Args:
-        else_latin_1: whether a file that is not UTF-8 is read as Latin-1, which older programs on Windows write.
+        path: the file.
+        most: the largest number of bytes.
         expected: what the file should be, for messages.
+
+    Raises:
+        InputError: the file is missing, longer, or no file.
     """
+    check_file(path, expected, pipe=True)
     try:
-        content = path.read_bytes()
-        # Notepad calls it "Unicode".
-        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
-        return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    except FileNotFoundError:
-        raise InputError("the file does not exist", path=path) from None
-    except IsADirectoryError:
-        raise InputError(f"found a folder, expected {expected}", path=path) from None
-    except UnicodeDecodeError:
-        if is_image(content):
-            raise InputError(f"found an image, expected {expected}", path=path) from None
-        if else_latin_1:
-            return content.decode("latin-1").replace("\r\n", "\n").split("\n")
-        raise InputError(
-            "the file is not UTF-8 text", path=path, hint="Save it as plain UTF-8 text"
-        ) from None
+        if not is_substitution(path):
+            check_length(path, most)
+            return path.read_bytes()
+        if path not in _FROM_PIPES:
+            with path.open("rb") as pipe:
+                _FROM_PIPES[path] = pipe.read(MOST_TEXT)
+        return _FROM_PIPES[path]
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
 
 
-def read_number_rows(path: Path, *, expected: str = "a text file") -> NumberRows:
+def read_lines(
+    path: Path, *, else_latin_1: bool = False, expected: str = "a text file", most: int = MOST_TEXT
+) -> list[str]:
+    """Return the lines of a UTF-8 file, with or without a byte order mark, or of UTF-16 with one. Raises InputError.
+
+    Args:
+        path: the file.
+        else_latin_1: whether a file that is not UTF-8 is read as Latin-1, which older programs on Windows write.
+        expected: what the file should be, for messages.
+        most: the largest number of bytes.
+    """
+    content = read_text(path, most=most, expected=expected)
+    is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
+    except UnicodeDecodeError:
+        if is_image(content):
+            raise InputError(f"found an image, expected {expected}", path=path) from None
+        if not else_latin_1:
+            hint = "Save it as plain UTF-8 text"
+            raise InputError("the file is not UTF-8 text", path=path, hint=hint) from None
+        text = content.decode("latin-1")
+    return _LINE_END.split(text)
+
+
+def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:
     """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
 
-    `expected` says in messages what the file should be.
+    `expected` says in messages what the file should be, `most` how many bytes it may have.
 
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
     content = [
         (line, text.partition("#")[0].strip())
-        for line, text in enumerate(read_lines(path, expected=expected), start=1)
+        for line, text in enumerate(read_lines(path, expected=expected, most=most), start=1)
     ]
     commas = uses_decimal_commas([text for _, text in content if text], 3)
     rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,16 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
+from splinecli.memory import is_out_of_memory
+
+_LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
 
 # Values of TIFF's PhotometricInterpretation, the meaning of a sample.
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
-def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+def decode_tiff(
+    path: Path,
+    decode_with_opencv: Callable[[], NDArray[Any]],
+    check: Callable[[tuple[int, ...], int], None],
+) -> NDArray[Any]:
     """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples).
 
     Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
     every sample format. OpenCV decodes compressions for which tifffile has no decoder (LZW).
+
+    Args:
+        path: the file.
+        decode_with_opencv: decodes the file with OpenCV.
+        check: receives the size (H, W, samples) and the bytes of a sample before the pixels are read.
 
     Raises:
         InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
@@ -33,6 +46,8 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
         try:
             with tifffile.TiffFile(path) as file:
                 page: Any = file.pages.first
+                samples = (page.imagelength, page.imagewidth, page.samplesperpixel)
+                check(samples, -(-page.bitspersample // 8))
                 _check_complete(page, path)
                 photometric = int(page.photometric)
                 if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
@@ -44,7 +59,9 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
                 pixels = _decode_page(page)
         except InputError:
             raise
-        except Exception:  # a damaged header causes struct, key, value or memory errors
+        except Exception as error:  # a damaged header causes struct, key or value errors
+            if is_out_of_memory(error):
+                raise
             raise damaged from None
     if pixels is None:
         if photometric == _WHITE_IS_ZERO:
@@ -64,7 +81,9 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
         return None
     try:
         pixels: NDArray[Any] = page.asarray()
-    except Exception:  # the type of the error for a missing codec depends on tifffile's version
+    except Exception as error:  # the type of the error for a missing codec depends on tifffile's version
+        if is_out_of_memory(error):
+            raise
         return None
     if page.axes == "SYX":
         pixels = np.moveaxis(pixels, 0, -1)
@@ -72,8 +91,14 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
 
 
 def _check_complete(page: Any, path: Path) -> None:
-    """Raise InputError where a part of the pixels lies beyond the end of the file."""
+    """Raise InputError where a part of the pixels lies beyond the end of the file, or is longer than its pixels.
+
+    A compressed part that is longer than its pixels would be may expand to a thousand times their size.
+    """
     size = path.stat().st_size
+    longest = 2 * math.prod(page.chunks) * page.dtype.itemsize + _LONGEST_EMPTY_PART
+    if any(count > longest for count in page.databytecounts):
+        raise InputError("the TIFF is damaged", path=path, hint="Copy or export it again")
     if any(
         count == 0 or offset + count > size
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from splinecli.capture.layouts.image_lists import IMAGE_SUFFIXES, PICTURE_SUFFIXES, list_folder
-from splinecli.capture.paths import find_mode, is_file, resolve
+from splinecli.capture.paths import check_file, is_file, resolve
 from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
@@ -89,11 +88,7 @@ class Overrides:
             f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None
         )
         for file in files:
-            mode = find_mode(file)
-            if mode is None:
-                raise InputError("the file does not exist", path=file)
-            if not stat.S_ISREG(mode):
-                raise InputError("found a folder, expected a file", path=file)
+            check_file(file, "a file", pipe=file == self.lights)
         return files
 
 

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import (
     DECIMAL_POINT,
+    MOST_TEXT,
     NumberRows,
+    check_length,
     columns,
     has_decimal_commas,
     read_number_rows,
@@ -173,6 +175,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
 
 def _read_array(path: Path) -> NumberRows:
     """Return the rows of an .npy file; the lines count them from 1."""
+    check_length(path, MOST_TEXT)
     try:
         with path.open("rb") as file:
             array = np.lib.format.read_array(file, allow_pickle=False)

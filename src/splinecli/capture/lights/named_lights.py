@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +23,12 @@ from splinecli.capture.lights.light_files import NPY, directions_of, read_light_
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import image_name, read_light_rows
 from splinecli.errors import InputError
+from splinecli.files import parse_json
 
 Array = NDArray[np.float64]
 
 SUFFIXES = (".lp", ".json")
+_MOST_DIGITS = 9  # of the number of lights
 _FOLDERS = re.compile(r"[/\\]")
 
 
@@ -120,9 +123,9 @@ def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
     (first, count), *rows = content
     if not count.isdecimal():
         raise InputError(f'found "{count[:40]}", expected the number of lights', path=path, line=first)
-    if int(count) != len(rows):
+    if int(count[:_MOST_DIGITS]) != len(rows):
         raise InputError(
-            f"the first line says {int(count)} lights, but {len(rows)} lines follow",
+            f"the first line says {count[:40]} lights, but {len(rows)} lines follow",
             path=path,
             line=first,
             hint="Correct the number, or restore the missing lines",
@@ -151,9 +154,11 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
     In the file, y points down and z away from the camera.
     """
     try:
-        document = json.loads("\n".join(read_lines(path)))
+        document = parse_json("\n".join(read_lines(path)))
     except json.JSONDecodeError as error:
         raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
+    except ValueError as error:
+        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
     lights = document.get("lights") if isinstance(document, dict) else None
     if not isinstance(lights, list) or not lights:
         raise InputError('found no list "lights", expected lights as AliceVision writes them', path=path)
@@ -164,7 +169,7 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
         kind = light.get("type", "directional")
         if kind != "directional":
             raise InputError(
-                f"light {number} is of type {kind!r}, expected 'directional'",
+                f"light {number} is of type {reprlib.repr(kind)}, expected 'directional'",
                 path=path,
                 hint="Calibrate for distant lights, one direction a light",
             )
@@ -198,5 +203,7 @@ def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> 
         isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
         for value in values or ()
     ):
-        raise InputError(f"light {number} has {key!r} {values!r}, expected three numbers", path=path)
+        raise InputError(
+            f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path
+        )
     return [float(value) for value in values or ()]

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from splinecli.calibration.circle import Circle
 
 
+_MOST_DIGITS = 18  # of a number of images
+
+
 class Device(StrEnum):
     """Device to compute on."""
 
@@ -109,7 +112,7 @@ def parse_skip(text: str) -> tuple[str, int]:
     from splinecli.evaluation.protocol import EVERY_CAPTURE
 
     name, equals, count = text.rpartition("=")
-    if not count.isdecimal() or bool(name) != bool(equals):
+    if not count.isdecimal() or len(count) > _MOST_DIGITS or bool(name) != bool(equals):
         raise UsageError(
             f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20"
         )

@@ -1,0 +1,92 @@
+"""The memory that a process may still use, and the images that it reads into it."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+from splinecli.errors import SplinecliError
+
+LARGEST_IMAGE = 400_000_000
+"""Pixels of the largest image that is read, unless the user says otherwise."""
+
+_LIBRARIES, _BUFFER = 1.5e9, 64 * 2**20  # bytes
+_NO_MEMORY = (
+    "allocate memory",
+    "out of memory",
+    "not enough memory",
+    "failed to map segment",
+    "start new thread",
+)
+_MEMORY = Path("/sys/fs/cgroup")
+
+
+def available_memory() -> float:
+    """Return the bytes of memory that this process may still use; infinity where the system does not say.
+
+    It is the least of the machine's free memory, the limit of the process's control group, and the limit on its address
+    space (ulimit -v).
+    """
+    return min(_free_memory(), _left_in_group(_MEMORY), _left_in_address_space())
+
+
+def check_address_space() -> None:
+    """Raise SplinecliError if the limit on the address space (ulimit -v) is too low to load the numerical libraries.
+
+    Where it is lower, these libraries abort without a message. They reserve a buffer for each core.
+    """
+    needed = _LIBRARIES + _BUFFER * (os.cpu_count() or 1)
+    if (most := _address_space_limit()) < needed:
+        raise SplinecliError(
+            f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v), but at least"
+            f" {needed / 1e9:.1f} GB are needed",
+            hint="Raise the limit",
+        )
+
+
+def _free_memory() -> float:
+    return 1024 * _value_after("MemAvailable:", Path("/proc/meminfo"), math.inf)
+
+
+def _left_in_group(folder: Path) -> float:
+    """Return what the limit of a control group (version 2) leaves. The group's file cache can be freed."""
+    try:
+        most = (folder / "memory.max").read_text("utf-8").strip()
+        used = int((folder / "memory.current").read_text("utf-8"))
+    except (OSError, ValueError):
+        return math.inf
+    return (
+        math.inf
+        if most == "max"
+        else int(most) - used + _value_after("inactive_file", folder / "memory.stat", 0)
+    )
+
+
+def _address_space_limit() -> float:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return math.inf
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return math.inf if most == resource.RLIM_INFINITY else most
+
+
+def _left_in_address_space() -> float:
+    return _address_space_limit() - 1024 * _value_after("VmSize:", Path("/proc/self/status"), 0)
+
+
+def _value_after(name: str, path: Path, otherwise: float) -> float:
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except OSError:  # not Linux
+        return otherwise
+    return next((float(line.split()[1]) for line in lines if line.startswith(name)), otherwise)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that there is no memory left, in Python, PyTorch or the loading of a library."""
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or (
+        isinstance(error, OSError | RuntimeError | ImportError) and any(words in text for words in _NO_MEMORY)
+    )

@@ -1,0 +1,204 @@
+"""Files that claim or hide far more than they show are refused from their headers, without taking memory."""
+
+from __future__ import annotations
+
+import io
+import os
+import resource
+import struct
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from scipy.io import savemat
+
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, limit_pixels
+from splinecli.capture.formats.images import read_mask
+from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
+from splinecli.errors import InputError
+from splinecli.memory import LARGEST_IMAGE
+
+HUGE = 30_000
+SMALL = (16, 18)
+TOO_LARGE = (
+    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 megapixels"
+)
+MOST_GROWTH = 300 * 2**20
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
+
+
+def chunk(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def write_png(path: Path, size: int = HUGE) -> None:
+    """A whole PNG of zeros, with few bytes."""
+    rows = zlib.compressobj(1)
+    data = b"".join(rows.compress(bytes(size + 1)) for _ in range(size)) + rows.flush()
+    header = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    )
+
+
+def write_jpeg(path: Path) -> None:
+    content = bytearray(cv2.imencode(".jpg", np.zeros(SMALL, np.uint8))[1].tobytes())
+    frame = content.index(b"\xff\xc0")
+    content[frame + 5 : frame + 9] = struct.pack(">HH", HUGE, HUGE)
+    path.write_bytes(content)
+
+
+def write_tiff(path: Path, height: int, width: int, strip: bytes) -> None:
+    """A TIFF whose only strip is these compressed bytes."""
+    tags = [
+        (256, width),
+        (257, height),
+        (258, 8),
+        (259, 8),
+        (262, 1),
+        (273, 0),
+        (277, 1),
+        (278, height),
+        (279, len(strip)),
+    ]
+    start = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, start if tag == 273 else value) for tag, value in tags)
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + strip)
+
+
+def write_mat(path: Path, shape: tuple[int, int, int], n_zeros: int) -> None:
+    """A compressed .mat file whose array claims a shape and expands to a number of zeros."""
+    buffer = io.BytesIO()
+    savemat(buffer, {"Normal_gt": np.zeros((2, 2, 3))})
+    plain = buffer.getvalue()
+    header, matrix = plain[:128], bytearray(plain[136:])
+    place = matrix.index(struct.pack("<III", 2, 2, 3))
+    matrix[place : place + 12] = struct.pack("<III", *shape)
+    data = matrix.index(struct.pack("<II", 9, 96))
+    matrix[data : data + 8] = struct.pack("<II", 9, n_zeros)
+    element = struct.pack("<II", 14, data + 8 + n_zeros) + bytes(matrix[: data + 8])
+    packer = zlib.compressobj(1)
+    packed = packer.compress(element)
+    packed += b"".join(packer.compress(bytes(1 << 20)) for _ in range(n_zeros >> 20)) + packer.flush()
+    path.write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
+
+
+def growth(work: Callable[[], object]) -> int:
+    """Bytes by which the largest memory of a process grows while it does the work."""
+    reader, writer = os.pipe()
+    if os.fork() == 0:
+        before = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+        work()
+        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        os.write(writer, str(peak - before).encode())
+        os._exit(0)
+    os.close(writer)
+    os.wait()
+    return int(os.read(reader, 100))
+
+
+def refused(work: Callable[[], object], match: str) -> None:
+    """Check that the work raises InputError, and that this takes little memory."""
+
+    def check() -> None:
+        with pytest.raises(InputError, match=match):
+            work()
+
+    check()
+    assert growth(check) < MOST_GROWTH
+
+
+def ground_truth(path: Path) -> object:
+    return read_ground_truth(path, SMALL, np.ones(SMALL, np.bool_))
+
+
+def test_images_too_large_to_read(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", 21_000)
+    write_jpeg(tmp_path / "a.jpg")
+    write_tiff(tmp_path / "a.tif", HUGE, HUGE, zlib.compress(bytes(1000)))
+    for name in ("a.png", "a.jpg", "a.tif"):
+        refused(lambda name=name: decode_image(tmp_path / name), TOO_LARGE)
+
+
+def test_images_of_another_size_than_expected(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", 15_000)
+    expected = ExpectedSize(SMALL, "1.png", "a mask")
+    match = "found a mask of 15000 x 15000 pixels, expected 18 x 16 as in 1.png"
+    refused(lambda: read_mask(tmp_path / "a.png", expected), match)
+    match = "found a ground truth of 15000 x 15000 pixels, expected 18 x 16 as in the images"
+    refused(lambda: ground_truth(tmp_path / "a.png"), match)
+
+
+def test_a_tiff_whose_strip_expands_beyond_its_pixels(tmp_path: Path) -> None:
+    write_tiff(tmp_path / "a.tif", *SMALL, zlib.compress(bytes(1 << 28), 1))
+    refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
+
+
+def test_arrays_too_large_to_read(tmp_path: Path) -> None:
+    with (tmp_path / "a.npy").open("wb") as file:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (HUGE, HUGE, 3)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.truncate(HUGE * HUGE * 24 + file.tell())  # a sparse file, which holds nothing on the disk
+    refused(lambda: ground_truth(tmp_path / "a.npy"), "found a ground truth of 30000 x 30000 pixels")
+    refused(lambda: read_normal_map(tmp_path / "a.npy"), TOO_LARGE)
+    write_mat(tmp_path / "a.mat", (HUGE, HUGE, 3), 1 << 20)
+    refused(lambda: ground_truth(tmp_path / "a.mat"), "found a ground truth of 30000 x 30000 pixels")
+    refused(lambda: read_normal_map(tmp_path / "a.mat"), TOO_LARGE)
+
+
+def test_a_mat_file_that_expands_beyond_its_shape(tmp_path: Path) -> None:
+    write_mat(tmp_path / "a.mat", (*SMALL, 3), 1 << 28)
+    refused(lambda: ground_truth(tmp_path / "a.mat"), "the MATLAB file is damaged")
+
+
+def test_a_text_file_too_long_for_its_pixels(tmp_path: Path) -> None:
+    with (tmp_path / "normal.txt").open("wb") as file:
+        file.truncate(1 << 31)
+    refused(lambda: ground_truth(tmp_path / "normal.txt"), "expected a text file of at most 67")
+
+
+@pytest.fixture
+def smaller_limit() -> Iterator[None]:
+    limit_pixels(100)
+    yield
+    limit_pixels(LARGEST_IMAGE)
+
+
+@pytest.mark.usefixtures("smaller_limit")
+def test_the_limit_can_be_chosen(tmp_path: Path) -> None:
+    for name, size in (("small.png", (10, 10)), ("large.png", (10, 11))):
+        cv2.imwrite(str(tmp_path / name), np.ones(size, np.uint8))
+    assert decode_image(tmp_path / "small.png").shape == (10, 10, 1)
+    match = "found an image of 11 x 10 pixels.*expected at most 0.0001 megapixels.*--max-pixels-per-image"
+    with pytest.raises(InputError, match=match):
+        decode_image(tmp_path / "large.png")
+
+
+def test_an_image_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splinecli.capture.formats.image_size.available_memory", lambda: 1e9)
+    check_stored_size((10_000, 10_000), 1, Path("a.png"))
+    with pytest.raises(InputError, match=r"takes 1\.5 GB of memory, but 1\.0 GB are available"):
+        check_stored_size((10_000, 10_000, 3), 1, Path("a.png"))
+
+
+@pytest.mark.parametrize("write", [cv2.imwrite, tifffile.imwrite])
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_what_headers_say_is_what_is_decoded(
+    tmp_path: Path, write: Callable[..., object], channels: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked: list[tuple[tuple[int, ...], int]] = []
+    name = "splinecli.capture.formats.decoding.check_stored_size"
+    monkeypatch.setattr(name, lambda shape, item_bytes, *_: checked.append((shape, item_bytes)))
+    suffixes = (".tif",) if write is tifffile.imwrite else (".png", ".jpg", ".tif")
+    for suffix in suffixes:
+        for dtype in (np.uint8,) if suffix == ".jpg" else (np.uint8, np.uint16):
+            write(str(tmp_path / f"a{suffix}"), np.ones((*SMALL, *channels), dtype))
+            pixels = decode_image(tmp_path / f"a{suffix}")
+            assert checked[-1] == (pixels.shape, pixels.dtype.itemsize)

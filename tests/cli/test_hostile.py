@@ -1,0 +1,239 @@
+"""What is wrong with files, names and limits gets one line and a documented exit code, and nothing hangs."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.cli.signals import GRACE_SECONDS
+
+COMMAND = [sys.executable, "-m", "splinecli"]
+posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
+
+
+def shell(script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60)
+
+
+@posix
+def test_devices_and_pipes_are_refused_at_once(capture, run):
+    os.mkfifo("pipe")
+    for option, expected in (("--lights", "a file"), ("--mask", "a file"), ("--ground-truth", "a file")):
+        for path, kind in (("/dev/zero", "a device"), ("pipe", "a pipe")):
+            result = run("infer", capture, "--method", "ls", option, path)
+            assert (result.code, result.err) == (
+                3,
+                f"splinecli: {path}: found {kind}, expected {expected}.\n",
+            )
+    run("infer", capture, "--method", "ls")
+    result = run("integrate", "out/sphere", "--camera-matrix", "/dev/zero")
+    assert (result.code, result.err) == (3, "splinecli: /dev/zero: found a device, expected a text file.\n")
+    result = run("train", "-o", "run", "--config", "/dev/zero")
+    assert (result.code, result.err) == (4, "splinecli: /dev/zero: found a device, expected a text file.\n")
+    result = run("integrate", "/dev/zero", "-o", "surface")
+    assert (result.code, result.err) == (3, "splinecli: /dev/zero: found a device, expected a normal map.\n")
+
+
+@posix
+def test_process_substitution_in_place_of_light_directions(capture, run):
+    run("infer", capture, "--method", "ls", "-o", "expected")
+    command = f"{sys.executable} -m splinecli infer {capture} --method ls --lights"
+    for _ in range(2):  # the second time, the same content counts as done
+        result = shell(f"{command} <(cat {capture}/light_directions.txt)")
+        assert result.returncode == 0, result.stderr
+    assert "already done" in result.stderr
+    assert np.array_equal(np.load("out/sphere/normals.npy"), np.load("expected/sphere/normals.npy"))
+
+
+@pytest.mark.parametrize("text", ["[" * 200_000, '{"lights": [' + "9" * 400 + "]}", "9" * 5_000])
+def test_lights_that_no_parser_likes(capture, run, text):
+    Path("lights.json").write_text(text)
+    result = run("infer", capture, "--method", "ls", "--lights", "lights.json")
+    assert result.code == 3
+    assert result.err.startswith("splinecli: lights.json: ")
+    assert len(result.err) < 200
+    Path("many.lp").write_text("1" * 5_000 + "\nimage1.png 0 0 1\n")
+    result = run("infer", capture, "--method", "ls", "--lights", "many.lp")
+    assert (result.code, result.err.count("\n")) == (3, 1)
+    assert "lights, but 1 lines follow" in result.err
+
+
+def test_numbers_of_options_that_no_parser_likes(capture, run):
+    for arguments in (
+        ["infer", capture, "--light-indices", "9" * 5_000],
+        ["evaluate", capture, "--skip-first", "9" * 5_000],
+        ["evaluate", capture, "--n-lights", "9" * 5_000],
+        ["train", "-o", "run", "--param", "seed=" + "9" * 5_000],
+        ["train", "-o", "run", "--param", "seed=" + "[" * 5_000],
+    ):
+        result = run(*arguments)
+        assert result.code in (2, 4), result.err
+        assert "Traceback" not in result.err
+
+
+def test_light_files_of_windows(capture, run):
+    run("infer", capture, "--method", "ls", "-o", "expected")
+    text = (capture / "light_directions.txt").read_text()
+    (capture / "light_directions.txt").write_text(text, encoding="utf-16")
+    assert run("infer", capture, "--method", "ls").code == 0
+    assert np.array_equal(np.load("out/sphere/normals.npy"), np.load("expected/sphere/normals.npy"))
+
+
+def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path):
+    forged = "a\nsplinecli: warning: fake"
+    for name in (forged, "\x1b[2J\u202eb"):
+        make_capture("plain").rename(tmp_path / name)
+        results = [
+            run("infer", name, "--method", "ls"),
+            run("infer", name, "--method", "ls"),
+            run("infer", name, "none", "--method", "ls", "--overwrite"),
+            run("info", name),
+            run("evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite"),
+            run("infer", name, "--method", "ls", "--lights", f"{name}/none\n"),
+        ]
+        for result in results:
+            for text in (result.out, result.err):
+                assert "\nsplinecli: warning: fake" not in text
+                assert not set("\x1b\u202e") & set(text)
+    make_capture("plain").rename(tmp_path / "a\nb")
+    assert run("infer", "a\nb", "--method", "ls").out.startswith("out/a\\nb: 448 pixels")
+
+
+def test_cells_are_no_formulas(make_capture, run):
+    make_capture("=1+1")
+    assert run("evaluate", "=1+1", "--method", "ls", "--n-lights", 4, "--trials", 1).code == 0
+    with Path("evaluation/results.csv").open(newline="") as file:
+        assert [row["capture"] for row in csv.DictReader(file)] == ["'=1+1"]
+
+
+def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
+    elsewhere = make_capture("elsewhere")
+    names = [f"../elsewhere/image{number}.png" for number in range(1, 9)]
+    (capture / "filenames.txt").write_text("\n".join(names))
+    message = (
+        'splinecli: sphere/filenames.txt:1: the image "../elsewhere/image1.png" is outside of this folder.'
+    )
+    for command in (["infer", "--method", "ls"], ["info"], ["evaluate", "--method", "ls", "--n-lights", 4]):
+        result = run(command[0], capture, *command[1:])
+        assert result.code == 3
+        assert message in result.err
+        assert "--images-elsewhere" in result.err
+        assert run(command[0], capture, *command[1:], "--images-elsewhere").code == 0
+    (capture / "filenames.txt").write_text("\n".join(str((elsewhere / n).absolute()) for n in names))
+    assert "is outside of this folder" in run("info", capture).err
+
+
+def test_the_largest_image_can_be_chosen(capture, run):
+    result = run("infer", capture, "--method", "ls", "--max-pixels-per-image", 575)
+    assert result.code == 3
+    assert "sphere/image1.png: found an image of 24 x 24 pixels, which takes 0.0 GB of memory" in result.err
+    assert run("infer", capture, "--method", "ls", "--max-pixels-per-image", 576).code == 0
+
+
+@posix
+def test_a_low_limit_on_memory_is_one_line(capture):
+    arguments = f"{sys.executable} -m splinecli infer {capture}"
+    for limit in (600_000, 1_100_000):
+        result = shell(f"ulimit -v {limit}; {arguments}")
+        assert result.returncode == 1
+        assert result.stderr.startswith("splinecli: the limit on the memory of this process is")
+        assert result.stderr.count("\n") == 1
+    assert not Path("out").exists()
+
+
+def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatch):
+    make_capture("second")
+    real = cv2.imdecode
+
+    def fail(*args: object) -> object:
+        if not failed:
+            failed.append(True)
+            raise MemoryError
+        return real(*args)
+
+    failed: list[bool] = []
+    monkeypatch.setattr(cv2, "imdecode", fail)
+    result = run("infer", capture, "second", "--method", "ls", "-q")
+    message = "splinecli: sphere: there is not enough memory. Use smaller images, or lower --batch-size.\n"
+    assert (result.code, result.err) == (1, message)
+    assert Path("out/second/normals.png").exists()
+
+
+def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise EOFError
+
+    monkeypatch.setattr("splinecli.pipeline.info.describe_capture", fail)
+    monkeypatch.setattr("splinecli.cli.info.describe_capture", fail)
+    assert run("info", capture).code == 1
+
+
+def start(code: str) -> subprocess.Popen[str]:
+    """Start a process that runs the code as the command line would, and wait until it says so."""
+    script = "import importlib, time\nm = importlib.import_module('splinecli.cli.main')"
+    script += f"\ndef work(*_):\n    {code}\nm.main = work\nm.run()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+@posix
+@pytest.mark.parametrize(
+    "code",
+    [
+        "print('ready', flush=True); time.sleep(60)",
+        # An interruption that somebody swallows.
+        "print('ready', flush=True)\n    while True:\n        try: time.sleep(60)\n        except BaseException: pass",
+        # A call into C that no signal interrupts.
+        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n    for _ in range(60): a @ a",
+    ],
+)
+def test_sigterm_always_ends_a_process(code):
+    process = start(code)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == "splinecli: interrupted.\n"
+    assert GRACE_SECONDS < 2
+
+
+@posix
+def test_a_signal_at_the_end_does_not_change_the_exit_code():
+    code = "import atexit; atexit.register(time.sleep, 0.5); print('ready', flush=True); return 3"
+    process = start(code)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 3
+
+
+def test_the_dependencies_have_no_known_holes():
+    """Floors above the versions with published holes in what is used here."""
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8")
+    listed = tomllib.loads(text)["project"]["dependencies"]
+    floors = {
+        name: tuple(int(part) for part in floor.split("."))
+        for name, floor in (item.split(">=") for item in listed)
+    }
+    for name, floor in {
+        "torch": (2, 6),  # CVE-2025-32434: code runs from a file read with weights_only
+        "pillow": (12, 3),  # writes beyond buffers, and bombs, in many formats
+        "jinja2": (3, 1, 6),  # CVE-2025-27516
+        "opencv-python-headless": (4, 12),  # CVE-2025-53644: writes beyond a buffer in 4.10 and 4.11
+        "safetensors": (0, 5),
+    }.items():
+        assert floors[name] >= floor, name
