@@ -1,0 +1,131 @@
+"""Commands under kills, on a tiny disk, under limits, and two at once."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from kills import content
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="POSIX processes, limits and mounts")
+
+COMMAND = f"{sys.executable} -m splinecli"
+LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
+
+
+def shell(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a flat capture of 60 x 60 pixels and the results of an earlier run in `out`."""
+    (tmp_path / "a").mkdir()
+    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+    for number, light in enumerate(lights):
+        noise = np.random.default_rng(number).integers(0, 2000, (60, 60))
+        cv2.imwrite(str(tmp_path / "a" / f"{number}.png"), (50_000 * light[2] + noise).astype(np.uint16))
+    np.savetxt(tmp_path / "a" / "lights.txt", lights)
+    assert shell(f"{COMMAND} infer a --method ls -q", tmp_path).returncode == 0
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", ["infer", "calibrate", "integrate"])
+def test_kills_at_every_step(command: str) -> None:
+    script = [
+        sys.executable,
+        str(Path(__file__).with_name("kill_commands.py")),
+        "--kills",
+        "5",
+        "--command",
+        command,
+    ]
+    done = subprocess.run(script, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 failed" in done.stdout
+
+
+@pytest.mark.parametrize("disk_kb", [16, 64])
+def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
+    """The disk has room for one set of results, not for two; or for none."""
+    mount = f"mount -t tmpfs -o size={disk_kb}k tiny disk"
+    infer = f"{COMMAND} infer a --method ls -o disk --overwrite --format npy -q"
+    script = (
+        f"mkdir disk; {mount} || exit 77; cp a/lights.txt disk/kept; {infer}; echo $? >code; cp -r disk left"
+    )
+    done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
+    if done.returncode or not (folder / "code").exists():
+        pytest.skip(f"this system does not let the test mount a disk ({done.stderr.strip()})")
+    assert (folder / "code").read_text() == ("5\n" if disk_kb == 16 else "0\n")
+    if disk_kb == 16:
+        assert done.stderr.count("\n") == 1
+        assert "No space left on device" in done.stderr or "the disk may be full" in done.stderr
+        assert set(content(folder / "left")) == {"kept"}
+        assert not (folder / "left" / "a").exists()
+
+
+def test_a_limit_on_the_size_of_files_keeps_earlier_results(folder: Path) -> None:
+    before = content(folder / "out")
+    done = shell(f"ulimit -f 4; trap '' XFSZ; {COMMAND} infer a --method ls --overwrite -q", folder)
+    assert (done.returncode, done.stderr.count("\n")) == (5, 1)
+    assert content(folder / "out") == before
+
+
+@pytest.mark.parametrize("limit", [6, 8, 10, 14, 20])
+def test_a_limit_on_open_files(folder: Path, limit: int) -> None:
+    """Old or new results after the next start, and one message."""
+    done = shell(f"ulimit -n {limit}; {COMMAND} infer a --method ls --overwrite -q", folder)
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (0, 3, 4, 5), done.stderr
+    again = shell(f"{COMMAND} infer a --method ls -q", folder)
+    assert again.returncode == 0, again.stderr
+    assert {"normals.npy", "normals.png", "report.json"} == set(content(folder / "out" / "a"))
+
+
+def test_two_writers_of_one_folder(folder: Path) -> None:
+    """One may be refused; what is left is whole."""
+    commands = [
+        subprocess.Popen(
+            [*COMMAND.split(), "infer", "a", "--method", "ls", "--overwrite", "-q", "--format", form],
+            cwd=folder,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for form in ("npy", "tiff", "npy", "tiff")
+    ]
+    ended = [(command.communicate(timeout=120)[1], command.returncode) for command in commands]
+    assert any(code == 0 for _, code in ended)
+    for message, code in ended:
+        assert code in (0, 5)
+        assert code == 0 or message == (
+            "splinecli: out/a: another splinecli process is writing into this folder."
+            " Wait for it to end, or choose another -o.\n"
+        )
+    assert set(content(folder / "out" / "a")) in (
+        {"normals.npy", "report.json"},
+        {"normals.tiff", "report.json"},
+    )
+
+
+def test_folders_and_files_without_permission(folder: Path) -> None:
+    """As an ordinary user, also where the tests run as root."""
+    (folder / "a" / "2.png").chmod(0)
+    (folder / "closed").mkdir(mode=0o555)
+    rights = "-dac_override,-dac_read_search"
+    prefix = f"setpriv --bounding-set={rights} --inh-caps={rights} " if os.geteuid() == 0 else ""
+    done = shell(f"{prefix}{COMMAND} infer a --method ls -o b -q", folder)
+    assert (done.returncode, done.stderr) == (
+        3,
+        "splinecli: a/2.png: the file cannot be read (Permission denied).\n",
+    )
+    assert not (folder / "b").exists()
+    for command in ("infer a --method ls", "integrate out/a", "calibrate a --circle 30,30,20"):
+        done = shell(f"{prefix}{COMMAND} {command} -o closed -q", folder)
+        assert done.returncode == 5, done.stderr
+        assert done.stderr.startswith("splinecli: closed: no permission to write into this folder")

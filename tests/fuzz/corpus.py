@@ -1,0 +1,255 @@
+"""Small whole inputs of every kind that splinecli reads, and the commands that read them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+from scipy.io import savemat
+
+SHAPE = (16, 18)
+LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1), (0.4, 0.4, 1)], float)
+LIGHTS /= np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+OUT = "out"
+"""The folder that commands write into. An earlier run has filled it."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of input.
+
+    Args:
+        name: for people, and the name of its folder.
+        write: writes its files into an empty folder.
+        files: patterns of the files that are mutated.
+        commands: the arguments of each command that reads them.
+        earlier: the command whose output is there before; None for the first of `commands`.
+    """
+
+    name: str
+    write: Callable[[Path], None]
+    files: tuple[str, ...]
+    commands: tuple[str, ...]
+    earlier: str | None = None
+
+
+def normals() -> np.ndarray:
+    """Normals (H, W, 3) of a flat sphere."""
+    y, x = np.indices(SHAPE)
+    vectors = np.stack(((x - 8.5) / 9, (7.5 - y) / 8, np.full(SHAPE, 2.5)), axis=-1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def shaded(light: np.ndarray) -> np.ndarray:
+    return np.rint((normals() @ light).clip(0) * 50_000).astype(np.uint16)
+
+
+def picture_of(vectors: np.ndarray) -> np.ndarray:
+    return np.rint((vectors + 1) / 2 * 65_535).astype(np.uint16)
+
+
+def png_capture(folder: Path) -> None:
+    """DiLiGenT's layout, with every optional file."""
+    names = [f"{number:03}.png" for number in range(len(LIGHTS))]
+    for name, light in zip(names, LIGHTS, strict=True):
+        cv2.imwrite(str(folder / name), shaded(light))
+    (folder / "filenames.txt").write_text("\n".join(names) + "\n")
+    np.savetxt(folder / "light_directions.txt", LIGHTS)
+    np.savetxt(folder / "light_intensities.txt", np.ones((len(LIGHTS), 3)))
+    cv2.imwrite(str(folder / "mask.png"), (np.indices(SHAPE).sum(axis=0) > 3).astype(np.uint8) * 255)
+    cv2.imwrite(str(folder / "ambient.png"), np.full(SHAPE, 20, np.uint16))
+    savemat(folder / "Normal_gt.mat", {"Normal_gt": normals()}, do_compression=True)
+
+
+def jpeg_capture(folder: Path) -> None:
+    for number, light in enumerate(LIGHTS):
+        gray = (shaded(light) // 257).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{number}.jpg"), np.dstack([gray] * 3))
+    lines = [f"C:\\rti\\{n}.jpg {x} {y} {z}" for n, (x, y, z) in enumerate(LIGHTS)]
+    (folder / "rti.lp").write_text("\n".join([str(len(LIGHTS)), *lines]))
+    alpha = np.dstack([np.full(SHAPE, 200, np.uint8)] * 3 + [np.tri(*SHAPE, k=8, dtype=np.uint8) * 255])
+    cv2.imwrite(str(folder / "mask.png"), alpha)
+    np.save(folder / "normal_gt.npy", normals().astype(np.float32))
+
+
+def tiff_capture(folder: Path) -> None:
+    for number, light in enumerate(LIGHTS):
+        value = shaded(light)
+        compression = (None, "zlib", "zlib", None, None, None)[number]
+        if number == 3:
+            tifffile.imwrite(folder / "3.tif", value.astype(np.float32) / 65_535)
+        elif number == 4:
+            cv2.imwrite(str(folder / "4.tif"), value)  # LZW
+        else:
+            rgb = np.dstack([value] * 3)
+            tifffile.imwrite(folder / f"{number}.tif", rgb, photometric="rgb", compression=compression)
+    lights = [
+        {"viewId": number, "type": "directional", "direction": [x, -y, -z], "intensity": [1.0, 1.0, 1.0]}
+        for number, (x, y, z) in enumerate(LIGHTS)
+    ]
+    (folder / "lights.json").write_text(json.dumps({"lights": lights}))
+    np.savetxt(folder / "normal_gt.txt", normals().reshape(-1, 3))
+    tifffile.imwrite(folder / "mask.tif", np.full(SHAPE, 255, np.uint8))
+    (folder / "draws.txt").write_text("0 1 2 3\n1 2 3 4\n")
+
+
+def normal_maps(folder: Path) -> None:
+    cv2.imwrite(str(folder / "n.png"), picture_of(normals())[:, :, ::-1])
+    tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
+    np.save(folder / "n.npy", normals())
+    savemat(folder / "n.mat", {"n": normals()})
+    cv2.imwrite(str(folder / "mask.png"), np.full(SHAPE, 255, np.uint8))
+    cv2.imwrite(str(folder / "colours.jpg"), np.full((*SHAPE, 3), 90, np.uint8))
+    (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
+
+
+def mirror_ball(folder: Path) -> None:
+    y, x = np.indices((40, 50))
+    nx, ny = (x - 25) / 16, (20 - y) / 16
+    inside = nx**2 + ny**2 < 1
+    n = np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1)
+    (folder / "ball").mkdir()
+    (folder / "gray").mkdir()
+    for number, light in enumerate(LIGHTS[:4]):
+        half = light + np.array((0, 0, 1))
+        spot = np.exp(-((np.degrees(np.arccos((n @ (half / np.linalg.norm(half))).clip(-1, 1))) / 4) ** 2))
+        ball = np.where(inside, 0.02 + 0.9 * spot, 0.2)
+        gray = np.where(inside, 0.5 * (n @ light).clip(0), 0)
+        for name, picture in (("ball", ball), ("gray", gray)):
+            cv2.imwrite(str(folder / name / f"{number}.png"), np.rint(picture * 65_535).astype(np.uint16))
+    for name in ("ball", "gray"):
+        cv2.imwrite(str(folder / name / "mask.png"), inside.astype(np.uint8) * 255)
+    np.savetxt(folder / "known.txt", LIGHTS[:4])
+
+
+def earlier_results(folder: Path) -> None:
+    """A capture whose results are read again: reports, finished trials."""
+    (folder / "capture").mkdir()
+    png_capture(folder / "capture")
+
+
+def weights(folder: Path) -> None:
+    import torch
+
+    from splinecli.networks.config import NetworkConfig
+    from splinecli.networks.spline_net import SplineNet
+    from splinecli.networks.weights import save_weights
+
+    torch.manual_seed(0)
+    config = NetworkConfig(map_size=8, width=2, li_blocks=1, ne_blocks=1, head_width=4, fits=("ls",))
+    save_weights(SplineNet(config), folder / "w.safetensors")
+    torch.save({"a": torch.zeros(3)}, folder / "g.ckpt")
+    (folder / "capture").mkdir()
+    png_capture(folder / "capture")
+
+
+def training(folder: Path) -> None:
+    """A finished run, a pixel set, and settings: reading them takes no training step."""
+    from small_pixel_sets import matte_pixels
+    from splinecli.pixel_sets.writer import PixelSetWriter
+
+    writer = PixelSetWriter(folder / "set")
+    for name in "ab":
+        writer.add(name, name, "a test", {"by": "hand"}, matte_pixels(12, 6))
+    writer.finish()
+    (folder / "a.toml").write_text(
+        "steps = 1\nbatch_size = 4\nseed = 3\nlearning_rate = 1e-3\nschedule = 'cosine'\nheld_share = 0.0\n"
+        "[pixels]\nmin_lights = 4\nmax_lights = 6\nusual_lights = 5\n"
+        "[network]\nmap_size = 8\nwidth = 2\nli_blocks = 1\nne_blocks = 1\nhead_width = 4\n"
+    )
+
+
+TRAIN = "train set -o out/run -q"
+TARGETS = (
+    Target(
+        "png",
+        png_capture,
+        ("*",),
+        (
+            "infer . --method ls -o out --overwrite --maps albedo",
+            "info .",
+            "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
+            "prepare . -o out/set",
+        ),
+    ),
+    Target("jpeg", jpeg_capture, ("*",), ("infer . --method ls -o out --overwrite", "info .")),
+    Target(
+        "tiff",
+        tiff_capture,
+        ("*",),
+        (
+            "infer . --method ls -o out --overwrite",
+            "evaluate . --method ls --draws draws.txt -o out --overwrite",
+        ),
+    ),
+    Target(
+        "normals",
+        normal_maps,
+        ("*",),
+        tuple(
+            f"integrate {name} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out --overwrite"
+            for name in ("n.png", "n.tif", "n.npy", "n.mat")
+        ),
+    ),
+    Target(
+        "ball",
+        mirror_ball,
+        ("*/*", "known.txt"),
+        ("calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",),
+    ),
+    Target(
+        "earlier",
+        earlier_results,
+        ("out/*/*.json", "out/*.jsonl", "out/*/*.npy", "out/index.html"),
+        (
+            "infer capture --method ls -o out",
+            "infer capture --method ls -o out --update",
+            "integrate out/capture -o out/capture --overwrite",
+            "evaluate capture --method ls --n-lights 4 --trials 1 -o out",
+        ),
+        earlier="evaluate capture --method ls --n-lights 4 --trials 1 -o out",
+    ),
+    Target(
+        "weights",
+        weights,
+        ("w.safetensors", "g.ckpt"),
+        (
+            "infer capture --weights w.safetensors -o out --overwrite",
+            "import-weights g.ckpt g.ckpt -o out/w.safetensors --overwrite",
+        ),
+    ),
+    Target(
+        "training",
+        training,
+        ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"),
+        (f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1"),
+        earlier=f"{TRAIN} --config a.toml",
+    ),
+)
+
+
+def write_corpus(folder: Path, run: Callable[[Path, str], int], names: tuple[str, ...] = ()) -> list[Target]:
+    """Write the files of the targets into folders of their names, each with the output of an earlier run.
+
+    Every command runs once on whole input. This also imports all that it needs.
+
+    Args:
+        folder: where to write.
+        run: runs a command in a folder and returns its exit code.
+        names: names of targets; empty for all.
+    """
+    targets = [target for target in TARGETS if not names or target.name in names]
+    for target in targets:
+        for place in (folder / "tried" / target.name, folder / target.name):
+            place.mkdir(parents=True)
+            target.write(place)
+            first = target.earlier or target.commands[0]
+            more = target.commands if place.parent.name == "tried" else target.commands[:1]
+            for command in dict.fromkeys((first, *more)):
+                assert run(place, command) == 0 or "g.ckpt" in command, command
+    return targets

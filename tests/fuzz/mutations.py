@@ -1,0 +1,205 @@
+"""Seeded mutations of files: of bytes, of texts and their numbers, of JSON values, of headers, of what a path is."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ODD_NUMBERS = (
+    "nan", "inf", "-inf", "1e999", "-0", "1e-320", "9" * 400, "9" * 5000, "1_0", "0x10", "١", "--1", "", "-1",
+    "4294967296", "2147483648", "-2147483649", "1e308", "1,5",
+)  # fmt: skip
+ODD_TEXTS = (
+    "",
+    "\x00",
+    "\x1b[2J",
+    "a\nsplinecli: warning: fake",
+    "../../etc/passwd",
+    "/dev/zero",
+    "𝔘\u202e",
+    "%s",
+    "a" * 5000,
+)
+ODD_VALUES: tuple[Any, ...] = (
+    None, True, False, [], {}, "", -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "a\nb", [[[]]], {"a": 1},
+    [1, 2, 3], -(2**63), 2**31,
+)  # fmt: skip
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_TEXTS = (".txt", ".lp", ".json", ".toml", ".csv", ".jsonl", ".html")
+
+
+def flip(data: bytes, rng: random.Random) -> bytes:
+    content = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 8, 64))):
+        if content:
+            content[rng.randrange(len(content))] = rng.randrange(256)
+    return bytes(content)
+
+
+def flip_header(data: bytes, rng: random.Random) -> bytes:
+    return flip(data[:128], rng) + data[128:]
+
+
+def cut(data: bytes, rng: random.Random) -> bytes:
+    return data[: rng.randrange(len(data) + 1)]
+
+
+def splice(data: bytes, rng: random.Random) -> bytes:
+    start, end = sorted(rng.randrange(len(data) + 1) for _ in range(2))
+    if rng.random() < 0.5:
+        return data[:start] + data[end:]
+    return data[:end] + data[start:end] * rng.choice((1, 3, 50)) + data[end:]
+
+
+def odd_word(data: bytes, rng: random.Random) -> bytes:
+    """Write an odd binary number somewhere."""
+    form = rng.choice(("<I", ">I", "<H", ">H", "<Q"))
+    word = struct.pack(form, rng.choice((0, 1, 0x7FFF, 0x8000, 0xFFFF)) * (65_537 if form[1] != "H" else 1))
+    place = rng.randrange(max(1, len(data)))
+    return data[:place] + word + data[place + len(word) :]
+
+
+def fill(data: bytes, rng: random.Random) -> bytes:
+    start, end = sorted(rng.randrange(len(data) + 1) for _ in range(2))
+    return data[:start] + bytes([rng.choice((0, 255, 32))]) * (end - start) + data[end:]
+
+
+def garbage(data: bytes, rng: random.Random) -> bytes:
+    return rng.choice(
+        (b"", b"\0" * 4096, rng.randbytes(300), b"[" * 100_000, b"\xff\xfe" + data, "é\n".encode("utf-16"))
+    )
+
+
+def number(data: bytes, rng: random.Random) -> bytes:
+    found = list(_NUMBER.finditer(data))
+    if not found:
+        return flip(data, rng)
+    match = rng.choice(found)
+    return data[: match.start()] + rng.choice(ODD_NUMBERS).encode() + data[match.end() :]
+
+
+def lines(data: bytes, rng: random.Random) -> bytes:
+    rows = data.split(b"\n")
+    place = rng.randrange(len(rows))
+    change = rng.randrange(4)
+    if change == 0:
+        rows.insert(place, rng.choice(rows))
+    elif change == 1:
+        del rows[place]
+    elif change == 2:
+        rows[place] = rng.choice(ODD_TEXTS).encode("utf-8", "surrogatepass")
+    else:
+        rng.shuffle(rows)
+    return b"\n".join(rows)
+
+
+def json_value(data: bytes, rng: random.Random) -> bytes:
+    """Replace, remove or repeat one value of a JSON document."""
+    try:
+        document = json.loads(data)
+    except ValueError:
+        return flip(data, rng)
+    places: list[tuple[Any, Any]] = []
+
+    def collect(value: Any) -> None:
+        for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+            places.append((value, key))
+            collect(value[key])
+
+    collect(document)
+    if places and rng.random() < 0.97:
+        holder, key = rng.choice(places)
+        if rng.random() < 0.2:
+            del holder[key]
+        else:
+            holder[key] = rng.choice(ODD_VALUES)
+    else:
+        document = rng.choice(ODD_VALUES)
+    return json.dumps(document).encode("utf-8", "surrogatepass")
+
+
+def png_header(data: bytes, rng: random.Random) -> bytes:
+    """Change the size or the kind of a PNG, with the right checksum."""
+    if not data.startswith(b"\x89PNG") or len(data) < 33:
+        return flip_header(data, rng)
+    body = bytearray(data[12:29])
+    if rng.random() < 0.6:
+        struct.pack_into(">I", body, 4 + 4 * rng.randrange(2), rng.choice((0, 1, 17, 30_000, 2**31 - 1)))
+    else:
+        body[rng.randrange(12, 17)] = rng.randrange(20)
+    return data[:12] + bytes(body) + struct.pack(">I", zlib.crc32(body)) + data[33:]
+
+
+def safetensors_header(data: bytes, rng: random.Random) -> bytes:
+    """Change a value in the header of a safetensors file, or in the JSON texts of its metadata."""
+    length = int.from_bytes(data[:8], "little")
+    try:
+        header = json.loads(data[8 : 8 + length])
+        metadata = header["__metadata__"]
+    except (ValueError, KeyError, TypeError):
+        return flip(data, rng)
+    if rng.random() < 0.8:
+        key = rng.choice(sorted(metadata))
+        metadata[key] = json_value(metadata[key].encode(), rng).decode("utf-8", "replace")
+        text = json.dumps(header).encode()
+    else:
+        text = json_value(json.dumps(header).encode(), rng)
+    return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+
+OF_BYTES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
+    flip, flip, flip_header, flip_header, cut, splice, odd_word, odd_word, fill, garbage,
+)  # fmt: skip
+OF_TEXTS = (number, number, number, lines, lines)
+
+
+def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
+    """Change a file in one way and return a description."""
+    if rng.random() < 0.06:
+        return _another_kind(path, others, rng)
+    choices = [*OF_BYTES]
+    if path.suffix in _TEXTS:
+        choices += OF_TEXTS * 2
+    if path.suffix == ".json":
+        choices += [json_value] * 15
+    if path.suffix == ".png":
+        choices += [png_header] * 4
+    if path.suffix == ".safetensors":
+        choices += [safetensors_header] * 20
+    change = rng.choice(choices)
+    data = path.read_bytes()
+    path.unlink()  # it may be a link to the corpus
+    path.write_bytes(change(data, rng))
+    return f"{change.__name__} {path.name}"
+
+
+def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:
+    """Put something else in the place of a file: a folder, a pipe, a device, another file, or nothing."""
+    kind = rng.choice(("folder", "pipe", "loop", "device", "other file", "nothing", "huge", "unreadable"))
+    other = rng.choice(others).read_bytes()
+    path.unlink()
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "loop":
+        path.symlink_to(path.name)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "other file":
+        path.write_bytes(other)
+    elif kind == "huge":
+        with path.open("wb") as file:
+            file.write(other)
+            file.truncate(3 << 30)
+    elif kind == "unreadable":
+        path.write_bytes(other)
+        path.chmod(0)
+    return f"{kind} {path.name}"
