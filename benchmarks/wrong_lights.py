@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from splinecli.capture import read_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.lights.light_advice import mirror_twin
-from splinecli.capture.lights.light_check import UNKNOWN_ORDER, LightCheck, check_lights
+from splinecli.capture.lights.light_check import LightCheck, check_lights
 from splinecli.capture.lights.light_frames import parse_light_frame
+from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.capture.sample import sample_observations
 from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene

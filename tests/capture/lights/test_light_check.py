@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from splinecli.capture import read_capture
 from splinecli.capture.lights.frame_evidence import rough_normals
-from splinecli.capture.lights.light_check import UNKNOWN_ORDER, LightCheck, check_lights
+from splinecli.capture.lights.light_check import LightCheck, check_lights
 from splinecli.capture.lights.light_fit import find_factors, random_misfits, shifted_orders, swapped_orders
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame, parse_light_frame
+from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.errors import UsageError
 
 Array = NDArray[np.float64]

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, CaptureWarning
-from splinecli.capture.lights.light_check import UNKNOWN_ORDER, Candidate, LightCheck
+from splinecli.capture.lights.light_check import Candidate, LightCheck
 from splinecli.capture.lights.light_frames import LightFrame
+from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 
 BOTH_NEGATED = LightFrame((-1, -1, 1))
 

@@ -14,37 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.frame_evidence import RoughNormals, rough_normals
-from splinecli.capture.lights.light_fit import (
-    find_factors,
-    random_misfits,
-    shifted_orders,
-    swapped_orders,
-)
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
+from splinecli.capture.lights.light_order import UNKNOWN_ORDER, check_order, shift_steps, shift_words
 
 Array = NDArray[np.float64]
-
-MIN_LIGHTS = 6
-"""Fewer lights leave too few equations to judge their order."""
-
-BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
-"""Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
-
-MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
-"""Smallest misfit of a wrong order, as a share of the median of random orders: of all lights, of two exchanged ones."""
-
-CHANCE = 0.02
-"""An order is wrong if more than this share of random orders fits as well."""
-
-MIN_LIGHTS_FOR_CHANCE = 8
-
-MAX_RESIDUAL = 0.2
-"""Above this residual of the factors, images of metal and of shiny hollows do not tell whether an order fits at all:
-their right lights may fit like a random order. Another order that fits much better is still named."""
-
-UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
-"""An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
-could explain: highlights and shadows."""
 
 CURL_WEIGHT, RIM_WEIGHT = 3.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
@@ -60,9 +33,6 @@ MAX_MISFIT_OF_RIM = 0.5
 
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.8
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
-
-UNKNOWN_ORDER = "unknown"
-"""The order of the lights does not fit, and no simple other one does."""
 
 _AS_GIVEN = "as given"
 
@@ -131,7 +101,7 @@ def check_lights(
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
-    found = _check_order(observations, light_directions, chosen, names)
+    found = check_order(observations, light_directions, chosen, names)
     normals = rough_normals(observations, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
     if found.misfit is not None and found.misfit > MAX_MISFIT_OF_RIM:
@@ -144,7 +114,7 @@ def check_lights(
         for frame in PLANE_FRAMES
     )
     for row, matrix in found.turns:
-        words, steps = _shift_words(row, len(light_directions)), _shift_steps(row, len(light_directions))
+        words, steps = shift_words(row, len(light_directions)), shift_steps(row, len(light_directions))
         turned = _candidate(words, None, normals.transformed(matrix), found.misfit, weight)
         others.append(replace(turned, steps=steps))
     ranked = sorted((_judge(other, first, weight) for other in others), key=lambda other: -other.advantage)
@@ -190,72 +160,3 @@ def _judge(other: Candidate, given: Candidate, weight: float) -> Candidate:
     if other.rim is not None and given.rim is not None:
         advantage += RIM_WEIGHT * weight * (other.rim - given.rim)
     return replace(other, advantage=float(advantage))
-
-
-@dataclass(frozen=True, eq=False)
-class _Order:
-    """The order of lights that fits best: its name (None for the given one), the lights (F, 3) in it, the misfits of
-    the given order and of this one, and other rows of shifted_orders that fit as well, with their matrices: they turn a
-    regular ring of lights."""
-
-    order: str | None
-    lights: Array
-    given_misfit: float | None = None
-    misfit: float | None = None
-    turns: tuple[tuple[int, Array], ...] = ()
-
-
-def _check_order(
-    observations: NDArray[np.floating],
-    light_directions: Array,
-    chosen: NDArray[np.integer],
-    names: Sequence[str],
-) -> _Order:
-    lights, n_all = light_directions[chosen], len(light_directions)
-    factors = find_factors(observations) if len(lights) >= MIN_LIGHTS else None
-    if factors is None:
-        return _Order(None, lights)
-    random = random_misfits(factors, lights)
-    usual = max(float(np.median(random)), 1e-9)
-    given = float(factors.misfits(lights[None])[0])
-    share, limit = given / usual, given * (BETTER_ORDER if len(lights) > FEW else BETTER_ORDER_OF_FEW)
-    shifted = light_directions[shifted_orders(n_all)[:, chosen]]
-    shift_misfits = factors.misfits(shifted)
-    best = int(shift_misfits.argmin())
-    if share > MIN_MISFIT and shift_misfits[best] < limit:
-        mended = float(shift_misfits[best])
-        turns = _turns(shifted[best], shifted, shift_misfits <= max(1.3 * mended, 0.05 * usual))
-        return _Order(_shift_words(best, n_all), shifted[best], share, mended / usual, turns)
-    swaps = swapped_orders(len(lights))
-    swap_misfits = factors.misfits(lights[swaps])
-    best = int(swap_misfits.argmin())
-    if share > MIN_SWAP_MISFIT and swap_misfits[best] < limit:
-        one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
-        words = f"with those of {one} and {other} exchanged"
-        return _Order(words, lights[swaps[best]], share, float(swap_misfits[best]) / usual)
-    judged = factors.residual < MAX_RESIDUAL
-    by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
-    if judged and (by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)):
-        return _Order(UNKNOWN_ORDER, lights, share, share)
-    turns = _turns(lights, shifted, shift_misfits <= max(1.3 * given, 0.05 * usual))
-    return _Order(None, lights, share, share, turns)
-
-
-def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[tuple[int, Array], ...]:
-    """Return the fitting ones of shifted orders (N, F, 3), each as the matrix that takes the lights (F, 3) to it."""
-    inverse = np.linalg.pinv(lights)
-    matrices = ((int(k), (inverse @ shifted[k]).T) for k in np.flatnonzero(fitting))
-    return tuple((k, matrix) for k, matrix in matrices if not np.allclose(matrix, np.eye(3), atol=1e-6))
-
-
-def _shift_steps(order: int, n_lights: int) -> int:
-    """Return by how many lights a row of shifted_orders is shifted, in the shorter direction."""
-    return min(order % n_lights, -order % n_lights)
-
-
-def _shift_words(order: int, n_lights: int) -> str:
-    """Return words for a row of shifted_orders."""
-    steps = order % n_lights
-    if order < n_lights:
-        return f"if image 1 belongs to light {steps + 1}, image 2 to the next, and so on"
-    return f"in reversed order, beginning with light {(n_lights - 1 + steps) % n_lights + 1}"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.robust_fit import absolute_weights
+from splinecli.capture.restore.robust_fit import absolute_weights, predict
 from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ RANDOM_ORDERS = 500
 
 _ROUNDS = 25
 _PRIOR = 1e-9
+_FITS, _FITTED_ORDERS = 5, 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ def find_factors(observations: NDArray[np.floating]) -> Factors | None:
 
     Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
     """
-    values = _sample(observations)
+    values = sample_pixels(observations)
     n_pixels, n_lights = values.shape
     if n_lights < 4 or n_pixels < 10 * n_lights:
         return None
@@ -103,7 +104,23 @@ def swapped_orders(n_lights: int) -> NDArray[np.int64]:
     return orders
 
 
-def _sample(observations: NDArray[np.floating]) -> Array:
+def fit_residual(values: Array, light_directions: Array) -> float:
+    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3)."""
+    lit = weights = (values > LIT_SHARE).astype(np.float64)
+    for _ in range(_FITS):
+        residuals = values - predict(values, weights, light_directions)
+        weights = lit * absolute_weights(residuals)
+    return float((np.abs(residuals) * lit).sum() / lit.sum())
+
+
+def random_residual(values: Array, light_directions: Array) -> float:
+    """Return the median of fit_residual over some random orders of the lights."""
+    rng = np.random.default_rng(1)
+    orders = [rng.permutation(len(light_directions)) for _ in range(_FITTED_ORDERS)]
+    return float(np.median([fit_residual(values, light_directions[k]) for k in orders]))
+
+
+def sample_pixels(observations: NDArray[np.floating]) -> Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     brightest = observations.max(axis=1)
     usable = np.flatnonzero(brightest > 0.1 * np.quantile(brightest, 0.99))

@@ -1,0 +1,149 @@
+"""Tell lights in a wrong order from right ones, by how well the images fit them.
+
+The thresholds were chosen on the same captures as those of light_check.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.lights.light_fit import (
+    find_factors,
+    fit_residual,
+    random_misfits,
+    random_residual,
+    sample_pixels,
+    shifted_orders,
+    swapped_orders,
+)
+
+Array = NDArray[np.float64]
+
+MIN_LIGHTS = 6
+"""Fewer lights leave too few equations to judge their order."""
+
+BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
+"""Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
+
+MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
+"""Smallest misfit of a wrong order, as a share of the median of random orders: of all lights, of two exchanged ones."""
+
+CHANCE = 0.02
+"""An order is wrong if more than this share of random orders fits as well."""
+
+MIN_LIGHTS_FOR_CHANCE = 8
+
+MAX_RESIDUAL = 0.2
+"""Above this residual of the factors, images of metal and of shiny hollows do not tell whether an order fits at all:
+their right lights may fit like a random order. Another order that fits much better is still named."""
+
+UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
+"""An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
+could explain: highlights and shadows."""
+
+UNKNOWN_ORDER = "unknown"
+"""The order of the lights does not fit, and no simple other one does."""
+
+RANDOM_FIT = 0.85
+"""Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
+
+_FITTED_PIXELS = 800
+
+
+@dataclass(frozen=True, eq=False)
+class LightOrder:
+    """The order of lights that fits best.
+
+    Args:
+        order: in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found.
+        lights: (F, 3), in this order.
+        given_misfit, misfit: of the given order and of this one, as shares of random orders'; None where there are too
+            few lights.
+        turns: rows of shifted_orders that fit as well, with the matrices (3, 3) that take the lights there. They turn a
+            regular ring of lights.
+    """
+
+    order: str | None
+    lights: Array
+    given_misfit: float | None = None
+    misfit: float | None = None
+    turns: tuple[tuple[int, Array], ...] = ()
+
+
+def check_order(
+    observations: NDArray[np.floating],
+    light_directions: Array,
+    chosen: NDArray[np.integer],
+    names: Sequence[str],
+) -> LightOrder:
+    """Return the order of the chosen lights that fits observations (P, F) best.
+
+    Args:
+        light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
+        chosen: (F,) the lights of the observations.
+        names: of the F images.
+    """
+    lights, n_all = light_directions[chosen], len(light_directions)
+    factors = find_factors(observations) if len(lights) >= MIN_LIGHTS else None
+    if factors is None:
+        return LightOrder(None, lights)
+    random = random_misfits(factors, lights)
+    usual = max(float(np.median(random)), 1e-9)
+    given = float(factors.misfits(lights[None])[0])
+    share, limit = given / usual, given * (BETTER_ORDER if len(lights) > FEW else BETTER_ORDER_OF_FEW)
+    shifted = light_directions[shifted_orders(n_all)[:, chosen]]
+    shift_misfits = factors.misfits(shifted)
+    best = int(shift_misfits.argmin())
+    if share > MIN_MISFIT and shift_misfits[best] < limit:
+        mended = float(shift_misfits[best])
+        turns = _turns(shifted[best], shifted, shift_misfits <= max(1.3 * mended, 0.05 * usual))
+        return LightOrder(shift_words(best, n_all), shifted[best], share, mended / usual, turns)
+    swaps = swapped_orders(len(lights))
+    swap_misfits = factors.misfits(lights[swaps])
+    best = int(swap_misfits.argmin())
+    if share > MIN_SWAP_MISFIT and swap_misfits[best] < limit:
+        one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
+        words = f"with those of {one} and {other} exchanged"
+        return LightOrder(words, lights[swaps[best]], share, float(swap_misfits[best]) / usual)
+    judged = factors.residual < MAX_RESIDUAL
+    by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
+    suspected = by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)
+    if judged and suspected and _fits_like_random(observations, lights):
+        return LightOrder(UNKNOWN_ORDER, lights, share, share)
+    fitting = shift_misfits <= max(1.3 * given, 0.05 * usual)
+    turns = _turns(lights, shifted, fitting) if share < MIN_MISFIT else ()
+    return LightOrder(None, lights, share, share, turns)
+
+
+def _fits_like_random(observations: NDArray[np.floating], lights: Array) -> bool:
+    """Return whether lights fit the pixels little better than in random orders.
+
+    The factors may be wrong where most lights leave each pixel in shadow; this fit is not.
+    """
+    values = sample_pixels(observations)
+    values = values[:: max(1, len(values) // _FITTED_PIXELS)]
+    return fit_residual(values, lights) > RANDOM_FIT * random_residual(values, lights)
+
+
+def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[tuple[int, Array], ...]:
+    """Return the fitting ones of shifted orders (N, F, 3), each as the matrix that takes the lights (F, 3) to it."""
+    inverse = np.linalg.pinv(lights)
+    matrices = ((int(k), (inverse @ shifted[k]).T) for k in np.flatnonzero(fitting))
+    return tuple((k, matrix) for k, matrix in matrices if not np.allclose(matrix, np.eye(3), atol=1e-6))
+
+
+def shift_steps(order: int, n_lights: int) -> int:
+    """Return by how many lights a row of shifted_orders is shifted, in the shorter direction."""
+    return min(order % n_lights, -order % n_lights)
+
+
+def shift_words(order: int, n_lights: int) -> str:
+    """Return words for a row of shifted_orders."""
+    steps = order % n_lights
+    if order < n_lights:
+        return f"if image 1 belongs to light {steps + 1}, image 2 to the next, and so on"
+    return f"in reversed order, beginning with light {(n_lights - 1 + steps) % n_lights + 1}"
