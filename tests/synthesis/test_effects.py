@@ -13,17 +13,11 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 from torch import Tensor
 
-from splinecli.normals import angle_between_deg
 from splinecli.observation_map import cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.effects import (
     Wall,
-    add_sensor_noise,
-    disturb_light_directions,
-    disturb_light_intensities,
     draw_ambient,
-    draw_exposure,
     draw_wall,
-    quantise,
 )
 from splinecli.synthesis.pixels import draw_visible_normals
 from splinecli.synthesis.principled import PrincipledMaterial
@@ -106,7 +100,19 @@ def matte(pixels: int) -> PrincipledMaterial:
     """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection away."""
     zero = torch.zeros(pixels, 1)
     return PrincipledMaterial(
-        zero + 1, zero, zero, zero + 0.1, zero, zero, zero, zero + 1e-9, zero + 1, zero + 2
+        zero + 1,
+        zero,
+        zero,
+        zero + 0.1,
+        zero,
+        zero,
+        zero,
+        zero + 1e-9,
+        zero + 1,
+        zero + 2,
+        zero,
+        zero + 1,
+        zero,
     )
 
 
@@ -225,82 +231,3 @@ def test_ambient_light() -> None:
     assert (ambient > 0).float().mean().item() == pytest.approx(0.3, abs=SHARE)
     assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
     assert not draw_ambient(N, 0.0, generator()).any()
-
-
-def tilted_lights(pixels: int, lights: int) -> Tensor:
-    directions = torch.randn(pixels, lights, 3, generator=generator(3))
-    directions[..., 2] = directions[..., 2].abs() + 0.5
-    return torch.nn.functional.normalize(directions, dim=-1)
-
-
-def test_errors_of_light_directions() -> None:
-    directions = tilted_lights(4000, 40)
-    moved = disturb_light_directions(directions, 0.6, generator())
-    torch.testing.assert_close(moved.norm(dim=-1), torch.ones(4000, 40))
-    assert (moved[..., 2] > 0).all()
-    error = angle_between_deg(moved.numpy(), directions.numpy())
-    # A pixel's angles have two components of its sigma each: sigma^2 is half of their mean square.
-    sigma = np.sqrt((error**2).mean(axis=1) / 2)
-    disturbed = sigma > 1e-6
-    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
-    # Sigma itself is estimated from 80 numbers, to 8 per cent.
-    assert stats.kstest(sigma[disturbed], lambda x: (x / 8).clip(0, 1) ** (1 / 3)).statistic < 0.04
-    assert 6 < sigma.max() < 10
-    np.testing.assert_allclose(disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6)
-
-
-def test_errors_of_light_intensities() -> None:
-    observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
-    factor = (disturb_light_intensities(observations, 0.6, generator()) / observations).numpy()
-    sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
-    disturbed = sigma > 1e-5
-    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
-    assert stats.kstest(sigma[disturbed], stats.uniform(0, 0.05).cdf).statistic < 0.04
-    assert factor[disturbed].mean() == pytest.approx(1, abs=1e-3)
-    assert torch.equal(disturb_light_intensities(observations, 0.0, generator()), observations)
-
-
-def test_exposure() -> None:
-    radiance = torch.rand(N, 5, generator=generator(3)) * 30
-    brightest = (radiance * draw_exposure(radiance, 0.25, generator())).amax(dim=1)
-    over = brightest > 1
-    assert over.float().mean().item() == pytest.approx(0.25, abs=SHARE)
-    assert_uniform(brightest[over], 1, 3)
-    assert_uniform(brightest[~over].log10(), -1.3, 0)
-    unclipped = (radiance * draw_exposure(radiance, 0.0, generator())).amax(dim=1)
-    assert unclipped.max() <= 1 + 1e-6
-    assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, generator())).all()
-
-
-def mean_square_of_power(low: float, high: float) -> float:
-    """E[(10^U(low, high))^2]."""
-    return (10 ** (2 * high) - 10 ** (2 * low)) / (2 * math.log(10) * (high - low))
-
-
-@pytest.mark.parametrize("level", [0.5, 0.1])
-def test_sensor_noise(level: float) -> None:
-    noisy = add_sensor_noise(torch.full((N, 20), level), generator())
-    expected = mean_square_of_power(-4, -2.5) + level * mean_square_of_power(-3.5, -2)
-    variance = (noisy.double() - level).square().mean().item()
-    assert variance == pytest.approx(expected, rel=0.05)
-    assert noisy.double().mean().item() == pytest.approx(level, abs=1e-4)
-
-
-def test_sensor_noise_stays_in_the_sensor_s_range() -> None:
-    noisy = add_sensor_noise(torch.tensor([0.0, 1.0]).expand(N, 2), generator())
-    assert noisy.min() == 0
-    assert noisy.max() == 1
-    assert (noisy[:, 0] > 0).float().mean().item() == pytest.approx(0.5, abs=SHARE)
-
-
-def test_quantisation() -> None:
-    exposed = torch.rand(N, 8, generator=generator(3), dtype=torch.float64)
-    rounded = quantise(exposed, 0.3, generator())
-    eight = ((rounded * 255 - (rounded * 255).round()).abs() < 1e-9).all(dim=1)
-    assert eight.double().mean().item() == pytest.approx(0.3, abs=SHARE)
-    assert ((rounded * 65535 - (rounded * 65535).round()).abs() < 1e-9).all()
-    error = (rounded - exposed).abs()
-    # Half a step, which the worst of many comes close to.
-    assert error[eight].max().item() == pytest.approx(0.5 / 255, rel=1e-2)
-    assert error[~eight].max().item() == pytest.approx(0.5 / 65535, rel=1e-2)
-    assert (quantise(exposed, 0.0, generator()) - exposed).abs().max() <= 0.5 / 65535 + 1e-9

@@ -22,6 +22,9 @@ NAMES = (
     "interface_loss",
     "minnaert",
     "tail_exponent",
+    "second_share",
+    "second_roughness",
+    "retro",
 )
 
 
@@ -52,17 +55,29 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
 
     The height of the highlight's distribution by quadrature: projected facets have unit area.
     """
-    base, metallic, specular, roughness, sheen, clearcoat, gloss, loss, kappa, gamma = (
+    base, metallic, specular, roughness, sheen, clearcoat, gloss, loss, kappa, gamma, share, second, retro = (
         float(getattr(surface, name)) for name in NAMES
     )
-    alpha = max(roughness, 0.1) ** 2
-    area, _ = integrate.quad(
-        lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
-        0,
-        1,
-        points=[1 - alpha**2],
-        epsrel=1e-9,
-    )
+
+    def facets(nh: float, nl: float, nv: float, roughness: float, gamma: float) -> float:
+        alpha = max(roughness, 0.1) ** 2
+        area, _ = integrate.quad(
+            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
+            0,
+            1,
+            points=[1 - alpha**2],
+            epsrel=1e-9,
+        )
+        ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
+        return float(ndf * g1(nl, alpha) * g1(nv, alpha))
+
+    def schlick(cosine: float) -> float:
+        return float((1 - cosine) ** 5)
+
+    def g1(cosine: float, alpha: float) -> float:
+        tangent = np.sqrt(1 - cosine**2) / cosine
+        return float(2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)))
+
     v = np.array([0.0, 0.0, 1.0])
     result = []
     for light in lights:
@@ -72,21 +87,14 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
             continue
         h = (light + v) / np.linalg.norm(light + v)
         nh, lh = n @ h, light @ h
-
-        def schlick(cosine: float) -> float:
-            return float((1 - cosine) ** 5)
-
-        def g1(cosine: float, alpha: float) -> float:
-            tangent = np.sqrt(1 - cosine**2) / cosine
-            return float(2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)))
-
         fd90 = 1 - loss if loss else 0.5 + 2 * roughness * lh**2
         diffuse = base / np.pi * (1 + (fd90 - 1) * schlick(nl)) * (1 + (fd90 - 1) * schlick(nv))
         diffuse *= (nl * nv) ** (kappa - 1)
-        ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
+        diffuse += base / np.pi * retro * ((1 + light @ v) / 2) ** 20
         f0 = (1 - metallic) * 0.08 * specular + metallic * base
         fresnel = f0 + (1 - f0) * schlick(lh)
-        lobe = ndf * fresnel * g1(nl, alpha) * g1(nv, alpha) / (4 * nl * nv)
+        lobe = (1 - share) * facets(nh, nl, nv, roughness, gamma) + share * facets(nh, nl, nv, second, 2)
+        lobe *= fresnel / (4 * nl * nv)
         coat_alpha = 0.1 * (1 - gloss) + 0.001 * gloss
         coat_ndf = (coat_alpha**2 - 1) / (np.pi * np.log(coat_alpha**2) * (1 + (coat_alpha**2 - 1) * nh**2))
         coat_fresnel = 0.04 + 0.96 * schlick(lh)
@@ -111,6 +119,9 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         material(minnaert=1.4, sheen=0.3),
         material(specular=1.0, roughness=0.4, tail_exponent=1.1),
         material(metallic=1.0, roughness=0.3, tail_exponent=1.6, clearcoat=4.0, clearcoat_gloss=0.5),
+        material(metallic=1.0, roughness=0.6, second_share=0.3, second_roughness=0.2),
+        material(specular=2.0, tail_exponent=1.5, second_share=0.7, second_roughness=0.8),
+        material(retro=0.5),
         material(sheen=1.0),
         material(clearcoat=1.0, clearcoat_gloss=0.0),
         material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
@@ -221,14 +232,18 @@ def test_drawn_materials_have_the_stated_classes() -> None:
     values = {name: getattr(drawn, name).numpy().ravel() for name in NAMES}
     metal, blend = values["metallic"] == 1, (values["metallic"] > 0) & (values["metallic"] < 1)
     # Four standard deviations of a share of 40 000 are 0.01.
-    assert metal.mean() == pytest.approx(0.25, abs=0.01)
-    assert blend.mean() == pytest.approx(0.10, abs=0.01)
-    assert (values["specular"] > 1).mean() == pytest.approx(0.30 / 2, abs=0.01)
+    assert metal.mean() == pytest.approx(0.28, abs=0.01)
+    assert blend.mean() == pytest.approx(0.14, abs=0.01)
+    assert (values["specular"] > 1).mean() == pytest.approx(0.28 / 2, abs=0.01)
     assert (values["specular"][metal] <= 1).all()
     assert (values["sheen"] > 0)[~metal].mean() == pytest.approx(0.2, abs=0.01)
     assert not values["sheen"][metal].any()
-    assert (values["clearcoat"] > 0).mean() == pytest.approx(0.2, abs=0.01)
-    assert (values["clearcoat"] > 1).mean() == pytest.approx(0.1, abs=0.01)
+    assert (values["clearcoat"] > 0).mean() == pytest.approx(0.25, abs=0.01)
+    assert (values["clearcoat"] > 1).mean() == pytest.approx(0.15, abs=0.01)
+    assert (values["second_share"] > 0)[metal | blend].mean() == pytest.approx(0.4, abs=0.02)
+    assert (values["second_share"] > 0)[~(metal | blend)].mean() == pytest.approx(0.15, abs=0.01)
+    assert (values["retro"] > 0)[~metal].mean() == pytest.approx(0.08, abs=0.01)
+    assert not values["retro"][metal].any()
     assert (values["interface_loss"] > 0).mean() == pytest.approx(0.6, abs=0.01)
     assert (values["minnaert"] != 1).mean() == pytest.approx(0.7, abs=0.01)
     assert (values["tail_exponent"] < 2).mean() == pytest.approx(0.5, abs=0.01)
@@ -246,6 +261,9 @@ def test_drawn_materials_have_the_stated_classes() -> None:
         "interface_loss": (0, 1),
         "minnaert": (0.85, 1.5),
         "tail_exponent": (1.1, 2),
+        "second_share": (0, 0.7),
+        "second_roughness": (0.1, 0.8),
+        "retro": (0, 1),
     }
     for name, (low, high) in ranges.items():
         assert low - 1e-3 <= values[name].min() <= low + 0.01, name

@@ -9,12 +9,14 @@ from typing import NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.effects import (
+from splinecli.synthesis.faults import (
     add_sensor_noise,
     disturb_light_directions,
     disturb_light_intensities,
     draw_exposure,
+    draw_light_intensities,
     quantise,
+    restore,
 )
 
 
@@ -28,9 +30,10 @@ class CaptureConfig:
         min_lights, max_lights, usual_lights: see draw_light_counts.
         light_direction_error_share: pixels with errors of the light directions.
         light_intensity_error_share: pixels with errors of the light intensities.
-        saturated_share: pixels that are clipped.
+        unequal_lights_share: pixels whose lights differ in intensity, which is divided out.
+        saturated_share: pixels that are clipped. Half of them are restored as `infer` does.
         sensor_noise: whether there are noise and quantisation.
-        eight_bit_share: pixels with 8 bits; the others have 16.
+        eight_bit_share: pixels with 8 bits; the others have 10 to 16.
     """
 
     min_lights: int = 4
@@ -38,9 +41,10 @@ class CaptureConfig:
     usual_lights: int = 10
     light_direction_error_share: float = 0.5
     light_intensity_error_share: float = 0.5
-    saturated_share: float = 0.08
+    unequal_lights_share: float = 0.5
+    saturated_share: float = 0.1
     sensor_noise: bool = True
-    eight_bit_share: float = 0.15
+    eight_bit_share: float = 0.3
 
 
 class DenseMap(NamedTuple):
@@ -152,12 +156,17 @@ def photograph(
     generator: torch.Generator,
 ) -> PixelBatch:
     """Photograph radiance (P, F) under directions (P, F, 3) with the faults of a camera and of a calibration."""
+    intensities = draw_light_intensities(*radiance.shape, config.unequal_lights_share, generator)
     radiance = radiance * valid
-    exposure = draw_exposure(radiance, config.saturated_share, generator)
-    observed = disturb_light_intensities(radiance * exposure, config.light_intensity_error_share, generator)
-    observed = observed.clamp(max=1)
+    exposure = draw_exposure(radiance * intensities, config.saturated_share, generator)
+    exposed = (radiance * intensities * exposure).clamp(max=1)
+    clipped = exposed >= 1
     if config.sensor_noise:
-        observed = add_sensor_noise(observed, generator)
-        observed = quantise(observed, config.eight_bit_share, generator)
+        exposed = quantise(add_sensor_noise(exposed, generator), config.eight_bit_share, generator)
+    exposed = torch.where(clipped, 1, exposed)
+    observed = disturb_light_intensities(
+        exposed * valid / intensities, config.light_intensity_error_share, generator
+    )
     calibrated = disturb_light_directions(directions, config.light_direction_error_share, generator)
-    return PixelBatch(observed * valid, calibrated, valid, truth, exposure)
+    restored = restore(observed, clipped & valid, calibrated, valid, generator)
+    return PixelBatch(restored, calibrated, valid, truth, exposure)

@@ -1,7 +1,6 @@
-"""Effects of real captures on a pixel. Each function states the distribution that it draws from.
+"""Effects of the scene on a pixel: walls and ambient light. Each function states the distribution that it draws from.
 
-Effects of the scene, such as walls and ambient light, depend on the light direction, so they also shape the dense
-map. Effects of the capture, such as errors of the lights and of the camera, change the sparse observations alone.
+They depend on the light direction, so they also shape the dense map. The faults of a capture are in faults.py.
 """
 
 from __future__ import annotations
@@ -150,55 +149,3 @@ def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tenso
     """Draw ambient light (P, 1), to be scaled by the albedo: 10^U(-3.5, -1.3) for a share of the pixels, else 0."""
     present = _uniform(generator, pixels, 1) < share
     return 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present
-
-
-def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Add Gaussian errors of calibration to the directions (P, F, 3) of a share of the pixels.
-
-    Their sigma on either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
-    """
-    pixels = len(directions)
-    sigma = math.radians(8.0) * _uniform(generator, pixels, 1, 1) ** 3
-    sigma = sigma * (_uniform(generator, pixels, 1, 1) < share)
-    moved = directions + sigma * torch.randn(directions.shape, generator=generator, device=directions.device)
-    moved = torch.cat((moved[..., :2], moved[..., 2:].clamp(min=0.01)), dim=-1)
-    return torch.nn.functional.normalize(moved, dim=-1)
-
-
-def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Multiply observations (P, F) by Gaussian errors of intensity, sigma U(0, 5 %), for a share of the pixels."""
-    sigma = _uniform(generator, len(observations), 1, high=0.05) * (
-        _uniform(generator, len(observations), 1) < share
-    )
-    factor = 1 + sigma * torch.randn(observations.shape, generator=generator, device=observations.device)
-    return observations * factor.clamp(min=0)
-
-
-def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
-    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
-
-    The brightest observation lies at 10^U(-1.3, 0). For `saturated_share` of the pixels it lies at U(1, 3), to be
-    clipped.
-    """
-    pixels = len(radiance)
-    level = 10 ** _uniform(generator, pixels, 1, low=-1.3, high=0.0)
-    over = _uniform(generator, pixels, 1, low=1.0, high=3.0)
-    level = torch.where(_uniform(generator, pixels, 1) < saturated_share, over, level)
-    return level / radiance.amax(dim=1, keepdim=True).clamp(min=1e-6)
-
-
-def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
-    """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both Gaussian."""
-    pixels = len(exposed)
-    read = 10 ** _uniform(generator, pixels, 1, low=-4.0, high=-2.5)
-    shot = 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-2.0)
-    sigma = (read * read + shot * shot * exposed.clamp(min=0)).sqrt()
-    noise = torch.randn(exposed.shape, generator=generator, device=exposed.device)
-    return (exposed + sigma * noise).clamp(0, 1)
-
-
-def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator) -> Tensor:
-    """Round to 8 bits for a share of the pixels and to 16 bits for the others."""
-    eight = _uniform(generator, len(exposed), 1) < eight_bit_share
-    steps = torch.where(eight, 255.0, 65535.0).to(exposed.dtype)
-    return (exposed * steps).round() / steps

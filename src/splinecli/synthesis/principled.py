@@ -15,12 +15,15 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+_RETRO_EXPONENT = 20
+"""The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart."""
+
 
 @dataclass(frozen=True)
 class PrincipledMaterial:
     """Parameters of the principled BRDF, each (P, 1), in Burley's ranges; specular reaches 4, as in CyclesPS.
 
-    Three are not Burley's.
+    Six are not Burley's.
 
     interface_loss: where above 0, the diffuse light loses this share at grazing angles, on its way in and on its way
         out, as through the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
@@ -28,6 +31,9 @@ class PrincipledMaterial:
         as on dust, over 1 steep as on marble.
     tail_exponent: gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2 is
         GGX; smaller values give longer tails.
+    second_share: share of the facets that form a second highlight, such as the flakes of a metallic paint.
+    second_roughness: the roughness of these facets.
+    retro: a lobe towards the light, as of fabrics, dust and road paint, in units of the base colour.
     """
 
     base: Tensor
@@ -40,6 +46,9 @@ class PrincipledMaterial:
     interface_loss: Tensor
     minnaert: Tensor
     tail_exponent: Tensor
+    second_share: Tensor
+    second_roughness: Tensor
+    retro: Tensor
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
         """Return the materials of some of the pixels."""
@@ -60,16 +69,16 @@ class PrincipledMaterial:
         diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
         if bool((self.minnaert != 1).any()):
             diffuse = diffuse * _power((lit * n_dot_v).clamp(min=1e-4), self.minnaert - 1)
+        if bool((self.retro > 0).any()):
+            diffuse = diffuse + self.retro * l_dot_h ** (2 * _RETRO_EXPONENT)
         diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
 
-        alpha_squared = (self.roughness**4).clamp(min=1e-4)
         f0 = (0.08 * self.specular * (1 - self.metallic) + self.base * self.metallic).clamp(max=1)
-        spread = n_dot_h_squared * (alpha_squared - 1) + 1
-        if bool((self.tail_exponent < 2).any()):
-            lobe = _tail_norm(alpha_squared, self.tail_exponent) * _power(spread, -self.tail_exponent)
-        else:
-            lobe = alpha_squared / (spread * spread)
-        specular = lobe * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared)
+        specular = _facets(n_dot_h_squared, lit, n_dot_v, self.roughness, self.tail_exponent)
+        if bool((self.second_share > 0).any()):
+            ggx = torch.full_like(self.tail_exponent, 2.0)
+            second = _facets(n_dot_h_squared, lit, n_dot_v, self.second_roughness, ggx)
+            specular = torch.lerp(specular, second, self.second_share)
         radiance = diffuse + specular * (f0 + (1 - f0) * fresnel)
 
         if bool((self.clearcoat > 0).any()):
@@ -88,15 +97,18 @@ class PrincipledMaterial:
 
 
 def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial:
-    """Draw random materials: 35 % matte, 30 % specular, 25 % metallic, 10 % half metallic.
+    """Draw random materials: 30 % matte, 28 % specular, 28 % metallic, 14 % half metallic.
 
     base: U(0.05, 1); 10^U(-1.7, 0) for half of what is no metal, because many real surfaces are dark.
     roughness: U(0.05, 1); U(0.1, 0.9) for metals.
     specular: U(0, 1); U(1, 4) for half of the specular class.
-    metallic: 0, 1 or U(0, 1).
+    metallic: 0, 1 or U(0, 1): between them lie metallic paints and gilding with a patina.
     sheen: U(0, 1) on a fifth of the dielectrics.
-    clearcoat: U(0, 1) on 10 %, and U(1, 4), a full coat of lacquer, on 10 %; gloss U(0, 1).
+    clearcoat: U(0, 1) on 10 %, and U(1, 4), a full coat of lacquer, on 15 %; gloss U(0, 1).
     interface_loss: U(0, 1) on 60 %. minnaert: U(0.85, 1.5) on 70 %. tail_exponent: U(1.1, 2) on 50 %.
+    second_share: U(0, 0.7) on 40 % of the metals and half metals and on 15 % of the others; second_roughness:
+    U(0.1, 0.8).
+    retro: 10^U(-1.3, 0) on 8 % of what is no metal.
 
     MERL's measured materials fall faster than by the cosine: as (n.l)^1.14 in the median of those that are no metal,
     nine tenths of them between 0.86 and 1.47. The ranges of base and minnaert were chosen to come near that.
@@ -107,23 +119,40 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
         return torch.rand(pixels, 1, generator=generator, device=device) * (high - low) + low
 
     kind, split = uniform(), uniform()
-    metal = (kind >= 0.65) & (kind < 0.9)
-    blend = kind >= 0.9
-    shiny = (kind >= 0.35) & ~metal & ~blend
+    metal = (kind >= 0.58) & (kind < 0.86)
+    blend = kind >= 0.86
+    shiny = (kind >= 0.30) & (kind < 0.58)
     zero, one = torch.zeros_like(kind), torch.ones_like(kind)
     coat, dark = uniform(), (uniform() < 0.5) & ~metal
+    has_second = uniform() < torch.where(metal | blend, 0.4, 0.15)
     return PrincipledMaterial(
         base=torch.where(dark, 10 ** uniform(-1.7, 0.0), uniform(0.05, 1.0)),
         metallic=torch.where(metal, one, torch.where(blend, uniform(), zero)),
         specular=torch.where(shiny & (split < 0.5), uniform(1.0, 4.0), uniform()),
         roughness=torch.where(metal | blend, uniform(0.1, 0.9), uniform(0.05, 1.0)),
         sheen=torch.where((uniform() < 0.2) & ~metal, uniform(), zero),
-        clearcoat=torch.where(coat < 0.1, uniform(), torch.where(coat < 0.2, uniform(1.0, 4.0), zero)),
+        clearcoat=torch.where(coat < 0.1, uniform(), torch.where(coat < 0.25, uniform(1.0, 4.0), zero)),
         clearcoat_gloss=uniform(),
         interface_loss=torch.where(uniform() < 0.6, uniform(), zero),
         minnaert=torch.where(uniform() < 0.7, uniform(0.85, 1.5), one),
         tail_exponent=torch.where(uniform() < 0.5, uniform(1.1, 2.0), one + 1),
+        second_share=torch.where(has_second, uniform(0.0, 0.7), zero),
+        second_roughness=uniform(0.1, 0.8),
+        retro=torch.where((uniform() < 0.08) & ~metal, 10 ** uniform(-1.3, 0.0), zero),
     )
+
+
+def _facets(
+    n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor
+) -> Tensor:
+    """Return the facets' distribution times their shadowing; GGX where the tail exponent is 2."""
+    alpha_squared = (roughness**4).clamp(min=1e-4)
+    spread = n_dot_h_squared * (alpha_squared - 1) + 1
+    if bool((tail_exponent < 2).any()):
+        lobe = _tail_norm(alpha_squared, tail_exponent) * _power(spread, -tail_exponent)
+    else:
+        lobe = alpha_squared / (spread * spread)
+    return lobe * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared)
 
 
 def schlick_weight(cosine: Tensor) -> Tensor:

@@ -152,6 +152,7 @@ def soften(material: Material) -> Material:
         return replace(
             material,
             roughness=material.roughness.clamp(min=SOFTEST),
+            second_roughness=material.second_roughness.clamp(min=SOFTEST),
             clearcoat_gloss=torch.zeros_like(material.clearcoat_gloss),
         )
     if isinstance(material, MixedMaterial):

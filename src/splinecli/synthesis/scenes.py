@@ -221,6 +221,9 @@ def draw_class(name: str, patches: int, generator: torch.Generator) -> Principle
         interface_loss=zero,
         minnaert=zero + 1,
         tail_exponent=zero + 2,
+        second_share=zero,
+        second_roughness=zero + 1,
+        retro=zero,
     )
 
 

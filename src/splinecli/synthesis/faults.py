@@ -1,0 +1,138 @@
+"""Faults of a capture: exposure, noise, quantisation, and errors of calibration, as random draws for each pixel.
+
+They change the sparse observations alone; the dense map is the truth. Each function states the distribution that it
+draws from. Observations are linear, and 1 is the sensor's full scale.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from splinecli.capture.restore.saturation import restore_saturated
+
+DARK_SHARE = 0.4
+"""Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""
+
+BITS = (10, 12, 14, 16)
+"""Depths of the pixels that do not have 8 bits, equally often."""
+
+
+def _uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+    return torch.rand(*shape, generator=generator, device=generator.device) * (high - low) + low
+
+
+def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """Add Gaussian errors of calibration to the directions (P, F, 3) of a share of the pixels.
+
+    Their sigma on either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
+    """
+    pixels = len(directions)
+    sigma = math.radians(8.0) * _uniform(generator, pixels, 1, 1) ** 3
+    sigma = sigma * (_uniform(generator, pixels, 1, 1) < share)
+    moved = directions + sigma * torch.randn(directions.shape, generator=generator, device=directions.device)
+    moved = torch.cat((moved[..., :2], moved[..., 2:].clamp(min=0.01)), dim=-1)
+    return torch.nn.functional.normalize(moved, dim=-1)
+
+
+def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """Multiply observations (P, F) by Gaussian errors of intensity, sigma U(0, 5 %), for a share of the pixels."""
+    sigma = _uniform(generator, len(observations), 1, high=0.05) * (
+        _uniform(generator, len(observations), 1) < share
+    )
+    factor = 1 + sigma * torch.randn(observations.shape, generator=generator, device=observations.device)
+    return observations * factor.clamp(min=0)
+
+
+def draw_light_intensities(pixels: int, lights: int, share: float, generator: torch.Generator) -> Tensor:
+    """Draw relative light intensities (P, F), the largest 1; for a share of the pixels 2^U(-2, 0), else equal ones.
+
+    A capture is exposed as its lamps are, and divided by their intensities afterwards: the observations of a weak lamp
+    have coarser steps and more noise.
+    """
+    unequal = _uniform(generator, pixels, 1) < share
+    intensities = 2 ** _uniform(generator, pixels, lights, low=-2.0, high=0.0)
+    return torch.where(unequal, intensities / intensities.amax(dim=1, keepdim=True), 1.0)
+
+
+def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
+    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is full scale.
+
+    The brightest observation of a pixel lies at 10^U(-2.7, -0.7) for DARK_SHARE of the pixels, else at 10^U(-1.3, 0).
+    For `saturated_share` of the pixels it lies at U(1, 3), to be clipped.
+    """
+    pixels = len(radiance)
+    dark = _uniform(generator, pixels, 1) < DARK_SHARE
+    level = _uniform(generator, pixels, 1)
+    level = 10 ** torch.where(dark, 2.0 * level - 2.7, 1.3 * level - 1.3)
+    over = _uniform(generator, pixels, 1, low=1.0, high=3.0)
+    level = torch.where(_uniform(generator, pixels, 1) < saturated_share, over, level)
+    return level / radiance.amax(dim=1, keepdim=True).clamp(min=1e-6)
+
+
+def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
+    """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both Gaussian.
+
+    The read noise is at most a thirtieth of a pixel's largest observation: few keep a capture that is darker than that.
+    """
+    pixels = len(exposed)
+    read = 10 ** _uniform(generator, pixels, 1, low=-4.0, high=-2.5)
+    read = torch.minimum(read, exposed.amax(dim=1, keepdim=True) / 30)
+    shot = 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-2.0)
+    sigma = (read * read + shot * shot * exposed.clamp(min=0)).sqrt()
+    noise = torch.randn(exposed.shape, generator=generator, device=exposed.device)
+    return (exposed + sigma * noise).clamp(0, 1)
+
+
+def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator) -> Tensor:
+    """Quantise values from 0 to 1: to 8 bits for a share of the pixels, else to one of BITS.
+
+    Half of the pixels with 8 bits are encoded by the curve of sRGB, rounded and decoded again. Of the others, half are
+    rounded, and half are cut, as where somebody keeps the high byte of 16.
+    """
+    pixels = len(exposed)
+    eight = _uniform(generator, pixels, 1) < eight_bit_share
+    kind = _uniform(generator, pixels, 1)
+    depth = torch.tensor(BITS, device=exposed.device)[
+        torch.randint(len(BITS), (pixels, 1), generator=generator, device=exposed.device)
+    ]
+    steps = torch.where(eight, 255.0, 2.0**depth - 1).to(exposed.dtype)
+    rounded = (exposed * steps).round() / steps
+    cut = (exposed * 256).floor().clamp(max=255) / 255
+    encoded = _decode_srgb((_encode_srgb(exposed) * 255).round() / 255)
+    return torch.where(eight & (kind < 0.5), encoded, torch.where(eight & (kind < 0.75), cut, rounded))
+
+
+def restore(
+    observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full scale.
+
+    Args:
+        observed: (P, F), clipped.
+        clipped: (P, F) bool.
+        directions: (P, F, 3), unit.
+        valid: (P, F) bool; the others are left out.
+    """
+    chosen = (_uniform(generator, len(observed), 1) < 0.5)[:, 0] & clipped.any(dim=1)
+    rows = chosen.nonzero()[:, 0]
+    if not len(rows):
+        return observed
+    values = observed[rows].cpu().numpy()
+    # An observation that is not valid is dark, so it hardly counts in the fit.
+    lights = (directions[rows] * valid[rows, :, None]).cpu().numpy()
+    restore_saturated(values, clipped[rows].cpu().numpy(), lights)
+    return observed.index_copy(0, rows, torch.from_numpy(values).to(observed))
+
+
+def _encode_srgb(linear: Tensor) -> Tensor:
+    """Return the sRGB encoding (IEC 61966-2-1) of values from 0 to 1, not rounded."""
+    return torch.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    )
+
+
+def _decode_srgb(stored: Tensor) -> Tensor:
+    return torch.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
