@@ -180,7 +180,12 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
 
 # The paper's text (section 4) where it speaks, the authors' code where it does not: docs/train.md.
 PRESETS = {
-    "compact": TrainingConfig(network=NetworkConfig(fits=("ls", "iw12", "iw12-all", "ia14"))),
+    "compact": TrainingConfig(
+        # Half of the paper's cells a side: the set branch has the exact directions that larger cells round.
+        network=NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64),
+        batch_size=512,
+        shards=2,
+    ),
     "paper": TrainingConfig(
         network=NetworkConfig(size="paper"),
         pixels=PixelGeneratorConfig(min_lights=10, max_lights=10, usual_lights=10),
