@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from splinecli.methods import method_names
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
@@ -137,3 +140,17 @@ def test_wrong_lights(run: Run) -> None:
     assert cells.pop("right") == "0 of 1"
     assert len(cells) == 9
     assert sum(cell == "1 / 1 of 1" for cell in cells.values()) >= 8
+
+
+def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
+    """Trained weights are better on measured materials than a network without training, which is a Lambertian fit."""
+    lights = shared_data / "DiLiGenT/pmsData/ballPNG/light_directions.txt"
+    materials = shared_data / "merl_nbrdf/merl_nbrdf.npz"
+    untrained = tmp_path / "untrained.safetensors"
+    save_weights(SplineNet(NetworkConfig()), untrained)
+    weights = "--weights", "spline-net", "--weights", str(untrained)
+    printed = run(
+        "measured_spheres", str(materials), str(lights), *weights, "--draws", "1", "--pixels", "4"
+    ).splitlines()
+    trained, fit = (float(re.findall(r": (\S+) degrees", line)[0]) for line in printed)
+    assert trained < 0.7 * fit
