@@ -1,5 +1,5 @@
 #!/bin/sh
-# Train the weights that come with splinecli from scratch, in about six hours on two cores:
+# Train the weights that come with splinecli from scratch, in about five hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
@@ -9,7 +9,7 @@ set -eu
 folder=${1:?name a folder for the scenes and the runs}
 
 splinecli=${SPLINECLI:-splinecli}
-"$splinecli" prepare --scenes 48 --seed 11 -o "$folder/scenes"
+"$splinecli" prepare --scenes 15 --size 96 --n-lights 200 --seed 21 -o "$folder/scenes"
 
 # Resume a run that was interrupted; skip a run that is finished.
 run() {
@@ -20,14 +20,12 @@ run() {
   "$splinecli" train "$folder/scenes" "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-run spline-net-1 --preset compact --generator-weight 3 --steps 15357
-run spline-net-2 --preset compact --generator-weight 2 --steps 12294 --param learning_rate=1e-3 \
-  --start-from "$folder/spline-net-1/weights.safetensors"
-run spline-net-3 --preset compact --generator-weight 2 --steps 7000 --param learning_rate=1e-3 \
-  --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-2/weights.safetensors"
+run spline-net-1 --preset compact --generator-weight 2 --steps 6280
+run spline-net-2 --preset compact --generator-weight 2 --steps 2340 --param learning_rate=1e-3 \
+  --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
 run cnn-ps-1 --preset cnn-ps --generator-weight 3 --steps 8136
 run cnn-ps-2 --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
   --start-from "$folder/cnn-ps-1/weights.safetensors"
 
-echo "$folder/spline-net-3/weights.safetensors"
+echo "$folder/spline-net-2/weights.safetensors"
 echo "$folder/cnn-ps-2/weights.safetensors"

@@ -123,7 +123,7 @@ def restore(
     values = observed[rows].cpu().numpy()
     # An observation that is not valid is dark, so it hardly counts in the fit.
     lights = (directions[rows] * valid[rows, :, None]).cpu().numpy()
-    restore_saturated(values, clipped[rows].cpu().numpy(), lights)
+    restore_saturated(values, clipped[rows].cpu().numpy(), lights.__getitem__)
     return observed.index_copy(0, rows, torch.from_numpy(values).to(observed))
 
 
