@@ -96,6 +96,9 @@ def material(*, glossy: bool) -> PrincipledMaterial:
         interface_loss=one(0.0),
         minnaert=one(1.0),
         tail_exponent=one(2.0),
+        second_share=one(0.0),
+        second_roughness=one(1.0),
+        retro=one(0.0),
     )
 
 

@@ -119,9 +119,9 @@ def test_how_sure_the_network_is(capture, run):
     confidence, report = np.load(out / "confidence.npy"), read_report(out)
     assert (confidence.dtype, confidence.shape) == (np.float32, mask.shape)
     assert not confidence[~mask].any()
-    # A matte sphere is the easiest there is.
+    # A matte sphere is the easiest there is, which the network cannot know from one pixel.
     assert report["angular_error_deg"]["under_5"] == 1
-    assert 0.7 < confidence[mask].mean() < 1
+    assert 0.5 < confidence[mask].mean() < 1
     assert report["expected_under_5"] == pytest.approx(confidence[mask].mean(), abs=1e-4)
     picture = cv2.imread(str(out / "confidence.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(picture, np.rint(255 * confidence))

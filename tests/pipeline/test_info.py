@@ -18,6 +18,7 @@ REPORT = {
     "image_kinds": [{"size": [30, 20], "channels": 3, "type": "uint8"}],
     "n_pixels": 600,
     "light_directions": "cat/lights.txt",
+    "lamps": None,
     "light_intensities": None,
     "mask": None,
     "ground_truth": None,
