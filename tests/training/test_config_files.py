@@ -92,7 +92,7 @@ def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
         ("[pixels]\nwall = 0.3", "unknown training setting 'wall'"),
         ("[network]\nwidht = 5", "unknown network setting 'widht'"),
         ("network = 5", "training setting 'network' is 5; expected a table"),
-        ("batch_size = 6", "'batch_size' is 6; expected a multiple of shards = 4"),
+        ("batch_size = 7", "'batch_size' is 7; expected a multiple of shards = 2"),
         ('sources = "set"', "'sources' is 'set'; expected a table"),
         ("[sources]\ngenerator = -1", "the weight of source 'generator' is -1"),
         ("steps = ", "is not TOML"),
@@ -186,7 +186,7 @@ def test_a_setting_that_is_not_given_stays_as_it_was(tmp_path: Path) -> None:
     assert configure_resumed(started, tmp_path) == started
     assert configure_resumed(started, tmp_path, changes=[{"batch_size": 32}]) == started
     # A preset gives all settings.
-    with pytest.raises(ModelError, match="batch_size = 32, not 256"):
+    with pytest.raises(ModelError, match="batch_size = 32, not 512"):
         configure_resumed(started, tmp_path, "compact", changes=[{"seed": 5}])
 
 
