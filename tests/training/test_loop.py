@@ -281,7 +281,9 @@ def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(
 
 
 def test_weights_of_another_network_cannot_begin_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="'spline-net' are of a network with map_size = 16, the run's has 32"):
+    with pytest.raises(
+        ModelError, match="'spline-net' are of a network with map_size = 16, the run's has 32"
+    ):
         Trainer(replace(tiny, start_from="spline-net"), tmp_path, CPU)
 
 

@@ -156,7 +156,9 @@ def photograph(
     generator: torch.Generator,
 ) -> PixelBatch:
     """Photograph radiance (P, F) under directions (P, F, 3) with the faults of a camera and of a calibration."""
-    intensities = draw_light_intensities(len(radiance), radiance.shape[1], config.unequal_lights_share, generator)
+    intensities = draw_light_intensities(
+        len(radiance), radiance.shape[1], config.unequal_lights_share, generator
+    )
     radiance = radiance * valid
     exposure = draw_exposure(radiance * intensities, config.saturated_share, generator)
     exposed = (radiance * intensities * exposure).clamp(max=1)
