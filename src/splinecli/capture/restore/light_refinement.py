@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
 from splinecli.capture.record import Capture
-from splinecli.capture.restore.robust_fit import absolute_weights
+from splinecli.capture.restore.robust_fit import absolute_weights, fit_scaled_normals
 from splinecli.errors import UsageError
 from splinecli.normals import angle_between_deg, unit
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
 
 Array = NDArray[np.float64]
 
@@ -53,7 +52,6 @@ _WORTH_PIXELS = 50.0
 _MAX_ROUNDS = 150
 _FIRST_FITS, _FITS_PER_ROUND = 8, 2
 _CONVERGED = 1e-4
-_RIDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +175,8 @@ def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
 
 def _fit(values: Array, lights: Array, lit: Array, weights: Array, fits: int) -> tuple[Array, Array]:
     """Return scaled normals (p, 3) of a robust matte fit, and the weights (p, F) for the next."""
-    x, y, z = lights.T
-    products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
     for _ in range(fits):
-        xx, yy, zz, xy, xz, yz = (weights @ products).T
-        covariance = inverse_3x3((xx + _RIDGE, yy + _RIDGE, zz + _RIDGE, xy, xz, yz), _RIDGE)
-        right_side = (weights * values) @ lights
-        normals = np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
+        normals = np.asarray(fit_scaled_normals(values, weights, lights), np.float64)
         weights = lit * absolute_weights(values - normals @ lights.T)
     return normals, weights
 

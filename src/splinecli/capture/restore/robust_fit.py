@@ -33,15 +33,23 @@ def predict(observations: Array, weights: Array, light_directions: Array) -> Arr
         observations, weights: (P, F).
         light_directions: (F, 3) or (P, F, 3), unit.
     """
+    scaled_normals = fit_scaled_normals(observations, weights, light_directions)
+    if light_directions.ndim == 2:
+        return np.asarray(scaled_normals @ light_directions.T)
+    return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
+
+
+def fit_scaled_normals(observations: Array, weights: Array, light_directions: Array) -> Array:
+    """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
+
+    The arguments are those of predict.
+    """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)
     xx, yy, zz, xy, xz, yz = _sum_over_lights(weights, products).T
     covariance = inverse_3x3((xx + _PRIOR, yy + _PRIOR, zz + _PRIOR, xy, xz, yz), _PRIOR)
     right_side = _sum_over_lights(weights * observations, light_directions)
-    scaled_normals = np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
-    if light_directions.ndim == 2:
-        return np.asarray(scaled_normals @ light_directions.T)
-    return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
+    return np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
 
 
 def _sum_over_lights(values: Array, terms: Array) -> Array:
