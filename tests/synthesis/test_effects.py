@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 from torch import Tensor
 
+from distributions import SHARE, N, assert_uniform, generator
 from splinecli.observation_map import cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.effects import (
     Wall,
@@ -21,22 +21,6 @@ from splinecli.synthesis.effects import (
 )
 from splinecli.synthesis.pixels import draw_visible_normals
 from splinecli.synthesis.principled import PrincipledMaterial
-
-N = 20_000
-# Four standard deviations of a share of 20 000.
-SHARE = 0.015
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def assert_uniform(values: Tensor | NDArray[Any], low: float, high: float) -> None:
-    flat = np.asarray(values, np.float64).ravel()
-    margin = 1e-4 * (high - low)
-    assert flat.min() >= low - margin
-    assert flat.max() <= high + margin
-    assert stats.kstest(flat, stats.uniform(low, high - low).cdf).pvalue > 1e-3
 
 
 def test_dot_of_shared_and_of_own_directions() -> None:

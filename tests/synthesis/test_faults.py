@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
+from distributions import SHARE, N, assert_uniform, generator
 from splinecli.normals import angle_between_deg
 from splinecli.synthesis.faults import (
     BITS,
@@ -24,22 +23,6 @@ from splinecli.synthesis.faults import (
     restore,
 )
 from splinecli.transfer import decode_transfer
-
-N = 20_000
-# Four standard deviations of a share of 20 000.
-SHARE = 0.015
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def assert_uniform(values: Tensor | NDArray[Any], low: float, high: float) -> None:
-    flat = np.asarray(values, np.float64).ravel()
-    margin = 1e-4 * (high - low)
-    assert flat.min() >= low - margin
-    assert flat.max() <= high + margin
-    assert stats.kstest(flat, stats.uniform(low, high - low).cdf).pvalue > 1e-3
 
 
 def tilted_lights(pixels: int, lights: int) -> Tensor:

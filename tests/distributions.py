@@ -1,0 +1,27 @@
+"""Draws of many values, compared with the distribution that they come from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+from torch import Tensor
+
+N = 20_000
+# Four standard deviations of a share of 20 000.
+SHARE = 0.015
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def assert_uniform(values: Tensor | NDArray[Any], low: float, high: float) -> None:
+    flat = np.asarray(values, np.float64).ravel()
+    margin = 1e-4 * (high - low)
+    assert flat.min() >= low - margin
+    assert flat.max() <= high + margin
+    assert stats.kstest(flat, stats.uniform(low, high - low).cdf).pvalue > 1e-3
