@@ -109,7 +109,8 @@ def test_busy_machine(run: Run) -> None:
     assert row.startswith("quiet")
     default, passive, single, ratio = numbers(row)
     assert min(default, passive, single) > 0
-    assert ratio == pytest.approx(default / passive, abs=0.02 * ratio + 0.02)
+    # The times are printed with one or two digits after the point.
+    assert (default - 0.05) / (passive + 0.05) - 0.05 <= ratio <= (default + 0.05) / (passive - 0.05) + 0.05
 
 
 def test_diligent_figures(run: Run, tmp_path: Path) -> None:

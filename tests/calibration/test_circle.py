@@ -88,7 +88,7 @@ def test_real_balls(shared_data: Path, record_property: Callable[[str, object], 
         x, y, radius = (float(word) for word in (folder / "circle_data.txt").read_text().split())
         picture = read_image(folder / "ref.JPG").mean(axis=2)
         found = find_circle(picture)
-        record_property(f"ball {number}", found)
+        record_property(f"ball {number}", repr(found))
         assert_close(found, Circle(x, len(picture) - y, radius), 0.01 * radius)
     found = circle_from_mask(read_mask(shared_data / "uw/chrome/mask.png"))
     assert found.visible > 0.98
