@@ -131,6 +131,34 @@ def test_wrong_files_are_named(run, bump: Path) -> None:
         (bump / name).unlink()
 
 
+@pytest.mark.parametrize("command", ["infer", "info"])
+def test_positions_in_another_unit_than_the_pixel_size(run, bump: Path, command: str) -> None:
+    """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the bump."""
+    arguments = [
+        command,
+        "bump",
+        *(["--method", "ls", "--overwrite"] if command == "infer" else []),
+        "--strict",
+    ]
+    nearest = np.linalg.norm(POSITIONS, axis=1).min() / 1000
+    number = int(np.linalg.norm(POSITIONS, axis=1).argmin()) + 1
+    (bump / "pixel_size.txt").write_text("2\n")
+    np.savetxt(bump / "light_positions.txt", POSITIONS / 1000)
+    refused = run(*arguments)
+    assert refused.code == 3
+    assert "light_positions.txt: " in refused.err
+    assert f"lamp {number} is {nearest:.3g} from the middle of the object, which is 64 wide" in refused.err
+    assert "inside the object. Give all lengths in one unit, such as millimetres" in refused.err
+    for factor, words in ((0.3, "A lamp is very near"), (1000, "so far that they are distant")):
+        np.savetxt(bump / "light_positions.txt", POSITIONS * factor)
+        warned = run(*arguments)
+        assert (warned.code, words in warned.err) == (3, True), warned.err
+        warned = run(*arguments[:-1])
+        assert (warned.code, words in warned.err) == (0, True), warned.err
+    np.savetxt(bump / "light_positions.txt", POSITIONS)
+    assert run(*arguments).code == 0
+
+
 def test_evaluate_and_prepare(run, bump: Path) -> None:
     """Scoring a sample of the pixels finds the surface from all of them."""
     np.savetxt(bump / "light_positions.txt", POSITIONS)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splinecli.capture.formats.images import to_linear
+from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.observations import StoredPixels, collect_observations
@@ -82,7 +83,8 @@ def capture_from_arrays(
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
         lamps = NearLamps.of(positions, pixel_size, (shape[0], shape[1]), equal=not known)
-        capture, known = replace(capture, lamps=lamps), True
+        warnings = (*capture.warnings, *check_distances(lamps, inside, None))
+        capture, known = replace(capture, lamps=lamps, warnings=warnings), True
     stored = StoredCapture(capture, found.saturation, intensities_known=known)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 
 
@@ -44,6 +42,7 @@ HIGH_LIGHTS = "high_lights"
 IMAGES_LEFT_OUT = "images_left_out"
 LIGHTS_CROWDED = "lights_crowded"
 KEPT_LIGHTS = "kept_lights"
+LAMP_DISTANCE = "lamp_distance"
 LIGHTS_MATCHED = "lights_matched"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
@@ -59,6 +58,7 @@ PROBABLY_WRONG = frozenset(
     {
         ENCODED_VALUES,
         GROUND_TRUTH_Z,
+        LAMP_DISTANCE,
         LIGHT_FRAME,
         LIGHT_ORDER,
         LOW_CONFIDENCE,
@@ -72,9 +72,6 @@ SATURATED_SHARE = 0.01
 
 BLACK_SHARE = 0.01
 """The share of pixels without light above which the capture carries a warning."""
-
-NEAR_DEG = 2.0
-"""The change of a light direction across the object above which distant lights carry a warning."""
 
 
 def white_level(level: WhiteLevel | None) -> CaptureWarning | None:
@@ -242,30 +239,6 @@ def kept_lights() -> CaptureWarning:
         "The light directions were not refined: no others near them fit the images much better, or there are fewer"
         " than 6 lights or too few pixels.",
     )
-
-
-def distant_lights(
-    positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]
-) -> list[CaptureWarning]:
-    """Warn that lights count as distant although a file has their positions; with a list of one warning or none.
-
-    Args:
-        positions: the file.
-        lamps: the lamps of the file, or None where their scale is unknown.
-        mask: (H, W), the object.
-    """
-    name = "the lamps' positions" if positions is None else positions.name
-    if lamps is None:
-        text = f"{name} is not used, because nothing tells the size of a pixel. Give --pixel-size or --object-width."
-        return [CaptureWarning(NEAR_LAMPS, text)]
-    angle_deg = lamps.angles_across_deg(mask).max()
-    if angle_deg <= NEAR_DEG:
-        return []
-    text = (
-        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
-        " and the edge of the object, but the lights count as distant. Use --light-positions instead of --lights."
-    )
-    return [CaptureWarning(NEAR_LAMPS, text)]
 
 
 def few_lights(n_lights: int) -> CaptureWarning:

@@ -16,6 +16,7 @@ from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
+from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
@@ -116,8 +117,8 @@ class CaptureSource:
         warnings = [*self.warnings, *found.warnings()]
         if upside_down:
             warnings.append(capture_warnings.ground_truth_upside_down())
-        lamps, far_from_distant = self._near_lamps(mask)
-        warnings += far_from_distant
+        lamps, of_lamps = self.near_lamps(mask)
+        warnings += of_lamps
         if ground_truth is not None and (ground_truth[mask][:, 2] < 0).mean() > 0.5:
             warnings.append(capture_warnings.ground_truth_z())
         capture = Capture(
@@ -184,14 +185,18 @@ class CaptureSource:
             self.light_directions, mask, equal=self.equal_lamps, frame=self.light_frame, step=step
         )
 
-    def _near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
-        """Return all near lamps over a mask (H, W), or None for distant lights, which may deserve a warning."""
+    def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
+        """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.
+
+        Raises:
+            InputError: a lamp would be inside the object.
+        """
         if self.lamps is None:
             return None, []
         lamps = self.lamps_over(mask)
-        if self.lamps.used:
-            return lamps, []
-        return None, capture_warnings.distant_lights(self.lamps.positions, lamps, mask)
+        if lamps is None or not self.lamps.used:
+            return None, distant_lights(self.lamps.positions, lamps, mask)
+        return lamps, check_distances(lamps, mask, self.lamps.positions)
 
     def _stored_pixels(
         self, indices: Sequence[int], mask: NDArray[np.bool_], first: NDArray[Any]

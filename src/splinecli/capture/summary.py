@@ -62,6 +62,7 @@ class CaptureSummary:
         n_pixels: number of the mask's pixels.
         white_level: as in Capture.
         sample: some of the pixels of all images, on a grid; None where images have different sizes.
+        lamp_warnings: about near lamps over this mask.
     """
 
     source: CaptureSource
@@ -69,6 +70,7 @@ class CaptureSummary:
     n_pixels: int
     white_level: WhiteLevel | None
     sample: Sample | None = None
+    lamp_warnings: tuple[CaptureWarning, ...] = ()
 
     @property
     def axis_angles_deg(self) -> NDArray[np.float64]:
@@ -93,14 +95,16 @@ class CaptureSummary:
             capture_warnings.few_lights(len(self.images)) if len(self.images) < FEW_LIGHTS else None,
             capture_warnings.high_lights(NARROW_DEG) if self.axis_angles_deg.max() < NARROW_DEG else None,
         ]
-        return [*self.source.warnings, *(warning for warning in found if warning is not None)]
+        given = (warning for warning in found if warning is not None)
+        return [*self.source.warnings, *self.lamp_warnings, *given]
 
 
 def summarise_capture(source: CaptureSource, progress: Callable[[], object] | None = None) -> CaptureSummary:
     """Return the summary of a capture, reading its images one at a time.
 
     Raises:
-        InputError: an image cannot be read, or the mask, the ambient image or a flat field does not fit.
+        InputError: an image cannot be read, the mask, the ambient image or a flat field does not fit, or a lamp would
+            be inside the object.
     """
     images: list[ImageSummary] = []
     mask: NDArray[np.bool_] | None = None
@@ -142,7 +146,8 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
             intensities = estimate_light_intensities(observations, None, source.light_directions)
             observations /= 1 if intensities is None else intensities.astype(np.float32)
         sample = Sample(observations, mask[::step, ::step], step)
-    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample)
+    _, of_lamps = source.near_lamps(mask)
+    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample, tuple(of_lamps))
 
 
 def _by_white_level(

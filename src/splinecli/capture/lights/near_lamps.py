@@ -110,6 +110,12 @@ class NearLamps:
         across, up = columns - middle_column, middle_row - rows
         return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
 
+    def extent(self, mask: NDArray[np.bool_]) -> tuple[tuple[float, float], Floats]:
+        """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on the mean plane."""
+        rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
+        return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
+
     def angles_across_deg(self, mask: NDArray[np.bool_]) -> Floats:
         """Return for each lamp (F,) how far its direction differs, at most, from that at the middle of the object.
 

@@ -1,0 +1,78 @@
+"""Checks of near lamps: whether they can be where their positions say, and whether they may count as distant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.errors import InputError
+
+NEAR_DEG = 2.0
+"""The change of a light direction across the object above which distant lights carry a warning."""
+
+INSIDE = 0.5
+"""A lamp is refused if its distance from the middle of the object is below this share of the smaller of the object's
+width and height: it would be inside the object, or hide it from the camera."""
+
+CLOSE, FAR = 1.0, 300.0
+"""Distances, in the larger of the object's width and height, that carry a warning: below the first, and above the
+second. A position in metres instead of millimetres changes the distance a thousandfold."""
+
+UNIT_HINT = (
+    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the pixel size or object"
+    " width"
+)
+
+
+def check_distances(
+    lamps: NearLamps, mask: NDArray[np.bool_], positions: Path | None
+) -> list[CaptureWarning]:
+    """Return a warning about lamps that are hardly possible over an object with this mask (H, W), or an empty list.
+
+    Args:
+        positions: the file of the positions, for the message; None where there is none.
+
+    Raises:
+        InputError: a lamp would be inside the object, or in front of it.
+    """
+    sizes, middle = lamps.extent(mask)
+    distances = np.linalg.norm(lamps.positions - middle, axis=1)
+    nearest = int(distances.argmin())
+    text = f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is {sizes[0]:.3g} wide"
+    if distances[nearest] < INSIDE * min(sizes):
+        raise InputError(f"{text}: it would be inside the object", path=positions, hint=UNIT_HINT)
+    if distances[nearest] < CLOSE * max(sizes):
+        return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
+    if distances[nearest] > FAR * max(sizes):
+        return [
+            CaptureWarning(LAMP_DISTANCE, f"The lamps are so far that they are distant: {text}. {UNIT_HINT}.")
+        ]
+    return []
+
+
+def distant_lights(
+    positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]
+) -> list[CaptureWarning]:
+    """Warn that lights count as distant although a file has their positions; with a list of one warning or none.
+
+    Args:
+        positions: the file.
+        lamps: the lamps of the file, or None where their scale is unknown.
+        mask: (H, W), the object.
+    """
+    name = "the lamps' positions" if positions is None else positions.name
+    if lamps is None:
+        text = f"{name} is not used, because nothing tells the size of a pixel. Give --pixel-size or --object-width."
+        return [CaptureWarning(NEAR_LAMPS, text)]
+    angle_deg = lamps.angles_across_deg(mask).max()
+    if angle_deg <= NEAR_DEG:
+        return []
+    text = (
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
+        " and the edge of the object, but the lights count as distant. Use --light-positions instead of --lights."
+    )
+    return [CaptureWarning(NEAR_LAMPS, text)]
