@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import Progress, tells_confidence
+from splinecli.methods.estimator import Progress, confidence, tells_confidence
 from splinecli.methods.lamp_light import LampLight, rows_of
 from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
@@ -73,12 +73,12 @@ def estimate_normals(
     started = time.perf_counter()
     capture = find_surface(capture)
     normals = np.empty((capture.n_pixels, 3), np.float32)
-    confidence = np.empty(capture.n_pixels, np.float32) if tells_confidence(estimator) else None
+    errors = np.empty((capture.n_pixels, 2), np.float32) if tells_confidence(estimator) else None
     for start in range(0, capture.n_pixels, tile_pixels):
         rows = slice(start, start + tile_pixels)
         light = _light_on(capture, rows)
-        if confidence is not None and tells_confidence(estimator):
-            found, confidence[rows] = estimator.estimate_with_confidence(
+        if errors is not None and tells_confidence(estimator):
+            found, errors[rows] = estimator.estimate_with_error(
                 light.observations, light.directions, progress=progress
             )
         else:
@@ -89,9 +89,9 @@ def estimate_normals(
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
     normal_map[capture.mask] = normals
     confidence_map = None
-    if confidence is not None:
+    if errors is not None:
         confidence_map = np.zeros(capture.mask.shape, np.float32)
-        confidence_map[capture.mask] = confidence
+        confidence_map[capture.mask] = confidence(errors)
     if capture.ground_truth is None:
         return NormalEstimate(capture, normal_map, seconds, confidence_map=confidence_map)
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)

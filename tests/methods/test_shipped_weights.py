@@ -13,7 +13,7 @@ import torch
 from splinecli.capture import read_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.methods.estimator import CONFIDENT_DEG, tells_confidence
+from splinecli.methods.estimator import CONFIDENT_DEG, confidence, tells_confidence
 from splinecli.networks.error_head import probability_within
 from splinecli.networks.weights import SHIPPED, manifest, resolve_weights
 from splinecli.normals import angle_between_deg, unit
@@ -99,14 +99,14 @@ def test_confidence_on_path_traced_captures(shared_data):
             assert capture.ground_truth is not None
             (lights,) = draw_lights(capture.light_directions, 10, trials=1, seed=0)
             pixels = np.linspace(0, capture.n_pixels - 1, 1200).astype(int)
-            normals, confidence = estimator.estimate_with_confidence(
+            normals, errors = estimator.estimate_with_error(
                 capture.observations[pixels][:, lights], capture.light_directions[list(lights)]
             )
-            confidences.append(confidence)
+            confidences.append(confidence(errors))
             errors_deg.append(angle_between_deg(normals, capture.ground_truth[capture.mask][pixels]))
-    confidence, error_deg = np.concatenate(confidences), np.concatenate(errors_deg)
-    assert share_found(confidence, error_deg) > 1 / 3
-    assert (error_deg <= CONFIDENT_DEG).mean() == pytest.approx(confidence.mean(), abs=0.05)
+    expected, error_deg = np.concatenate(confidences), np.concatenate(errors_deg)
+    assert share_found(expected, error_deg) > 1 / 3
+    assert (error_deg <= CONFIDENT_DEG).mean() == pytest.approx(expected.mean(), abs=0.05)
 
 
 @pytest.mark.parametrize("name", sorted(manifest()))

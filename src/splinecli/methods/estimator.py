@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol, TypeGuard, runtime_checkable
 
@@ -54,6 +55,9 @@ class Estimator(Protocol):
 CONFIDENT_DEG = 5.0
 """Confidence is the probability that a normal is off by at most this angle."""
 
+UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))
+"""The distribution of the error of a normal that nothing is known of. Its confidence is 0."""
+
 
 @runtime_checkable
 class ConfidentEstimator(Estimator, Protocol):
@@ -65,12 +69,12 @@ class ConfidentEstimator(Estimator, Protocol):
     @property
     def tells_confidence(self) -> bool: ...
 
-    def estimate_with_confidence(
+    def estimate_with_error(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Estimate normals (P, 3) as `estimate` does, and the probability (P,) that each is within CONFIDENT_DEG.
+        """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
 
-        The probability is 0 for a pixel that is dark under every light.
+        networks/error_head.py describes the two numbers. A pixel that is dark under every light gets UNKNOWN_ERROR.
         """
         ...
 
@@ -78,3 +82,12 @@ class ConfidentEstimator(Estimator, Protocol):
 def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:
     """Return whether the estimator can estimate its own accuracy."""
     return isinstance(estimator, ConfidentEstimator) and estimator.tells_confidence
+
+
+def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions (P, 2)."""
+    import torch
+
+    from splinecli.networks.error_head import probability_within
+
+    return np.asarray(probability_within(torch.from_numpy(errors), CONFIDENT_DEG).numpy(), np.float32)

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
-from splinecli.methods.estimator import CONFIDENT_DEG, Directions, Observations, Progress
+from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, Progress
 from splinecli.methods.layer_progress import LayerProgress, PixelSteps
-from splinecli.networks.error_head import probability_within
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
@@ -79,12 +78,12 @@ class NetworkEstimator:
     def tells_confidence(self) -> bool:
         return self.network.config.error_head
 
-    def estimate_with_confidence(
+    def estimate_with_error(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Estimate unit normals (P, 3) and the probability (P,) that each is within CONFIDENT_DEG.
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see ConfidentEstimator.
 
-        The probability is the mean over the rotations.
+        The numbers of the distributions are means over the rotations.
 
         Raises:
             UsageError: the weights have no error head.
@@ -92,7 +91,7 @@ class NetworkEstimator:
         if not self.tells_confidence:
             raise UsageError(f"the weights {self.weights['name']!r} cannot estimate the confidence")
         results = self._in_batches(observations, light_directions, progress)
-        return results[:, :3], results[:, 3]
+        return results[:, :3], results[:, 3:]
 
     def _in_batches(
         self,
@@ -118,7 +117,7 @@ class NetworkEstimator:
             batch_size=self.batch_size,
             device=self.device,
             dtype=torch.float32,
-            columns=4,
+            columns=5,
         )
 
     @torch.inference_mode()
@@ -129,17 +128,19 @@ class NetworkEstimator:
         return len(self._rotations) * self._layers.work_of(lambda: self.network(observations, lights))
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
-        """Return normals and confidence (P, 4). The confidence is 0 without an error head."""
-        total = batch.new_zeros(len(batch), 4)
+        """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""
+        total = batch.new_zeros(len(batch), 5)
         with torch.autocast(lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
             for rotation in self._rotations:
                 normals, error = self.network(batch, lights, rotation=rotation)
                 total[:, :3] += normals
                 if error is not None:
-                    total[:, 3] += probability_within(error, CONFIDENT_DEG)
+                    total[:, 3:] += error
         unit = torch.nn.functional.normalize(total[:, :3], dim=-1)
         averaged = torch.cat((unit, total[:, 3:] / len(self._rotations)), dim=1)
-        return averaged.masked_fill(batch.amax(dim=1, keepdim=True) <= 0, 0)
+        dark = batch.amax(dim=1) <= 0
+        averaged[dark] = averaged.new_tensor((0.0, 0.0, 0.0, *UNKNOWN_ERROR))
+        return averaged
 
     @torch.inference_mode()
     def maps(

@@ -114,7 +114,8 @@ def draw_scene(
 ) -> Scene:
     """Draw scene number `index` of the set with this seed.
 
-    The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %.
+    The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %. In half of the
+    scenes the patches differ in their base alone, as on a painted or printed object of one gloss.
 
     Args:
         mesh: the shape. None draws one at random.
@@ -126,13 +127,14 @@ def draw_scene(
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
     patches = _draw_patch_count(rng)
+    one_gloss = rng.random() < 0.5
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     render_seed = int(rng.integers(2**62))
     materials: dict[str, Material] = {}
     for name in CLASSES:
         measured = torch.rand((), generator=generator) < config.measured_share
         drawn = draw_measured(patches, generator) if draw_measured is not None and measured else None
-        materials[name] = draw_class(name, patches, generator) if drawn is None else drawn
+        materials[name] = drawn or draw_class(name, patches, generator, one_gloss=one_gloss)
     # The shape comes last, because the number of random values that it needs varies.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
@@ -198,24 +200,32 @@ def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[
     return np.asarray(cKDTree(seeds).query(centres)[1], dtype=np.int64)
 
 
-def draw_class(name: str, patches: int, generator: torch.Generator) -> PrincipledMaterial:
+def draw_class(
+    name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False
+) -> PrincipledMaterial:
     """Draw materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
 
     base: U(0, 1). metallic: 1 for metals, else 0. specular: U(0, 4) for the specular class, else U(0, 1). roughness:
     U(0.3, 0.7) for metals, else U(0, 1). sheen: U(0, 1) for a fifth of the patches that are not metals.
+
+    Args:
+        one_gloss: all patches have the specular reflection, the roughness and the sheen of the first.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
         return torch.rand(patches, 1, generator=generator) * (high - low) + low
+
+    def gloss(values: Tensor) -> Tensor:
+        return values[:1].expand(patches, 1) if one_gloss else values
 
     metal = name == "metallic"
     zero = torch.zeros(patches, 1)
     return PrincipledMaterial(
         base=uniform(),
         metallic=torch.ones_like(zero) if metal else zero,
-        specular=uniform(0.0, 4.0 if name == "specular" else 1.0),
-        roughness=uniform(0.3, 0.7) if metal else uniform(),
-        sheen=zero if metal else uniform() * (uniform() < 0.2),
+        specular=gloss(uniform(0.0, 4.0 if name == "specular" else 1.0)),
+        roughness=gloss(uniform(0.3, 0.7) if metal else uniform()),
+        sheen=gloss(zero if metal else uniform() * (uniform() < 0.2)),
         clearcoat=zero,
         clearcoat_gloss=zero,
         interface_loss=zero,

@@ -1,0 +1,123 @@
+"""What the refinement net reads of each pixel: its estimated normal and error, and how its observations fit them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
+from splinecli.fits.weighted_least_squares import weighted_least_squares
+from splinecli.observation_map import map_scale
+
+VECTORS = ((0, 1), (3, 4), (6, 7), (9, 10), (11, 12))
+"""Channels that hold the x and y of vectors, and turn with the image."""
+
+TENSOR = (13, 14, 15)
+"""Channels that hold the xx, yy and xy of the lights' second moments."""
+
+CHANNELS = 24
+MEDIAN, SHAPE = 16, 17
+"""Channels that hold the two numbers of the error's distribution; see networks/error_head.py."""
+
+_MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
+_LARGEST_LOG = 4.0
+
+
+@torch.no_grad()
+def refine_features(
+    observations: Tensor, light_directions: Tensor, normals: Tensor, error: Tensor, reference: float
+) -> Tensor:
+    """Return the features (P, CHANNELS) of pixels, each about -1 to 1.
+
+    0 to 2: the estimated normal. 3 to 8: the normals of the robust Lambertian fit and of least squares, minus it.
+    9, 10: x and y of the mean light direction, weighted by what a matte surface with this normal does not explain.
+    11 to 15: mean and second moments of the lights' x and y. 16, 17: the error's distribution. 18: logarithm of the
+    largest observation, relative to the capture. 19, 20: mean and standard deviation over the largest. 21: root mean
+    square of what is not explained. 22: share of dark observations. 23: logarithm of the number of lights.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        light_directions: (F, 3) or (P, F, 3), unit.
+        normals: (P, 3), unit.
+        error: (P, 2), see networks/error_head.py.
+        reference: the brightness of the capture, see `brightness`.
+    """
+    scale = map_scale(observations)
+    observed = observations / scale
+    pixels, count = observed.shape
+    lights = light_directions.expand(pixels, count, 3)
+    robust = torch.nn.functional.normalize(fit_lambertian(observed, light_directions), dim=-1)
+    wide = observed.double()
+    plain = weighted_least_squares(wide, light_directions.double(), torch.ones_like(wide))[0]
+    plain = torch.nn.functional.normalize(plain, dim=-1).to(observed)
+    cosine = (lights @ normals[..., None])[..., 0].clamp(min=0)
+    albedo = (observed * cosine).sum(1, keepdim=True) / cosine.square().sum(1, keepdim=True).clamp(min=1e-4)
+    unexplained = observed - albedo.clamp(0, 4) * cosine
+    x, y = lights[..., 0], lights[..., 1]
+
+    def mean(values: Tensor) -> Tensor:
+        return values.mean(dim=1, keepdim=True)
+
+    return torch.cat(
+        (
+            normals,
+            robust - normals,
+            plain - normals,
+            4 * mean(unexplained * x),
+            4 * mean(unexplained * y),
+            mean(x),
+            mean(y),
+            mean(x * x),
+            mean(y * y),
+            mean(x * y),
+            error[:, :1] + _MEDIAN_OFFSET,
+            error[:, 1:] - 1,
+            (scale / reference).log().clamp(-_LARGEST_LOG, _LARGEST_LOG) / 2,
+            mean(observed),
+            observed.std(dim=1, keepdim=True),
+            3 * mean(unexplained.square()).sqrt(),
+            mean((observed < SHADOW_SHARE).to(observed.dtype)),
+            torch.full_like(scale, math.log(count / 10)),
+        ),
+        dim=1,
+    )
+
+
+def brightness(observations: Tensor) -> float:
+    """Return the brightness of a capture: the median over its pixels (P, F) of the largest observation."""
+    return max(float(observations.amax(dim=1).median()), 1e-12)
+
+
+def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
+    """Return normals (B, 3, H, W) and error (B, 2, H, W) from maps of features (B, CHANNELS, H, W)."""
+    offset = features.new_tensor((-_MEDIAN_OFFSET, 1.0))[:, None, None]
+    return features[:, :3], features[:, MEDIAN : SHAPE + 1] + offset
+
+
+def turn_features(features: Tensor, normals: Tensor, quarters: int, mirror: bool) -> tuple[Tensor, Tensor]:
+    """Turn maps of features (..., CHANNELS, H, W) and normals (..., 3, H, W) counterclockwise by quarters.
+
+    With `mirror`, x is flipped first.
+    """
+    if mirror:
+        features, normals = features.flip(-1).clone(), normals.flip(-1).clone()
+        for first, _ in VECTORS:
+            features[..., first, :, :].neg_()
+        features[..., TENSOR[2], :, :].neg_()
+        normals[..., 0, :, :].neg_()
+    for _ in range(quarters % 4):
+        features, normals = features.rot90(1, (-2, -1)), normals.rot90(1, (-2, -1))
+        old = features
+        features = features.clone()
+        for first, second in VECTORS:
+            features[..., first, :, :], features[..., second, :, :] = (
+                -old[..., second, :, :],
+                old[..., first, :, :],
+            )
+        xx, yy, xy = TENSOR
+        features[..., xx, :, :], features[..., yy, :, :] = old[..., yy, :, :], old[..., xx, :, :]
+        features[..., xy, :, :] = -old[..., xy, :, :]
+        normals = torch.stack((-normals[..., 1, :, :], normals[..., 0, :, :], normals[..., 2, :, :]), dim=-3)
+    return features, normals

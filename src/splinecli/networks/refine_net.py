@@ -1,0 +1,88 @@
+"""The refinement net: corrects a map of normals and of their errors by what lies around each pixel."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, max_pool2d, normalize, pad
+
+from splinecli.networks.refine_features import CHANNELS, split_features
+
+WIDTHS = (32, 64, 96)
+"""Channels at the full, the half and the quarter resolution."""
+
+BLOCKS = (1, 2, 3)
+"""Residual blocks of each scale on the way down; the two finer scales have one more on the way up."""
+
+COARSEST = 2 ** (len(WIDTHS) - 1)
+"""Side of the coarsest scale's pixels. The origins of tiles are multiples of it."""
+
+REACH = 48
+"""No pixel further away than this changes a result."""
+
+
+class RefineNet(nn.Module):
+    """An encoder-decoder of three scales with residual blocks. It has no norm and starts as the identity.
+
+    After each layer, everything outside the mask is zero. A pixel outside the mask is therefore the same as one outside
+    of the image, so tiles with an overlap of REACH give the same as the whole image.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(CHANNELS + 1, WIDTHS[0], 3, padding=1)
+        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
+        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
+        self.encode = nn.ModuleList(
+            nn.ModuleList(_MaskedBlock(width) for _ in range(count))
+            for width, count in zip(WIDTHS, BLOCKS, strict=True)
+        )
+        self.decode = nn.ModuleList(_MaskedBlock(width) for width in WIDTHS[:-1])
+        self.out = nn.Conv2d(WIDTHS[0], 5, 3, padding=1)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
+
+    def forward(self, features: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return unit normals (B, 3, H, W) and errors (B, 2, H, W), zero outside the mask.
+
+        Args:
+            features: (B, CHANNELS, H, W), see refine_features; zero outside the mask.
+            mask: (B, 1, H, W), 1 inside, else 0.
+        """
+        height, width = mask.shape[-2:]
+        border = (0, -width % COARSEST, 0, -height % COARSEST)
+        masks = [pad(mask, border)]
+        for _ in self.down:
+            masks.append(max_pool2d(masks[-1], 2))
+        x = self.enter(torch.cat((pad(features, border), masks[0]), dim=1)) * masks[0]
+        passed = []
+        for scale, blocks in enumerate(self.encode):
+            if scale:
+                passed.append(x)
+                x = self.down[scale - 1](x) * masks[scale]
+            for block in blocks:  # type: ignore[attr-defined]
+                x = block(x, masks[scale])
+        for scale in reversed(range(len(passed))):
+            x = passed[scale] + interpolate(self.up[scale](x), scale_factor=2, mode="nearest")
+            x = self.decode[scale](x * masks[scale], masks[scale])
+        change = self.out(torch.relu(x))[..., :height, :width].float()
+        normals, error = split_features(features.float())
+        return normalize(normals + change[:, :3], dim=1) * mask, (error + change[:, 3:]) * mask
+
+
+class _MaskedBlock(nn.Module):
+    """x + conv3x3(relu(conv3x3(relu(x)))), zero outside the mask. It starts as the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        hidden = torch.relu(self.first(torch.relu(x)) * mask)
+        out: Tensor = (x + self.second(hidden)) * mask
+        return out

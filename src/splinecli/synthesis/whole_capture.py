@@ -1,0 +1,65 @@
+"""A rendered scene as one capture shows it: the faults of camera and calibration are the same for all pixels."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from splinecli.capture.restore.saturation import restore_saturated
+from splinecli.synthesis.batches import CaptureConfig
+from splinecli.synthesis.faults import (
+    add_sensor_noise,
+    disturb_light_directions,
+    disturb_light_intensities,
+    draw_light_intensities,
+    quantise,
+)
+
+_BRIGHT_SHARE = 1e-3
+"""Share of the observations that may be brighter than the one from which the exposure is chosen."""
+
+_MOST_SATURATED = 0.03
+"""Largest share of clipped observations in an overexposed capture."""
+
+
+def photograph_scene(
+    radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Photograph a scene: return observations (P, F), divided by the intensities, and calibrated directions (F, 3).
+
+    The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
+    places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 %
+    of the observations are clipped, and restored as `infer` does.
+
+    Args:
+        radiance: (P, F).
+        directions: (F, 3), unit.
+        config: the shares of captures with each fault.
+        generator: source of all random numbers.
+    """
+
+    def uniform(low: float = 0.0, high: float = 1.0) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    lights = radiance.shape[1]
+    intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
+    arriving = radiance * intensities
+    saturated = uniform() < config.saturated_share
+    share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
+    bright = arriving.flatten().sort().values[-1 - math.floor(share * arriving.numel())].clamp(min=1e-6)
+    exposed = (arriving * ((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)).clamp(max=1)
+    clipped = exposed >= 1
+    if config.sensor_noise:
+        row = add_sensor_noise(exposed.view(1, -1), generator)
+        exposed = quantise(row, config.eight_bit_share, generator).view_as(exposed)
+    exposed = torch.where(clipped, 1, exposed)
+    errors = disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
+    observed = exposed * errors / intensities
+    calibrated = disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
+    if saturated:
+        values = observed.numpy()
+        restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
+        observed = torch.from_numpy(values)
+    return observed, calibrated
