@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.light_fit import find_factors
+from splinecli.capture.lights.light_fit import Factors, find_factors
 
 Array = NDArray[np.float64]
 
@@ -29,15 +29,23 @@ def repeated_images(observations: NDArray[np.floating]) -> list[tuple[int, int]]
     return [(int(first), int(second)) for first, second in np.argwhere(np.triu(same, 1))]
 
 
-def decoding_ratio(observations: NDArray[np.floating], light_directions: Array) -> float | None:
+def decoding_ratio(
+    observations: NDArray[np.floating], factors: Factors | None, light_directions: Array
+) -> float | None:
     """Return what the lights cannot explain of the images once they are decoded, as a share of that as they are.
 
     Returns None where there are too few lit pixels.
+
+    Args:
+        observations: (P, F).
+        factors: of the observations; see find_factors.
+        light_directions: (F, 3).
     """
-    left = []
-    for exponent in (1.0, DISPLAY_EXPONENT):
-        factors = find_factors(np.maximum(observations, 0).astype(np.float64) ** exponent)
-        if factors is None:
-            return None
-        left.append(float(np.hypot(factors.misfits(light_directions[None])[0], factors.residual)))
-    return left[1] / max(left[0], 1e-3)
+    if factors is None:
+        return None
+    decoded = np.maximum(observations, 0).astype(np.float64) ** DISPLAY_EXPONENT
+    after = find_factors(decoded, intensities_known=factors.intensities_known)
+    if after is None:
+        return None
+    left, before = (np.hypot(k.misfits(light_directions[None])[0], k.residual) for k in (after, factors))
+    return float(left / max(before, 1e-3))

@@ -156,7 +156,7 @@ def _read_lights(
     near = lamps is not None and lamps.used
     # Geometry gives the intensities of near lamps that are equally strong.
     known = equal or near or intensities is not None
-    equal_lamps = intensities is None
+    measured = intensities is not None
     if intensities is None:
         check_exposures(files.images)
         intensities = np.ones((len(files.images), 3))
@@ -167,7 +167,7 @@ def _read_lights(
         tuple(warnings),
         radiometry,
         intensities_known=known,
+        intensities_measured=measured,
         light_frame=frame,
         lamps=lamps,
-        equal_lamps=equal_lamps,
     )

@@ -42,13 +42,13 @@ class CaptureSource:
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         intensities_known: whether a file or the user gives the intensities.
+        intensities_measured: whether a file gives the intensities.
         warnings: what a user should read.
         radiometry: how stored values become linear light.
         white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
         light_frame: the frame of the light file, in which the directions are no longer.
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
         lamps: what is known of near lamps, or None.
-        equal_lamps: whether near lamps count as equally strong, because nothing gives their intensities.
     """
 
     files: CaptureFiles
@@ -59,9 +59,9 @@ class CaptureSource:
     white_level: float | None = None
     automatic_mask: NDArray[np.bool_] | None = None
     intensities_known: bool = True
+    intensities_measured: bool = True
     light_frame: LightFrame = USUAL_FRAME
     lamps: LampFiles | None = None
-    equal_lamps: bool = False
 
     @property
     def n_lights(self) -> int:
@@ -181,9 +181,8 @@ class CaptureSource:
         """Return all lamps over a mask (H, W), or over one of every step-th row and column; None for none."""
         if self.lamps is None:
             return None
-        return self.lamps.over(
-            self.light_directions, mask, equal=self.equal_lamps, frame=self.light_frame, step=step
-        )
+        equal = not self.intensities_measured
+        return self.lamps.over(self.light_directions, mask, equal=equal, frame=self.light_frame, step=step)
 
     def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.

@@ -16,7 +16,6 @@ from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import Lineariser
 from splinecli.capture.observations import observe
-from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
 from splinecli.capture.sample import Sample, grid_step
@@ -142,9 +141,6 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
     level, summaries = _by_white_level(finder, images, mask)
     sample = None
     if all(image.shape[:2] == mask.shape for image in images):
-        if not source.intensities_known:
-            intensities = estimate_light_intensities(observations, None, source.light_directions)
-            observations /= 1 if intensities is None else intensities.astype(np.float32)
         sample = Sample(observations, mask[::step, ::step], step)
     _, of_lamps = source.near_lamps(mask)
     return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample, tuple(of_lamps))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
@@ -26,21 +27,32 @@ def check_capture(source: CaptureSource, capture: Capture) -> list[CaptureWarnin
     from splinecli.capture.sample import sample_observations
 
     sample = sample_observations(capture.observations, capture.mask)
+    if capture.estimated_intensities is not None:
+        # They were estimated under the lights that are in question.
+        sample = replace(sample, observations=sample.observations * capture.estimated_intensities)
     return check_sample(source, sample, capture.light_indices)[1]
 
 
 def check_sample(
     source: CaptureSource, sample: Sample, indices: Sequence[int]
 ) -> tuple[LightCheck, list[CaptureWarning]]:
-    """Return what a sample of the images with these indices says about the lights, and all warnings."""
+    """Return what a sample of the images with these indices says about the lights, and all warnings.
+
+    The observations are not divided by estimated intensities.
+    """
     from splinecli.capture import capture_warnings, image_checks
     from splinecli.capture.lights.light_advice import light_warnings
-    from splinecli.capture.lights.light_check import light_spread
+    from splinecli.capture.lights.light_check import check_lights, light_spread
+    from splinecli.capture.lights.light_fit import find_factors
 
-    check = check_source(source, sample, indices)
-    warnings = light_warnings(check, source.light_frame, source.files.light_directions)
     names = [source.files.images[index].name for index in indices]
     lights = source.light_directions[list(indices)]
+    observations = sample.observations
+    if source.lamps is not None and source.lamps.used:
+        observations = _as_distant(source, sample, indices)
+    factors = find_factors(observations, intensities_known=source.intensities_measured)
+    check = check_lights(observations, sample.mask, source.light_directions, indices, names, factors)
+    warnings = light_warnings(check, source.light_frame, source.files.light_directions)
     spread, in_cone = light_spread(lights)
     if spread < SMALLEST_SPREAD:
         warnings.append(capture_warnings.lights_crowded(max(spread, 1e-3), in_cone=in_cone))
@@ -48,23 +60,12 @@ def check_sample(
     if pairs:
         first, second = (names[place] for place in pairs[0])
         warnings.append(capture_warnings.repeated_images(first, second, len(pairs)))
-    if check.order is not None or spread < SMALLEST_SPREAD:
-        return check, warnings  # the other checks rely on the lights
-    ratio = image_checks.decoding_ratio(sample.observations, lights) if source.radiometry.gamma == 1 else None
+    if check.order is not None or spread < SMALLEST_SPREAD or source.radiometry.gamma != 1:
+        return check, warnings  # the last check relies on the lights
+    ratio = image_checks.decoding_ratio(observations, factors, lights)
     if ratio is not None and ratio < image_checks.DISPLAY_RATIO:
         warnings.append(capture_warnings.encoded_values(ratio))
     return check, warnings
-
-
-def check_source(source: CaptureSource, sample: Sample, indices: Sequence[int]) -> LightCheck:
-    """Return what a sample of the images with these indices says about the lights."""
-    from splinecli.capture.lights.light_check import check_lights
-
-    names = [source.files.images[index].name for index in indices]
-    observations = sample.observations
-    if source.lamps is not None and source.lamps.used:
-        observations = _as_distant(source, sample, indices)
-    return check_lights(observations, sample.mask, source.light_directions, indices, names)
 
 
 def _as_distant(source: CaptureSource, sample: Sample, indices: Sequence[int]) -> NDArray[np.floating]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.frame_evidence import RoughNormals, rough_normals
+from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.lights.light_order import UNKNOWN_ORDER, check_order, shift_steps, shift_words
 
@@ -91,6 +92,7 @@ def check_lights(
     light_directions: Array,
     indices: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
+    factors: Factors | None = None,
 ) -> LightCheck:
     """Return what observations (P, F) of a mask (H, W) say about their lights.
 
@@ -98,11 +100,13 @@ def check_lights(
         light_directions: (N, 3), all lights of the capture, in the order of the file.
         indices: the F lights of the observations; None for all.
         names: of the F images, for the words of the result.
+        factors: of the observations, if they were found before.
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
-    found = check_order(observations, light_directions, chosen, names)
-    normals = rough_normals(observations, found.lights, mask)
+    factors = find_factors(observations) if factors is None else factors
+    found = check_order(observations, factors, light_directions, chosen, names)
+    normals = rough_normals(observations / found.intensities, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
     if found.misfit is not None and found.misfit > MAX_MISFIT_OF_RIM:
         weight = 0.0

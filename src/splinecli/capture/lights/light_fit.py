@@ -3,7 +3,7 @@
 The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
 (Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
 factors are found without the lights. Right lights are linear combinations of these factors, whatever their frame.
-Lights in a wrong order are not.
+Lights in a wrong order are not. Where nobody measured the light intensities, each light may have any length.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.robust_fit import absolute_weights, predict
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.capture.restore.robust_fit import absolute_weights, fit_scaled_normals, predict
 
 Array = NDArray[np.float64]
 
@@ -27,9 +26,14 @@ MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000
 RANDOM_ORDERS = 500
 """The number of random orders of the lights that a given order is compared with."""
 
-_ROUNDS = 25
+INTENSITY_PRIOR = 0.01
+"""Weight of equal intensities against those that fit best, where nobody measured them."""
+
+INTENSITY_LIMITS = (0.1, 10.0)
+
+_ROUNDS, _INTENSITY_ROUNDS = 25, 12
 _PRIOR = 1e-9
-_FITS, _FITTED_ORDERS = 5, 9
+_FITS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +44,50 @@ class Factors:
         matrix: (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between
             two such matrices is one between images, as a share of the mean brightness.
         residual: the root mean square of what the factors do not explain, in the same unit.
+        intensities_known: whether the observations were divided by measured light intensities.
     """
 
     matrix: Array
     residual: float
+    intensities_known: bool = True
 
     def misfits(self, light_directions: Array) -> Array:
         """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
-        basis = np.linalg.qr(light_directions)[0]
-        explained = ((self.matrix @ basis) ** 2).sum(axis=(1, 2))
-        misfits: Array = np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0))
-        return misfits
+        if self.intensities_known:
+            basis = np.linalg.qr(light_directions)[0]
+            explained = ((self.matrix @ basis) ** 2).sum(axis=(1, 2))
+            misfits: Array = np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0))
+            return misfits
+        intensities, matrices = self._fit_intensities(light_directions)
+        differences = self.matrix.T - intensities[..., None] * matrices
+        return np.asarray(np.sqrt((differences**2).sum(axis=(1, 2))))
+
+    def intensities(self, light_directions: Array) -> Array:
+        """Return the intensities (N, F) that fit lights (N, F, 3) best; ones where they are known."""
+        if self.intensities_known:
+            return np.ones(light_directions.shape[:2])
+        return self._fit_intensities(light_directions)[0]
+
+    def _fit_intensities(self, light_directions: Array) -> tuple[Array, Array]:
+        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would give.
+
+        Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (semi-calibrated photometric
+        stereo, Cho et al., TPAMI 2018).
+        """
+        prior = INTENSITY_PRIOR * (self.matrix**2).sum(axis=0).mean()
+        intensities = np.ones(light_directions.shape[:2])
+        for _ in range(_INTENSITY_ROUNDS):
+            vectors = intensities[..., None] * light_directions
+            transposed = vectors.swapaxes(1, 2)
+            products = transposed @ vectors + _PRIOR * np.eye(3)  # lights may lie in one plane
+            matrices = light_directions @ np.linalg.solve(products, transposed @ self.matrix.T)
+            along = np.einsum("cf,nfc->nf", self.matrix, matrices)
+            intensities = (along + prior) / ((matrices**2).sum(axis=2) + prior)
+            intensities = intensities.clip(*INTENSITY_LIMITS)
+        return intensities, matrices
 
 
-def find_factors(observations: NDArray[np.floating]) -> Factors | None:
+def find_factors(observations: NDArray[np.floating], *, intensities_known: bool = True) -> Factors | None:
     """Return the factors of observations (P, F), or None where there are too few lit ones.
 
     Shadows do not count, and highlights count little: least absolute deviations, by weighted least squares.
@@ -66,8 +100,8 @@ def find_factors(observations: NDArray[np.floating]) -> Factors | None:
     matrix = np.linalg.svd(values, full_matrices=False)[2][:3]
     weights = lit
     for _ in range(_ROUNDS):
-        rows = _solve(values, weights, matrix.T)
-        matrix = _solve(values.T, weights.T, rows).T
+        rows = fit_scaled_normals(values, weights, matrix.T, prior=_PRIOR)
+        matrix = fit_scaled_normals(values.T, weights.T, rows, prior=_PRIOR).T
         residuals = values - rows @ matrix
         weights = lit * absolute_weights(residuals)
     # The largest values of a row are 1, but a few rows in deep shadow may be wild.
@@ -77,7 +111,8 @@ def find_factors(observations: NDArray[np.floating]) -> Factors | None:
         return None
     brightness = np.sqrt((values[kept] ** 2).sum(axis=1).mean())
     scale = np.linalg.qr(rows)[1] / np.sqrt(len(rows)) / brightness
-    return Factors(scale @ matrix, float(np.sqrt((residuals**2 * lit).sum(axis=1).mean()) / brightness))
+    residual = float(np.sqrt((residuals**2 * lit).sum(axis=1).mean()) / brightness)
+    return Factors(scale @ matrix, residual, intensities_known)
 
 
 def random_misfits(factors: Factors, light_directions: Array) -> Array:
@@ -113,13 +148,6 @@ def fit_residual(values: Array, light_directions: Array) -> float:
     return float((np.abs(residuals) * lit).sum() / lit.sum())
 
 
-def random_residual(values: Array, light_directions: Array) -> float:
-    """Return the median of fit_residual over some random orders of the lights."""
-    rng = np.random.default_rng(1)
-    orders = [rng.permutation(len(light_directions)) for _ in range(_FITTED_ORDERS)]
-    return float(np.median([fit_residual(values, light_directions[k]) for k in orders]))
-
-
 def sample_pixels(observations: NDArray[np.floating]) -> Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
     brightest = observations.max(axis=1)
@@ -131,12 +159,3 @@ def sample_pixels(observations: NDArray[np.floating]) -> Array:
     # Three unknowns need more than three lit observations to leave a residual.
     kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
     return kept
-
-
-def _solve(values: Array, weights: Array, basis: Array) -> Array:
-    """Return the rows (P, 3) that minimise the weighted squares of values (P, F) - rows @ basis (F, 3)'."""
-    x, y, z = basis.T
-    products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=1)
-    inverse = inverse_3x3(tuple((weights @ products).T), _PRIOR)
-    solution: Array = np.stack(multiply_symmetric(inverse, tuple(((weights * values) @ basis).T)), axis=1)
-    return solution

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.light_fit import (
-    find_factors,
+    Factors,
     fit_residual,
     random_misfits,
-    random_residual,
     sample_pixels,
     shifted_orders,
     swapped_orders,
@@ -51,7 +50,7 @@ UNKNOWN_ORDER = "unknown"
 RANDOM_FIT = 0.85
 """Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
 
-_FITTED_PIXELS = 800
+_FITTED_PIXELS, _FITTED_ORDERS = 800, 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +60,7 @@ class LightOrder:
     Args:
         order: in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found.
         lights: (F, 3), in this order.
+        intensities: (F,), those that fit these lights best; ones where they are known.
         given_misfit, misfit: of the given order and of this one, as shares of random orders'; None where there are too
             few lights.
         turns: rows of shifted_orders that fit as well, with the matrices (3, 3) that take the lights there. They turn a
@@ -69,6 +69,7 @@ class LightOrder:
 
     order: str | None
     lights: Array
+    intensities: Array
     given_misfit: float | None = None
     misfit: float | None = None
     turns: tuple[tuple[int, Array], ...] = ()
@@ -76,6 +77,7 @@ class LightOrder:
 
 def check_order(
     observations: NDArray[np.floating],
+    factors: Factors | None,
     light_directions: Array,
     chosen: NDArray[np.integer],
     names: Sequence[str],
@@ -83,14 +85,20 @@ def check_order(
     """Return the order of the chosen lights that fits observations (P, F) best.
 
     Args:
+        factors: of the observations; None where there are too few lit ones.
         light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
         chosen: (F,) the lights of the observations.
         names: of the F images.
     """
     lights, n_all = light_directions[chosen], len(light_directions)
-    factors = find_factors(observations) if len(lights) >= MIN_LIGHTS else None
-    if factors is None:
-        return LightOrder(None, lights)
+    if factors is None or len(lights) < MIN_LIGHTS:
+        return LightOrder(None, lights, np.ones(len(lights)))
+
+    def found(
+        order: str | None, lights: Array, misfit: float, turns: tuple[tuple[int, Array], ...] = ()
+    ) -> LightOrder:
+        return LightOrder(order, lights, factors.intensities(lights[None])[0], share, misfit / usual, turns)
+
     random = random_misfits(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
     given = float(factors.misfits(lights[None])[0])
@@ -101,32 +109,36 @@ def check_order(
     if share > MIN_MISFIT and shift_misfits[best] < limit:
         mended = float(shift_misfits[best])
         turns = _turns(shifted[best], shifted, shift_misfits <= max(1.3 * mended, 0.05 * usual))
-        return LightOrder(shift_words(best, n_all), shifted[best], share, mended / usual, turns)
+        return found(shift_words(best, n_all), shifted[best], mended, turns)
     swaps = swapped_orders(len(lights))
     swap_misfits = factors.misfits(lights[swaps])
     best = int(swap_misfits.argmin())
     if share > MIN_SWAP_MISFIT and swap_misfits[best] < limit:
         one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
         words = f"with those of {one} and {other} exchanged"
-        return LightOrder(words, lights[swaps[best]], share, float(swap_misfits[best]) / usual)
+        return found(words, lights[swaps[best]], float(swap_misfits[best]))
     judged = factors.residual < MAX_RESIDUAL
     by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
     suspected = by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)
-    if judged and suspected and _fits_like_random(observations, lights):
-        return LightOrder(UNKNOWN_ORDER, lights, share, share)
+    if judged and suspected and _fits_like_random(observations, factors, lights):
+        return found(UNKNOWN_ORDER, lights, given)
     fitting = shift_misfits <= max(1.3 * given, 0.05 * usual)
     turns = _turns(lights, shifted, fitting) if share < MIN_MISFIT else ()
-    return LightOrder(None, lights, share, share, turns)
+    return found(None, lights, given, turns)
 
 
-def _fits_like_random(observations: NDArray[np.floating], lights: Array) -> bool:
+def _fits_like_random(observations: NDArray[np.floating], factors: Factors, lights: Array) -> bool:
     """Return whether lights fit the pixels little better than in random orders.
 
     The factors may be wrong where most lights leave each pixel in shadow; this fit is not.
     """
     values = sample_pixels(observations)
     values = values[:: max(1, len(values) // _FITTED_PIXELS)]
-    return fit_residual(values, lights) > RANDOM_FIT * random_residual(values, lights)
+    rng = np.random.default_rng(1)
+    orders = np.stack((lights, *(rng.permutation(lights) for _ in range(_FITTED_ORDERS))))
+    intensities = factors.intensities(orders)
+    given, *random = (fit_residual(values / e, k) for e, k in zip(intensities, orders, strict=True))
+    return given > RANDOM_FIT * float(np.median(random))
 
 
 def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[tuple[int, Array], ...]:

@@ -39,15 +39,17 @@ def predict(observations: Array, weights: Array, light_directions: Array) -> Arr
     return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
 
 
-def fit_scaled_normals(observations: Array, weights: Array, light_directions: Array) -> Array:
+def fit_scaled_normals(
+    observations: Array, weights: Array, light_directions: Array, *, prior: float = _PRIOR
+) -> Array:
     """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
 
-    The arguments are those of predict.
+    The arguments are those of predict. `prior` pulls b towards 0.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)
     xx, yy, zz, xy, xz, yz = _sum_over_lights(weights, products).T
-    covariance = inverse_3x3((xx + _PRIOR, yy + _PRIOR, zz + _PRIOR, xy, xz, yz), _PRIOR)
+    covariance = inverse_3x3((xx + prior, yy + prior, zz + prior, xy, xz, yz), prior)
     right_side = _sum_over_lights(weights * observations, light_directions)
     return np.stack(multiply_symmetric(covariance, tuple(right_side.T)), axis=1)
 
