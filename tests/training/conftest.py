@@ -10,7 +10,7 @@ import torch
 from small_pixel_sets import _matte_pixels, make_set
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
-from splinecli.training import loop
+from splinecli.training import tasks
 from splinecli.training.config import TrainingConfig
 from splinecli.training.run_log import RunLog
 
@@ -28,7 +28,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "VALIDATION_PIXELS", 64)
+    monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 64)
 
 
 @pytest.fixture

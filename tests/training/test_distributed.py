@@ -98,10 +98,10 @@ WORKER = """
 import json, os, sys
 from pathlib import Path
 import torch
-from splinecli.training import loop
+from splinecli.training import loop, tasks
 from splinecli.training.config import TrainingConfig
 from splinecli.training.distributed import join_workers, leave_workers
-loop.VALIDATION_PIXELS = 16
+tasks.VALIDATION_PIXELS = 16
 workers, device = join_workers(torch.device("cpu"))
 assert workers.agree(7.0 + workers.rank, device) == 7.0
 for name, values in json.loads(Path("configs.json").read_text()).items():
@@ -152,9 +152,9 @@ def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Pat
 FAILING = """
 import os, signal
 from splinecli.cli.main import run
-from splinecli.training import loop
+from splinecli.training import loop, tasks
 from splinecli.training.run_log import RunLog
-loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, loop.VALIDATION_PIXELS = 0.05, 5, 16
+loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, tasks.VALIDATION_PIXELS = 0.05, 5, 16
 RunLog.draw = lambda self, maps: None
 step = loop.Trainer.step
 def failing(self):

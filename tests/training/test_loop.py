@@ -27,7 +27,7 @@ from splinecli.networks.weights import load_weights
 from splinecli.pixel_sets.store import PixelSet
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
-from splinecli.training import loop
+from splinecli.training import loop, tasks
 from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 from splinecli.training.defaults import METRICS
@@ -38,10 +38,10 @@ from splinecli.training.loop import (
     WEIGHTS,
     Trainer,
     learning_rate,
-    stream_seed,
 )
 from splinecli.training.objective import compute_losses
 from splinecli.training.run_log import Metrics, read_metrics
+from splinecli.training.tasks import stream_seed
 from splinecli.training.validation import validation_deg
 
 CPU = torch.device("cpu")
@@ -88,7 +88,7 @@ def test_the_authors_schedule(progress: float, expected: float) -> None:
 def learn(config: TrainingConfig, folder: Path) -> list[float]:
     """Loss, angle, map error and its share at the lights after a run on one batch, over those at its start."""
     trainer = Trainer(replace(config, turn_jitter_deg=0.0, shards=1), folder, CPU)
-    trainer.source = OneBatch(config)
+    trainer.task.source = OneBatch(config)
     results = torch.stack([trainer.step() for _ in range(config.steps)])
     shares: list[float] = (results[-5:].mean(dim=0) / results[:3].mean(dim=0)).tolist()[:4]
     return shares
@@ -165,14 +165,14 @@ def test_every_stream_of_a_run_is_another() -> None:
 
 
 def test_workers_share_the_very_shards_of_one(tiny: TrainingConfig, tmp_path: Path) -> None:
-    shards, mirrored = Trainer(tiny, tmp_path / "one", CPU).draw()
+    shards, mirrored = Trainer(tiny, tmp_path / "one", CPU).task.draw(0)
     assert len(shards) == tiny.shards
     mirrors = set()
     for rank in range(2):
         folder = tmp_path / f"rank {rank}"
         follower = Trainer(tiny, folder, CPU, workers=Workers(rank, 2))
         assert folder.exists() == (rank == 0)  # the leader alone writes
-        parts, part_mirrored = follower.draw()
+        parts, part_mirrored = follower.task.draw(0)
         mirrors.add(part_mirrored)
         for (part, part_turn_deg), (batch, turn_deg) in zip(
             parts, (shards[rank], shards[rank + 2]), strict=True
@@ -190,7 +190,7 @@ def test_half_of_the_batches_are_mirrored(tiny: TrainingConfig, tmp_path: Path) 
     mirrored = []
     for step in range(100):
         trainer.counters.step = step
-        mirrored.append(trainer.draw()[1])
+        mirrored.append(trainer.task.draw(trainer.counters.step)[1])
     # Four standard deviations of the binomial.
     assert sum(mirrored) == pytest.approx(50, abs=20)
 
@@ -200,7 +200,7 @@ def test_the_paper_s_size_sees_its_pixels_as_they_are(tiny: TrainingConfig, tmp_
     trainer = Trainer(config, tmp_path, CPU)
     for step in range(8):
         trainer.counters.step = step
-        shards, mirrored = trainer.draw()
+        shards, mirrored = trainer.task.draw(trainer.counters.step)
         assert not any(turn_deg.any() for _, turn_deg in shards)
         assert not mirrored
 
@@ -243,7 +243,7 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
         start_from=str(tmp_path / "first" / WEIGHTS), average_decay=0.0, weight_decay=0.1,
     )  # fmt: skip
     second = Trainer(config, tmp_path / "second", CPU)
-    (batch, _), *_ = second.draw()[0]
+    (batch, _), *_ = second.task.draw(second.counters.step)[0]
     before = compute_losses(second.network, batch, config, part="error_head").total.item()
     second.run()
     assert compute_losses(second.network, batch, config, part="error_head").total.item() < before - 0.1
@@ -269,7 +269,7 @@ def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(
     grown = replace(tiny.network, set_width=16, set_layers=1)
     config = replace(tiny, network=grown, start_from=str(tmp_path / "first" / WEIGHTS))
     second = Trainer(config, tmp_path / "second", CPU)
-    (batch, _), *_ = second.draw()[0]
+    (batch, _), *_ = second.task.draw(second.counters.step)[0]
     with torch.no_grad():
         plain, with_set = (
             network.eval()(batch.observations, batch.light_directions, batch.valid).normals
@@ -319,7 +319,7 @@ def test_a_run_writes_its_files(
     assert [row.validation_deg is not None for row in rows] == [False, False, True]
     assert last.validation_deg is not None
     loaded = load_weights(tmp_path / WEIGHTS).network
-    again = validation_deg(loaded, trainer.validation)
+    again = validation_deg(loaded, trainer.task.validation)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
     assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
     assert TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text())) == trainer.config
@@ -385,13 +385,13 @@ def poison(trainer: Trainer, what: str) -> None:
     """Make the next loss, or its gradient alone, other than finite."""
     parameter = next(trainer.network.ne_net.parameters())
     if what == "loss":
-        original = trainer.source.draw
+        original = trainer.task.source.draw
 
         def draw(pixels: int) -> PixelBatch:
             batch = original(pixels)
             return replace(batch, observations=batch.observations * torch.nan)
 
-        trainer.source.draw = draw  # type: ignore[method-assign]
+        trainer.task.source.draw = draw  # type: ignore[method-assign]
     else:
         parameter.register_hook(lambda gradient: gradient * math.inf)
 
@@ -473,20 +473,20 @@ def test_the_validation_pixels_are_the_same_when_taken_up(tiny: TrainingConfig, 
     losses(trainer, 2)
     trainer.save()
     again = Trainer(tiny, tmp_path, CPU, resume=True)
-    assert torch.equal(again.validation.observations, trainer.validation.observations)
+    assert torch.equal(again.task.validation.observations, trainer.task.validation.observations)
     other = Trainer(replace(tiny, seed=1), tmp_path / "other", CPU)
-    assert not torch.equal(other.validation.truth.normals, trainer.validation.truth.normals)
+    assert not torch.equal(other.task.validation.truth.normals, trainer.task.validation.truth.normals)
 
 
 DRIVER = """
 import json, sys
 from pathlib import Path
 import torch
-from splinecli.training import loop
+from splinecli.training import loop, tasks
 from splinecli.training.config import TrainingConfig
 from splinecli.training.run_log import RunLog
 torch.set_num_threads(1)
-loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, loop.VALIDATION_PIXELS = 0.3, 3, 16
+loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, tasks.VALIDATION_PIXELS = 0.3, 3, 16
 RunLog.draw = lambda self, maps: None
 config = TrainingConfig.from_dict(json.loads(sys.argv[1]))
 loop.Trainer(config, Path(sys.argv[2]), torch.device("cpu"), resume=sys.argv[3] == "resume").run()
@@ -518,7 +518,7 @@ def test_a_killed_run_goes_on(tiny: TrainingConfig, tmp_path: Path, monkeypatch:
     first = read_metrics(folder / METRICS)[0]
     run_and_kill(config, folder, "resume", 0.41)
     monkeypatch.setattr(loop, "REPORT_STEPS", 3)
-    monkeypatch.setattr(loop, "VALIDATION_PIXELS", 16)
+    monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 16)
     taken_up = Trainer(config, folder, CPU, resume=True)
     step = taken_up.counters.step
     kept = [p.detach().clone() for p in taken_up.network.parameters()]
@@ -544,7 +544,7 @@ def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path
     expected = losses(plain, 3)
     found = []
     for _ in range(3):
-        validation_deg(checked.average, checked.validation)
+        validation_deg(checked.average, checked.task.validation)
         found += losses(checked, 1)
     assert found == expected
 

@@ -15,6 +15,7 @@ _CHOICES = {
     "grid": get_args(Grid),
     "interpolates": (True, False),
     "error_head": (True, False),
+    "refines": (True, False),
 }
 
 
@@ -34,6 +35,7 @@ class NetworkConfig:
             size only.
         interpolates: whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
         error_head: whether NE-Net also estimates its own error. Compact size only.
+        refines: whether a refinement net corrects the map of normals afterwards. Needs an error head.
         width: channels of the compact size.
         li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size.
         head_width: hidden features of NE-Net's head in the compact size.
@@ -51,6 +53,7 @@ class NetworkConfig:
     fits: tuple[str, ...] = ()
     interpolates: bool = True
     error_head: bool = False
+    refines: bool = False
     set_width: int = 0
     set_layers: int = 3
 
@@ -96,6 +99,8 @@ class NetworkConfig:
             raise ModelError("network setting 'fits' needs the size 'compact'")
         if config.error_head and config.size != "compact":
             raise ModelError("network setting 'error_head' needs the size 'compact'")
+        if config.refines and not config.error_head:
+            raise ModelError("network setting 'refines' needs 'error_head'")
         if config.set_width and config.size != "compact":
             raise ModelError("network setting 'set_width' needs the size 'compact'")
         if config.set_width % HEAD_WIDTH:

@@ -24,6 +24,7 @@ from splinecli.fits.lambertian import fit_lambertian
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_net import CompactLINet, PaperLINet
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
+from splinecli.networks.refine_net import RefineNet
 from splinecli.networks.set_branch import SetBranch
 from splinecli.networks.starting_fits import fit_normals
 from splinecli.observation_map import (
@@ -91,7 +92,7 @@ class Estimate(NamedTuple):
 
 
 class SplineNet(nn.Module):
-    """LI-Net, NE-Net and all steps between raw observations and normals."""
+    """LI-Net, NE-Net and all steps between raw observations and normals; the refinement net follows on the map."""
 
     cells: Tensor
     inside: Tensor
@@ -120,6 +121,7 @@ class SplineNet(nn.Module):
         self.set_branch: SetBranch | None = None
         if config.set_width:
             self.set_branch = SetBranch(config.set_width, config.set_layers, 1 + len(config.fits))
+        self.refine_net = RefineNet() if config.refines else None
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)

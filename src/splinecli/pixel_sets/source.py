@@ -14,13 +14,12 @@ from splinecli.observation_map import cell_directions, rotate_about_view_axis, s
 from splinecli.pixel_sets.dense_maps import fill_gaps
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
-from splinecli.synthesis.lights import draw_light_counts
+from splinecli.synthesis.lights import draw_light_counts, rank_in_cone
 
 # Memory-mapped arrays are closed after this many bytes of them were read, so that their pages can be freed.
 _MAPPED_BYTES = 128 << 20
 # The operating system reads this much around the first byte of a page.
 _READ_AHEAD_BYTES = 64 << 10
-_LEAST_CONE_DEG, _MOST_CONE_DEG = 20, 90
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,7 @@ class SampledPixels:
 class PixelSetSource:
     """Draws pixels of some entries of a set, all with the same probability, under newly drawn lights.
 
-    As in CNN-PS (Ikehata, ECCV 2018), the lights of a pixel are drawn within a cone about the view axis. Its
-    half-angle is random, U(20, 90) degrees. If the cone contains too few lights, the closest others are added.
+    The lights of a pixel are drawn within a cone; see choose_in_cone.
 
     Args:
         pixel_set: the set.
@@ -96,12 +94,7 @@ class PixelSetSource:
 
     def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
         """Return light indices (P, K) and which of them are used, counts (P,) in each row."""
-        uniform = torch.rand(truth.known.shape, generator=self.generator, device=self.generator.device)
-        cone = torch.rand(len(counts), 1, generator=self.generator, device=self.generator.device)
-        lowest_z = torch.deg2rad(_LEAST_CONE_DEG + (_MOST_CONE_DEG - _LEAST_CONE_DEG) * cone).cos()
-        z = truth.light_directions[..., 2]
-        # Lights within the cone have a random rank below 1. The others follow, the closest to the axis first.
-        rank = torch.where(z >= lowest_z, uniform, 2 - z).masked_fill(~truth.known, torch.inf)
+        rank = rank_in_cone(truth.light_directions, self.generator).masked_fill(~truth.known, torch.inf)
         order = rank.argsort(dim=1)[:, : int(counts.max())]
         chosen = torch.arange(order.shape[1], device=counts.device) < counts[:, None]
         return order, chosen & truth.known.gather(1, order)

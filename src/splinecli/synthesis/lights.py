@@ -21,6 +21,27 @@ def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: t
     return (largest * (1 - 0.2 * _uniform(generator, pixels))).round().long().clamp(low, high)
 
 
+_LEAST_CONE_DEG, _MOST_CONE_DEG = 20, 90
+
+
+def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Choose `count` of the light directions (F, 3) at random, within a cone about the view axis; return their indices.
+
+    Its half-angle is U(20, 90) degrees, as in CNN-PS (Ikehata, ECCV 2018). If it contains too few lights, the closest
+    others are added.
+    """
+    return rank_in_cone(directions[None], generator)[0].argsort()[:count]
+
+
+def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
+    """Return ranks (P, F) of the lights (P, F, 3) of P pixels, whose lowest are chosen; see choose_in_cone."""
+    uniform = _uniform(generator, *directions.shape[:2])
+    half_angle = _uniform_deg(generator, len(directions), 1, low=_LEAST_CONE_DEG, high=_MOST_CONE_DEG)
+    z = directions[..., 2]
+    # Lights within the cone have a random rank below 1. The others follow, the closest to the axis first.
+    return torch.where(z >= half_angle.cos(), uniform, 2 - z)
+
+
 Points = tuple[Tensor, Tensor]
 """x and y (P, F) of lights in the disc of their projections."""
 

@@ -52,7 +52,7 @@ def photograph_scene(
     exposed = (arriving * ((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)).clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
-        row = add_sensor_noise(exposed.view(1, -1), generator)
+        row = add_sensor_noise(exposed.reshape(1, -1), generator)
         exposed = quantise(row, config.eight_bit_share, generator).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)
     errors = disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)

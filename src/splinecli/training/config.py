@@ -9,7 +9,7 @@ from typing import Any, Literal
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
-from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS
+from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
 from splinecli.training.losses import Norm
 
 GENERATOR = "generator"
@@ -24,12 +24,13 @@ class TrainingConfig:
         sources: the sources of pixels and their weights. A weight is the source's share of the batches.
         start_from: name or file of the weights that the run starts from; empty for random ones.
         held_share: share of the scenes of a pixel set that is for validation.
-        batch_size: pixels a step.
+        batch_size: pixels a step; captures a step for the refinement net.
         shards: number of parts of a batch. The pixels of a shard come from one random stream and have nearly equal
             numbers of lights. The number of processes must divide it.
         updates: "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates`
             steps for NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and
-            trains the error head alone.
+            trains the error head alone. "refine_net" fixes all these and trains the refinement net on pixel sets of
+            rendered scenes.
         learning_rate: the highest rate. It rises over `warmup_steps` and then falls.
         schedule: "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth
             for the last tenth of the run.
@@ -54,7 +55,7 @@ class TrainingConfig:
     held_share: float = 0.1
     batch_size: int = 256
     shards: int = 4
-    updates: Literal["joint", "alternating", "error_head"] = "joint"
+    updates: Literal["joint", "alternating", "error_head", "refine_net"] = "joint"
     ne_net_updates: int = 5
     learning_rate: float = 1.5e-3
     schedule: Literal["cosine", "stepped"] = "cosine"
@@ -97,10 +98,15 @@ class TrainingConfig:
             )
         if self.updates == "alternating" and not self.network.interpolates:
             raise ModelError("training setting 'updates' is 'alternating', which needs a LI-Net")
-        if (self.updates == "error_head") != self.network.error_head:
+        if (self.updates in ("error_head", "refine_net")) != self.network.error_head:
             raise ModelError(
                 f"training settings 'updates' and 'network.error_head' are {self.updates!r} and"
-                f" {self.network.error_head}; the updates 'error_head' need an error head, and only they train one"
+                f" {self.network.error_head}; the updates 'error_head' and 'refine_net' need an error head, no others"
+            )
+        if (self.updates == "refine_net") != self.network.refines:
+            raise ModelError(
+                f"training settings 'updates' and 'network.refines' are {self.updates!r} and"
+                f" {self.network.refines}; the updates 'refine_net' need a refinement net, and only they train one"
             )
         if not sum(self.sources.values()) > 0:
             raise ModelError("training setting 'sources' has no weight above 0")
@@ -132,7 +138,7 @@ class TrainingConfig:
 
 
 _CHOICES = {
-    "updates": ("joint", "alternating", "error_head"),
+    "updates": ("joint", "alternating", "error_head", "refine_net"),
     "schedule": ("cosine", "stepped"),
     "precision": ("bfloat16", "float32"),
     "li_net_norm": ("mean", "sum"),
@@ -179,12 +185,21 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
 
 
 # The paper's text (section 4) where it speaks, the authors' code where it does not: docs/train.md.
+# Half of the paper's cells a side: the set branch has the exact directions that larger cells round.
+_COMPACT = NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64)
+
 PRESETS = {
-    "compact": TrainingConfig(
-        # Half of the paper's cells a side: the set branch has the exact directions that larger cells round.
-        network=NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64),
-        batch_size=512,
-        shards=2,
+    "compact": TrainingConfig(network=_COMPACT, batch_size=512, shards=2),
+    "refine": TrainingConfig(
+        network=replace(_COMPACT, error_head=True, refines=True),
+        start_from="spline-net",
+        updates="refine_net",
+        batch_size=4,
+        shards=1,
+        learning_rate=1e-3,
+        warmup_steps=100,
+        steps=REFINE_STEPS,
+        average_decay=0.998,
     ),
     "paper": TrainingConfig(
         network=NetworkConfig(size="paper"),

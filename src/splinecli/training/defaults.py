@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-PRESET_NAMES = ("compact", "paper", "cnn-ps")
+PRESET_NAMES = ("compact", "refine", "paper", "cnn-ps")
 DEFAULT_PRESET = "compact"
 DEFAULT_STEPS = 40_000
 PAPER_STEPS = 200_000
+REFINE_STEPS = 6_000
 
 CHECKPOINT_SECONDS = 45
 """The checkpoint and the figures are renewed after this many seconds."""

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,22 +17,13 @@ from splinecli.errors import ModelError, OutputError
 from splinecli.files import check_writable, write_text
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
-from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers
-from splinecli.training.objective import Losses, Part, compute_losses, part_of_step
+from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_log import Metrics, RunLog, none_for_nan
-from splinecli.training.sources import open_sources
-from splinecli.training.validation import sample_maps, validation_deg
-
-VALIDATION_PIXELS = 2048
-_VALIDATION_DRAW = 64  # pixels at a time: a draw has one source
-
-# Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
-# other processes follow it.
-_BATCH_STREAM, _VALIDATION_STREAM, _DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 + 2
+from splinecli.training.tasks import DROPOUT_STREAM, open_task, stream_seed
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
@@ -44,21 +34,12 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
     return config.learning_rate * rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
 
 
-def stream_seed(seed: int, step: int, stream: int) -> int:
-    """Return the seed of one of a step's random streams.
-
-    A step's batch depends on these three numbers alone. A resumed run, or one that is shared among processes in
-    another way, therefore sees the same batches.
-    """
-    return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
-
-
 def _start_from(weights: str, network: SplineNet) -> None:
     """Copy the weights into the network. A set branch that they lack changes no normal at first."""
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     adds_set = bool(wanted["set_width"]) and not found["set_width"]
-    allowed = {"error_head"} | ({"set_width", "set_layers"} if adds_set else set())
+    allowed = {"error_head", "refines"} | ({"set_width", "set_layers"} if adds_set else set())
     differing = [name for name in wanted if wanted[name] != found[name] and name not in allowed]
     if differing:
         name = differing[0]
@@ -104,16 +85,12 @@ class Trainer:
         self.device = device
         self.workers = workers or Workers()
         self.shards = self.workers.shards(config.shards)
-        self.generator = torch.Generator(device)
-        validation_generator = torch.Generator(device)
-        validation_generator.manual_seed(stream_seed(config.seed, 0, _VALIDATION_STREAM))
         if not resume and (folder / CHECKPOINT).exists():
             raise OutputError(
                 "already contains a run", path=folder, hint="Continue it with --resume, or choose another -o"
             )
-        sources = open_sources(config, self.generator, validation_generator)
-        self.source = sources.training
-        self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
+        self.task = open_task(config, self.shards, device)
+        self.sets, self.single_scene_sets = self.task.sets, self.task.single_scene_sets
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         if config.start_from and not resume:
@@ -133,11 +110,9 @@ class Trainer:
             self.counters = load_checkpoint(
                 folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets
             )
+        self.task.prepare(self.network, rank=self.workers.rank)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
-            pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
-            draws = [sources.validation.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
-            self.validation = join_batches(draws)
             write_text(folder / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")
 
     @property
@@ -184,49 +159,19 @@ class Trainer:
             losses, count = {}, 0
         return metrics
 
-    def draw(self) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
-        """Draw this process's shards of the step's batch.
-
-        Returns:
-            Each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
-        """
-        canonical = self.network.config.is_canonical
-        self.generator.manual_seed(stream_seed(self.config.seed, self.counters.step, _BATCH_STREAM))
-        mirrored = canonical and bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
-        jitter_deg = self.config.turn_jitter_deg if canonical else 0.0
-        pixels = self.config.batch_size // self.config.shards
-        shards = []
-        for shard in self.shards:
-            self.generator.manual_seed(stream_seed(self.config.seed, self.counters.step, shard))
-            batch = self.source.draw(pixels)
-            turn = 2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1
-            shards.append((batch, turn * jitter_deg))
-        return shards, mirrored
-
     def step(self) -> Tensor:
         """Update once on a new batch; return the losses (6,), as in Losses, averaged over all processes."""
         config = self.config
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, self.counters.step, self.progress)
-        shards, mirrored = self.draw()
         # Dropout draws from the global generator. Its seed is that of the step, so a resumed run drops the same.
-        torch.manual_seed(stream_seed(config.seed, self.counters.step, _DROPOUT_STREAM + self.workers.rank))
+        torch.manual_seed(stream_seed(config.seed, self.counters.step, DROPOUT_STREAM + self.workers.rank))
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
         total = torch.zeros(len(Losses._fields), dtype=torch.float64, device=self.device)
-        # One shard at a time: its pixels have about equally many lights, so hardly any padding is computed.
-        for batch, turn_deg in shards:
-            losses = compute_losses(
-                self.network,
-                batch,
-                config,
-                part=part_of_step(config, self.counters.step),
-                turn_deg=turn_deg,
-                mirrored=mirrored,
-                bfloat16=self.bfloat16,
-            )
-            torch.autograd.backward(losses.total / len(shards))
-            total += torch.stack([loss.detach().double() for loss in losses]) / len(shards)
+        for losses in self.task.losses(self.network, self.counters.step, bfloat16=self.bfloat16):
+            torch.autograd.backward(losses.total / len(self.shards))
+            total += torch.stack([loss.detach().double() for loss in losses]) / len(self.shards)
         numbers = self.workers.average(self.network.parameters(), total).cpu()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit or math.inf)
         for name, value in (("loss", numbers[0]), ("gradient", norm)):
@@ -250,7 +195,7 @@ class Trainer:
             self.sets,
         )
         save_weights(self.average, self.folder / WEIGHTS)
-        self.log.draw(sample_maps(self.average, self.validation))
+        self.log.draw(self.task.sample_maps(self.average))
 
     def _check_weights(self) -> None:
         """Raise ModelError where a weight is not finite, before it is saved."""
@@ -277,7 +222,7 @@ class Trainer:
         """Return the metrics of means (N, 6) over the steps of each part: of both, or of NE-Net and LI-Net."""
         # Each network has its own loss, so losses are added. Errors are averaged.
         summed, averaged = Losses(*means.sum(dim=0).tolist()), Losses(*means.mean(dim=0).tolist())
-        checked_deg = validation_deg(self.average, self.validation, bfloat16=self.bfloat16) if check else None
+        checked_deg = self.task.validation_deg(self.average, bfloat16=self.bfloat16) if check else None
         return Metrics(
             step=self.counters.step,
             pixels=self.counters.pixels,

@@ -24,7 +24,7 @@ from splinecli.training.losses import (
     symmetric_loss,
 )
 
-Part = Literal["both", "ne_net", "li_net", "error_head"]
+Part = Literal["both", "ne_net", "li_net", "error_head", "refine_net"]
 
 
 class Losses(NamedTuple):
@@ -48,8 +48,8 @@ def part_of_step(config: TrainingConfig, step: int) -> Part:
     """Return which networks a step updates."""
     if config.updates == "joint":
         return "both"
-    if config.updates == "error_head":
-        return "error_head"
+    if config.updates in ("error_head", "refine_net"):
+        return config.updates
     return "li_net" if step % (config.ne_net_updates + 1) == config.ne_net_updates else "ne_net"
 
 
@@ -76,7 +76,7 @@ def compute_losses(
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     if part == "error_head":
-        with _fixed(network, part), autocast:
+        with fixed(network, part), autocast:
             normals, error = network.estimate(maps, network.interpolate(maps))
         assert error is not None, "TrainingConfig asks for an error head"
         angle, missing = angles(normals, normal_truth), normals.new_full((), torch.nan)
@@ -84,7 +84,7 @@ def compute_losses(
     with_maps = network.config.interpolates or config.symmetric_weight or config.asymmetric_weight
     # The maps are half of the work of a batch, and CNN-PS does not use them.
     dense_truth = dense_truth_in_frame(batch, maps, size=network.config.map_size) if with_maps else None
-    with _fixed(network, part), autocast:
+    with fixed(network, part), autocast:
         with torch.set_grad_enabled(torch.is_grad_enabled() and part != "ne_net"):
             dense = network.interpolate(maps)
         normals = network.estimate(maps, dense).normals
@@ -143,13 +143,14 @@ def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> De
 
 
 @contextmanager
-def _fixed(network: SplineNet, part: Part) -> Iterator[None]:
+def fixed(network: SplineNet, part: Part) -> Iterator[None]:
     """Compute no gradients for parameters outside `part`. Gradients still pass through them."""
     inside = {
         "both": ("",),
         "ne_net": ("ne_net.", "set_branch."),
         "li_net": ("li_net.",),
         "error_head": ("ne_net.error_head.",),
+        "refine_net": ("refine_net.",),
     }[part]
     fixed = [
         parameter

@@ -82,11 +82,13 @@ class RunLog:
                         self._events.add_scalar(key, value, metrics.step)
                 self._events.flush()
 
-    def draw(self, maps: SampleMaps) -> None:
-        """Write curves.png and maps.png anew."""
+    def draw(self, maps: SampleMaps | None) -> None:
+        """Write curves.png anew, and maps.png where there are maps."""
         rows = read_metrics(self.folder / METRICS)
         columns = {field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)}
         write_bytes(self.folder / CURVES, training_curves(columns))
+        if maps is None:
+            return
         figure = observation_map_figure(
             maps.sparse, maps.dense, maps.truth, error_deg=maps.error_deg, truth_label="true map, gaps filled"
         )

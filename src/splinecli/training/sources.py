@@ -10,7 +10,7 @@ from typing import Protocol
 
 import torch
 
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 from splinecli.pixel_sets.source import PixelSetSource
 from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
 from splinecli.synthesis.batches import PixelBatch
@@ -117,6 +117,46 @@ def open_sources(
     return Sources(
         open_all(config.pixels, generator, validate=False),
         open_all(validation_pixels, validation_generator, validate=True),
+        {name: pixel_set.sha256 for name, pixel_set in sets.items()},
+        tuple(name for name, (_, validation) in parts.items() if not validation),
+    )
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """The rendered scenes of a run that trains the refinement net; see Sources for `sets` and `single_scene_sets`."""
+
+    training: tuple[tuple[PixelSet, Entry], ...]
+    validation: tuple[tuple[PixelSet, Entry], ...]
+    sets: dict[str, str]
+    single_scene_sets: tuple[str, ...]
+
+
+def open_scenes(config: TrainingConfig) -> Scenes:
+    """Open the pixel sets of a configuration as whole scenes. Each scene is equally likely, whatever its set's weight.
+
+    Raises:
+        UsageError: there are no pixel sets, or the generator is among the sources.
+        InputError: as for open_sources.
+    """
+    if config.sources.get(GENERATOR, 0) > 0:
+        raise UsageError(
+            "the refinement net learns from pixel sets of rendered scenes, and the sources name the pixel generator",
+            hint="Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset refine",
+        )
+    sets = {name: open_pixel_set(Path(name)) for name, weight in config.sources.items() if weight > 0}
+    parts = _split_sets(sets, config.held_share)
+
+    def together(validate: bool) -> tuple[tuple[PixelSet, Entry], ...]:
+        return tuple(
+            (sets[name], entry)
+            for name, (training, validation) in parts.items()
+            for entry in (validation or training if validate else training)
+        )
+
+    return Scenes(
+        together(False),
+        together(True),
         {name: pixel_set.sha256 for name, pixel_set in sets.items()},
         tuple(name for name, (_, validation) in parts.items() if not validation),
     )

@@ -1,0 +1,214 @@
+"""Training of the refinement net on rendered scenes as images, after a SPLINE-Net that stays as it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from splinecli.networks.error_head import error_negative_log_likelihood
+from splinecli.networks.refine_features import brightness, refine_features, split_features, turn_features
+from splinecli.networks.spline_net import SplineNet
+from splinecli.pixel_sets.store import Entry, PixelSet
+from splinecli.synthesis.batches import CaptureConfig
+from splinecli.synthesis.lights import choose_in_cone, draw_light_counts
+from splinecli.synthesis.whole_capture import photograph_scene
+from splinecli.training.losses import angles
+
+FIRST_EXAMPLES = 16
+"""Captures that are photographed before the first step."""
+
+STEPS_PER_EXAMPLE = 8
+"""Steps after which another one is photographed: a third of the time of training on a processor."""
+
+MOST_EXAMPLES = 2000
+"""More replace the oldest ones. One takes about a megabyte."""
+
+CROP = 128
+"""Side of the part of a larger map that a step sees."""
+
+ERROR_WEIGHT = 0.05
+"""Weight of the likelihood of the errors beside the angle in radians."""
+
+TYPICAL_ERROR = math.radians(2.5)
+"""Added to the error before refinement, whose root divides the angle of a capture. Without it, captures that are good
+already would count too much."""
+
+_BATCH = 1024
+
+
+class SceneMaps(NamedTuple):
+    """One capture of a rendered scene, after SPLINE-Net.
+
+    Attributes:
+        features: (CHANNELS, H, W) float16, see refine_features; zero outside the mask.
+        normals: (3, H, W) float16, the truth.
+        mask: (1, H, W) bool.
+    """
+
+    features: Tensor
+    normals: Tensor
+    mask: Tensor
+
+    def to(self, device: torch.device) -> SceneMaps:
+        """Return the maps on a device."""
+        return SceneMaps(*(maps.to(device) for maps in self))
+
+
+class ScenePool:
+    """Captures of scenes, each under its own lights and faults. The pool grows while training goes on.
+
+    A capture depends only on (seed, its number). A run that continues begins with new captures.
+
+    Args:
+        scenes: entries of pixel sets.
+        network: a SPLINE-Net with an error head, on the device of the captures.
+        config: number of lights and the faults of a capture.
+        seed: seed of all captures.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[tuple[PixelSet, Entry]],
+        network: SplineNet,
+        config: CaptureConfig,
+        seed: int,
+    ) -> None:
+        self.scenes = tuple(scenes)
+        self.network = network
+        self.config = config
+        self.seed = seed
+        self.examples: list[SceneMaps] = []
+        self._made = 0
+
+    def add(self) -> None:
+        """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
+        seeds = np.random.SeedSequence((self.seed, self._made)).generate_state(1, np.uint64)
+        generator = torch.Generator().manual_seed(int(seeds[0] >> np.uint64(1)))
+        pixel_set, entry = self.scenes[int(torch.randint(len(self.scenes), (), generator=generator))]
+        example = _photograph(pixel_set, entry, self.network, self.config, generator)
+        if len(self.examples) < MOST_EXAMPLES:
+            self.examples.append(example)
+        else:
+            self.examples[self._made % MOST_EXAMPLES] = example
+        self._made += 1
+
+    def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
+        """Draw `count` captures, turn, mirror and crop each, and stack them as float32 (count, ...)."""
+        drawn = [
+            _turned(self.examples[int(index)], generator)
+            for index in torch.randint(
+                len(self.examples), (count,), generator=generator, device=generator.device
+            )
+        ]
+        return stack_maps(drawn)
+
+
+def _photograph(
+    pixel_set: PixelSet,
+    entry: Entry,
+    network: SplineNet,
+    config: CaptureConfig,
+    generator: torch.Generator,
+) -> SceneMaps:
+    pixels = pixel_set.load(entry)
+    lights = torch.from_numpy(np.array(pixels.light_directions))
+    most = min(config.max_lights, entry.n_lights)
+    counts = draw_light_counts(1, config.min_lights, most, min(config.usual_lights, most), generator)
+    chosen = choose_in_cone(lights, int(counts), generator)
+    radiance = torch.from_numpy(np.asarray(pixels.observations[:, chosen.numpy()], np.float32))
+    observations, lights = photograph_scene(radiance, lights[chosen], config, generator)
+    features = pixel_features(network, observations, lights)
+    mask = torch.from_numpy(np.array(pixels.mask))
+    rows, columns = (torch.nonzero(mask.any(dim=axis)).flatten() for axis in (1, 0))
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+    def placed(values: Tensor) -> Tensor:
+        maps = torch.zeros(values.shape[1], *mask.shape, dtype=torch.float16)
+        maps[:, mask] = values.T.half().cpu()
+        return maps[:, *box].clone()
+
+    truth = torch.from_numpy(np.array(pixels.normals))
+    return SceneMaps(placed(features), placed(truth), mask[None, *box].clone())
+
+
+@torch.no_grad()
+def pixel_features(network: SplineNet, observations: Tensor, light_directions: Tensor) -> Tensor:
+    """Return the refinement net's features (P, CHANNELS) of a capture's pixels, after SPLINE-Net."""
+    device = network.cells.device
+    network.eval()
+    reference = brightness(observations)
+    light_directions = light_directions.to(device)
+    found = []
+    for start in range(0, len(observations), _BATCH):
+        batch = observations[start : start + _BATCH].to(device)
+        normals, error = network(batch, light_directions)
+        assert error is not None, "TrainingConfig asks for an error head"
+        found.append(refine_features(batch, light_directions, normals, error, reference))
+    return torch.cat(found)
+
+
+def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
+    """Stack captures as float32 (B, ...); smaller ones get a margin outside the mask."""
+    height, width = (max(capture.mask.shape[axis] for capture in captures) for axis in (-2, -1))
+    return SceneMaps(
+        *(
+            torch.stack(
+                [pad(maps.float(), (0, width - maps.shape[-1], 0, height - maps.shape[-2])) for maps in field]
+            )
+            for field in zip(*captures, strict=True)
+        )
+    )
+
+
+def _turned(example: SceneMaps, generator: torch.Generator) -> SceneMaps:
+    draw = torch.rand(4, generator=generator, device=generator.device).tolist()
+    height, width = example.mask.shape[-2:]
+    top, left = int(draw[0] * max(height - CROP + 1, 1)), int(draw[1] * max(width - CROP + 1, 1))
+    box = slice(top, top + CROP), slice(left, left + CROP)
+    quarters, mirror = int(4 * draw[2]), draw[3] < 0.5
+    features, normals = turn_features(example.features[:, *box], example.normals[:, *box], quarters, mirror)
+    mask = example.mask[:, *box]
+    mask = (mask.flip(-1) if mirror else mask).rot90(quarters, (-2, -1))
+    return SceneMaps(features, normals, mask)
+
+
+class RefinementLosses(NamedTuple):
+    """The total loss, and the mean angle in radians before and after refinement, averaged over captures."""
+
+    total: Tensor
+    before: Tensor
+    angle: Tensor
+
+
+def refinement_losses(network: SplineNet, maps: SceneMaps, *, bfloat16: bool = False) -> RefinementLosses:
+    """Compute the losses of stacked captures.
+
+    The mean angle of each capture is divided by the root of its error before refinement: a degree counts more on a
+    capture that is nearly right. The likelihood of the errors is that of the error head.
+    """
+    assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
+    with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+        normals, error = network.refine_net(maps.features, maps.mask)
+    inside = maps.mask[:, 0]
+    area = inside.sum((1, 2)).clamp(min=1)
+
+    def mean_over_capture(values: Tensor) -> Tensor:
+        return (values * inside).sum((1, 2)) / area
+
+    def angles_of(estimate: Tensor) -> Tensor:
+        return angles(estimate.movedim(1, -1), maps.normals.movedim(1, -1))
+
+    with torch.no_grad():
+        before = mean_over_capture(angles_of(split_features(maps.features)[0]))
+    angle = angles_of(normals)
+    after = mean_over_capture(angle)
+    surprise = mean_over_capture(error_negative_log_likelihood(error.movedim(1, -1), angle.detach()))
+    weight = math.sqrt(2 * TYPICAL_ERROR) / (before + TYPICAL_ERROR).sqrt()
+    total = (weight * after + ERROR_WEIGHT * surprise).mean()
+    return RefinementLosses(total, before.mean(), after.mean())

@@ -1,0 +1,192 @@
+"""What a run trains on: pixels for LI-Net, NE-Net and the error head, or whole scenes for the refinement net."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splinecli.networks.spline_net import SplineNet
+from splinecli.synthesis.batches import PixelBatch, join_batches
+from splinecli.training.config import TrainingConfig
+from splinecli.training.objective import Losses, compute_losses, fixed, part_of_step
+from splinecli.training.refinement import (
+    FIRST_EXAMPLES,
+    STEPS_PER_EXAMPLE,
+    ScenePool,
+    refinement_losses,
+    stack_maps,
+)
+from splinecli.training.sources import open_scenes, open_sources
+from splinecli.training.validation import SampleMaps, sample_maps, validation_deg
+
+VALIDATION_PIXELS = 2048
+_VALIDATION_DRAW = 64  # pixels at a time: a draw has one source
+VALIDATION_SCENES = 12
+
+# Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
+# other processes follow it.
+_BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 - 1, 2**31 + 2
+
+
+def stream_seed(seed: int, step: int, stream: int) -> int:
+    """Return the seed of one of a step's random streams.
+
+    A step's batch depends on these three numbers alone. A resumed run, or one that is shared among processes in
+    another way, therefore sees the same batches.
+    """
+    return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
+
+
+class Task(Protocol):
+    """Draws what a run trains on, and judges a network by it.
+
+    Attributes:
+        sets, single_scene_sets: see Sources.
+    """
+
+    sets: dict[str, str]
+    single_scene_sets: tuple[str, ...]
+
+    def prepare(self, network: SplineNet, *, rank: int) -> None:
+        """Draw what is needed before the first step, for process number `rank`. Only process 0 validates."""
+        ...
+
+    def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
+        """Yield the losses of each of this process's shards of a step's batch."""
+        ...
+
+    def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
+        """Return the mean angular error on what is not trained on, in degrees."""
+        ...
+
+    def sample_maps(self, network: SplineNet) -> SampleMaps | None:
+        """Return observation maps for maps.png, if the task has some."""
+        ...
+
+
+def open_task(config: TrainingConfig, shards: range, device: torch.device) -> PixelTask | RefinementTask:
+    """Open the sources of a run. Raises InputError, UsageError."""
+    if config.updates == "refine_net":
+        return RefinementTask(config, shards, device)
+    return PixelTask(config, shards, device)
+
+
+class PixelTask:
+    """Batches of pixels from the sources of a run.
+
+    Attributes:
+        source: draws training pixels.
+        validation: the validation pixels.
+    """
+
+    def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
+        self.config = config
+        self.shards = shards
+        self.device = device
+        self.generator = torch.Generator(device)
+        held = torch.Generator(device)
+        held.manual_seed(stream_seed(config.seed, 0, _VALIDATION_STREAM))
+        sources = open_sources(config, self.generator, held)
+        self.source = sources.training
+        self._held = sources.validation
+        self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
+
+    def prepare(self, network: SplineNet, *, rank: int) -> None:
+        if rank == 0:
+            pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
+            draws = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
+            self.validation = join_batches(draws)
+
+    def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
+        """Draw this process's shards of a step's batch.
+
+        Returns:
+            Each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
+        """
+        config = self.config
+        canonical = config.network.is_canonical
+        self.generator.manual_seed(stream_seed(config.seed, step, _BATCH_STREAM))
+        mirrored = canonical and bool(torch.rand((), generator=self.generator, device=self.device) < 0.5)
+        jitter_deg = config.turn_jitter_deg if canonical else 0.0
+        pixels = config.batch_size // config.shards
+        shards = []
+        for shard in self.shards:
+            self.generator.manual_seed(stream_seed(config.seed, step, shard))
+            batch = self.source.draw(pixels)
+            turn = 2 * torch.rand(pixels, generator=self.generator, device=self.device) - 1
+            shards.append((batch, turn * jitter_deg))
+        return shards, mirrored
+
+    def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
+        shards, mirrored = self.draw(step)
+        # One shard at a time: its pixels have about equally many lights, so hardly any padding is computed.
+        for batch, turn_deg in shards:
+            yield compute_losses(
+                network,
+                batch,
+                self.config,
+                part=part_of_step(self.config, step),
+                turn_deg=turn_deg,
+                mirrored=mirrored,
+                bfloat16=bfloat16,
+            )
+
+    def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
+        return validation_deg(network, self.validation, bfloat16=bfloat16)
+
+    def sample_maps(self, network: SplineNet) -> SampleMaps:
+        return sample_maps(network, self.validation)
+
+
+class RefinementTask:
+    """Captures of whole scenes, photographed while training goes on; see ScenePool."""
+
+    def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
+        self.config = config
+        self.shards = shards
+        self.device = device
+        self.generator = torch.Generator()
+        self.scenes = open_scenes(config)
+        self.sets, self.single_scene_sets = self.scenes.sets, self.scenes.single_scene_sets
+
+    def prepare(self, network: SplineNet, *, rank: int) -> None:
+        config, scenes = self.config, self.scenes
+        self.pool = ScenePool(
+            scenes.training, network, config.pixels, stream_seed(config.seed, rank, _POOL_STREAM)
+        )
+        for _ in range(FIRST_EXAMPLES):
+            self.pool.add()
+        if rank == 0:
+            seed = stream_seed(config.seed, 0, _VALIDATION_STREAM)
+            held = ScenePool(scenes.validation, network, config.pixels, seed)
+            for _ in range(VALIDATION_SCENES):
+                held.add()
+            self.validation = [stack_maps([example]) for example in held.examples]
+
+    def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
+        if step % STEPS_PER_EXAMPLE == 0:
+            self.pool.add()
+        missing = torch.full((), torch.nan, device=self.device)
+        for shard in self.shards:
+            self.generator.manual_seed(stream_seed(self.config.seed, step, shard))
+            maps = self.pool.draw(self.config.batch_size // self.config.shards, self.generator)
+            with fixed(network, "refine_net"):
+                found = refinement_losses(network, maps.to(self.device), bfloat16=bfloat16)
+            yield Losses(found.total, found.angle, missing, missing, missing, missing)
+
+    @torch.no_grad()
+    def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
+        network.eval()
+        found = [
+            refinement_losses(network, maps.to(self.device), bfloat16=bfloat16).angle
+            for maps in self.validation
+        ]
+        return math.degrees(float(torch.stack(found).mean()))
+
+    def sample_maps(self, network: SplineNet) -> None:
+        return None

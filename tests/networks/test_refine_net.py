@@ -1,0 +1,106 @@
+"""The refinement net and its features: symmetries, the mask, and how far it sees."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from splinecli.networks.refine_features import CHANNELS, refine_features, split_features, turn_features
+from splinecli.networks.refine_net import COARSEST, REACH, RefineNet
+
+HEIGHT, WIDTH = 6, 9
+
+
+def random_net(seed: int = 0) -> RefineNet:
+    """A net whose every layer does something."""
+    generator = torch.Generator().manual_seed(seed)
+    net = RefineNet()
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return net.eval()
+
+
+def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    mask = (torch.rand(1, 1, height, width, generator=generator) < 0.9).float()
+    features = torch.randn(1, CHANNELS, height, width, generator=generator) * mask
+    return features, mask
+
+
+def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Tensor) -> Tensor:
+    """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H, W)."""
+    rows = [maps.flatten(1).T.contiguous() for maps in (observations, normals, error)]
+    features = refine_features(rows[0], lights, rows[1], rows[2], 0.7)
+    return features.T.view(-1, *observations.shape[1:])
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("quarters", range(4))
+def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
+    generator = torch.Generator().manual_seed(1)
+    lights = torch.nn.functional.normalize(
+        torch.randn(7, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
+    )
+    normals = torch.randn(3, HEIGHT, WIDTH, generator=generator) + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
+    normals = torch.nn.functional.normalize(normals, dim=0)
+    error = torch.randn(2, HEIGHT, WIDTH, generator=generator)
+    shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)
+    observations = shading**1.5 + 0.05 * torch.rand(7, HEIGHT, WIDTH, generator=generator)
+
+    def turned(vectors: Tensor) -> Tensor:
+        """Vectors (3, ...), turned."""
+        x, y, z = (-vectors[0] if mirror else vectors[0]), vectors[1], vectors[2]
+        for _ in range(quarters):
+            x, y = -y, x
+        return torch.stack((x, y, z))
+
+    def moved(maps: Tensor) -> Tensor:
+        return (maps.flip(-1) if mirror else maps).rot90(quarters, (-2, -1))
+
+    expected = features_of(moved(observations), turned(lights.T).T, turned(moved(normals)), moved(error))
+    found, found_normals = turn_features(
+        features_of(observations, lights, normals, error), normals, quarters, mirror
+    )
+    torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-4)
+    torch.testing.assert_close(found_normals, turned(moved(normals)))
+
+
+def test_a_new_net_changes_nothing() -> None:
+    features, mask = random_maps(12, 15)
+    features[:, :3] = torch.nn.functional.normalize(features[:, :3], dim=1)
+    normals, error = RefineNet()(features, mask)
+    before, error_before = split_features(features)
+    torch.testing.assert_close(normals, before * mask)
+    torch.testing.assert_close(error, error_before * mask)
+
+
+def test_outside_of_the_mask_is_outside_of_the_image() -> None:
+    features, mask = random_maps(20, 24)
+    wide = torch.nn.functional.pad(features, (COARSEST, 9, 2 * COARSEST, 3))
+    wide_mask = torch.nn.functional.pad(mask, (COARSEST, 9, 2 * COARSEST, 3))
+    net = random_net().double()
+    box = (..., slice(2 * COARSEST, 2 * COARSEST + 20), slice(COARSEST, COARSEST + 24))
+    for alone, within in zip(
+        net(features.double(), mask.double()), net(wide.double(), wide_mask.double()), strict=True
+    ):
+        torch.testing.assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
+
+
+def test_nothing_beyond_the_reach_counts() -> None:
+    size = 2 * REACH + COARSEST
+    features, mask = random_maps(size, size)
+    net = random_net().double()
+    before = net(features.double(), mask.double())
+    for place in (0, size - 1):
+        changed = features.clone().double()
+        changed[..., place, :] += 1
+        changed[..., place] += 1
+        after = net(changed, mask.double())
+        distance = torch.arange(size).sub(place).abs()
+        far = torch.minimum(distance[:, None], distance[None]) >= REACH
+        for one, other in zip(before, after, strict=True):
+            difference = (one - other).abs().amax(dim=(0, 1))
+            assert difference[far].max() == 0
+            assert difference.max() > 0
