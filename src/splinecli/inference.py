@@ -1,4 +1,4 @@
-"""From a Capture and an Estimator to a NormalEstimate.
+"""From a Capture and an Estimator to a NormalEstimate, refined where the estimator has a refiner.
 
 The pixels are processed in tiles. The working memory of a method is that of one tile; only the results grow with the
 capture.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import Progress, confidence, tells_confidence
+from splinecli.methods.estimator import Progress, confidence, refiner_of, tells_confidence
 from splinecli.methods.lamp_light import LampLight, rows_of
 from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
@@ -84,6 +85,10 @@ def estimate_normals(
         else:
             found = estimator.estimate(light.observations, light.directions, progress=progress)
         normals[rows] = light.in_frame_of_capture(found)
+    refiner = refiner_of(estimator)
+    if refiner is not None and errors is not None:
+        light_of = partial(_light_on, capture)
+        normals, errors = refiner.refine(capture.mask, capture.observations, light_of, normals, errors)
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
@@ -100,7 +105,7 @@ def estimate_normals(
     )
 
 
-def _light_on(capture: Capture, rows: slice) -> LampLight:
+def _light_on(capture: Capture, rows: slice | NDArray[np.integer]) -> LampLight:
     """Return the observations and the light directions of some of a capture's pixels."""
     observations = capture.observations[rows]
     if capture.lamps is None:

@@ -20,6 +20,7 @@ from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trial_capture import TrialSource
 from splinecli.evaluation.trials import Trial, TrialStore, plan_trials
 from splinecli.methods import Estimator
+from splinecli.methods.estimator import refiner_of
 
 Unit = tuple[Trial, Estimator]
 """A trial and the method that it scores."""
@@ -140,7 +141,8 @@ class CaptureJob:
         protocol = self.tasks[0].protocol
         rows = scored_rows(stored.capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
         as_stored = all(task.protocol.as_stored for task in self.tasks)
-        return TrialSource.with_pixels(stored, rows, as_stored=as_stored)
+        whole = any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw)
+        return TrialSource.with_pixels(stored, rows, as_stored=as_stored, whole=whole)
 
 
 def as_input_error(error: SplinecliError | OSError, folder: Path) -> SplinecliError:

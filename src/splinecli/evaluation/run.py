@@ -19,6 +19,7 @@ from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
 from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
+from splinecli.methods.estimator import refiner_of
 
 OnProgress = Callable[[float, int, str], object]
 """Called with the trials done, the total, and a short text. A running trial counts by the share of its pixels."""
@@ -148,12 +149,11 @@ class _Run:
         return running
 
     def _score(self, shared: SharedDraw, trial: Trial, estimator: Estimator) -> None:
-        capture = shared.capture()
+        capture = shared.capture(whole=refiner_of(estimator) is not None)
         advance = self._progress.begin(capture.n_pixels)
         estimate = estimate_normals(capture, estimator, progress=advance)
-        assert estimate.errors is not None  # a capture without ground truth has no trials
         estimated = capture.estimated_intensities is not None
-        self._store.add(trial, Score(estimate.errors.mean, estimate.seconds, estimated))
+        self._store.add(trial, Score(shared.mean_error_deg(estimate), estimate.seconds, estimated))
 
 
 class _Progress:

@@ -14,6 +14,7 @@ from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Trial
+from splinecli.inference import NormalEstimate
 from splinecli.methods.near_light import find_surface
 
 _RETILTS = 100
@@ -35,42 +36,48 @@ class TrialSource:
     rows: NDArray[np.integer] | None = None
 
     @classmethod
-    def with_pixels(cls, stored: StoredCapture, rows: NDArray[np.integer], *, as_stored: bool) -> TrialSource:
+    def with_pixels(
+        cls, stored: StoredCapture, rows: NDArray[np.integer], *, as_stored: bool, whole: bool
+    ) -> TrialSource:
         """Return a source that scores the given rows of the observations only.
 
         Args:
+            whole: whether a method sees neighbours, and so needs all pixels.
             as_stored: whether no trial restores. Otherwise all pixels are kept where the light intensities are
                 unknown, because `infer` estimates them from all pixels. They are also kept under near lamps, which
                 need the whole surface.
         """
         if len(rows) == stored.capture.n_pixels:
             return cls(stored)
-        if stored.capture.lamps is None and (as_stored or stored.intensities_known):
+        if not whole and stored.capture.lamps is None and (as_stored or stored.intensities_known):
             return cls(stored.choose_pixels(rows))
         return cls(stored, rows)
 
-    def see(self, trial: Trial) -> Capture:
-        """Return the capture under the lights of a trial, with noise on their directions, and refined if asked."""
-        capture = self._see(trial)
+    def see(self, trial: Trial, *, whole: bool = False) -> Capture:
+        """Return the capture under the lights of a trial, with noise on their directions, which are refined if asked.
+
+        It has the scored pixels, or with `whole` all of them.
+        """
+        capture = self._see(trial, None if whole else self.rows)
         if trial.light_error_deg is None:
             return capture
         known = self.stored.intensities_known
         return refine_capture(capture, error_deg=trial.light_error_deg, intensities_known=known)
 
-    def _see(self, trial: Trial) -> Capture:
+    def _see(self, trial: Trial, rows: NDArray[np.integer] | None) -> Capture:
         position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
         seen = self.stored.choose_lights([position[light] for light in trial.lights])
         if trial.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
         intensities = None if trial.as_stored else seen.estimate_intensities()
-        if self.rows is None or seen.capture.lamps is None:
-            if self.rows is not None:
-                seen = seen.choose_pixels(self.rows)
+        if rows is None or seen.capture.lamps is None:
+            if rows is not None:
+                seen = seen.choose_pixels(rows)
             return seen.capture if trial.as_stored else seen.restore(intensities)
         # Near lamps need the surface, which only all pixels together have.
         capture = find_surface(seen.capture if trial.as_stored else seen.restore(intensities))
-        return capture.choose_pixels(self.rows)
+        return capture.choose_pixels(rows)
 
 
 class SharedDraw:
@@ -79,14 +86,24 @@ class SharedDraw:
     def __init__(self, source: TrialSource, trial: Trial) -> None:
         self._source, self._trial = source, trial
         self._lock = Lock()
-        self._capture: Capture | None = None
+        self._captures: dict[bool, Capture] = {}
 
-    def capture(self) -> Capture:
-        """Return the capture under the lights of the draw. Any thread may call this."""
+    def capture(self, *, whole: bool) -> Capture:
+        """Return the capture under the lights of the draw: the scored pixels, or all. Any thread may call this."""
         with self._lock:
-            if self._capture is None:
-                self._capture = self._source.see(self._trial)
-            return self._capture
+            if whole not in self._captures:
+                self._captures[whole] = self._source.see(self._trial, whole=whole)
+            return self._captures[whole]
+
+    def mean_error_deg(self, estimate: NormalEstimate) -> float:
+        """Return the mean error of an estimate over the scored pixels."""
+        assert (
+            estimate.errors is not None and estimate.error_map_deg is not None
+        )  # or it would have no trials
+        rows = self._source.rows
+        if rows is None or estimate.capture.n_pixels == len(rows):
+            return estimate.errors.mean
+        return float(estimate.error_map_deg[estimate.capture.mask][rows].mean())
 
 
 def _with_noise(capture: Capture, trial: Trial) -> Capture:

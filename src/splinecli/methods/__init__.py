@@ -88,10 +88,12 @@ class _Solver:
 
 @dataclass(frozen=True)
 class _Network:
-    """A network, with its default number of averaged rotations and its default batch size."""
+    """A network: its default weights, averaged rotations and batch size, and whether it refines the map."""
 
+    weights: str
     rotations: int
     batch_size: int
+    refines: bool = True
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
         from splinecli.devices import choose_device, choose_precision, use_available_cores
@@ -102,17 +104,19 @@ class _Network:
         device = choose_device(options.device)
         return NetworkEstimator(
             name,
-            resolve_weights(options.weights or name),
+            resolve_weights(options.weights or self.weights),
             device=device,
             precision=choose_precision(options.precision, device),
+            refines=self.refines,
             rotations=self.rotations if options.rotations is None else options.rotations,
             batch_size=self.batch_size if options.batch_size is None else options.batch_size,
         )
 
 
 _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
-    "spline-net": _Network(rotations=1, batch_size=1024),
-    "cnn-ps": _Network(rotations=10, batch_size=512),
+    "spline-net": _Network("spline-net", rotations=1, batch_size=1024),
+    "spline-net-pixelwise": _Network("spline-net", rotations=1, batch_size=1024, refines=False),
+    "cnn-ps": _Network("cnn-ps", rotations=10, batch_size=512),
     "ls": _least_squares,
     "ls-trimmed": _Solver("trimmed_least_squares", 8192),
     "l1": _Solver("least_absolute", 8192),

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from splinecli.methods.refiner import Refiner
 
 Observations = NDArray[np.float32]
 """(P, F): linear, already divided by the light intensities."""
@@ -77,6 +80,22 @@ class ConfidentEstimator(Estimator, Protocol):
         networks/error_head.py describes the two numbers. A pixel that is dark under every light gets UNKNOWN_ERROR.
         """
         ...
+
+
+@runtime_checkable
+class RefiningEstimator(ConfidentEstimator, Protocol):
+    """An estimator whose map of normals can be corrected by what lies around each pixel.
+
+    refiner: does that; None if the weights or the method leave it out.
+    """
+
+    @property
+    def refiner(self) -> Refiner | None: ...
+
+
+def refiner_of(estimator: Estimator) -> Refiner | None:
+    """Return what corrects the estimator's map of normals, if anything does."""
+    return estimator.refiner if isinstance(estimator, RefiningEstimator) else None
 
 
 def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:

@@ -64,6 +64,10 @@ class LampLight:
             directions = np.einsum("pij,pfj->pfi", turns, directions)
         return cls(observations / strengths, directions, turns)
 
+    def in_frame_of_pixels(self, normals: Floats) -> Floats:
+        """Return normals (P, 3), given in the capture's frame, in the pixels' own."""
+        return normals if self.turns is None else np.einsum("pij,pj->pi", self.turns, normals)
+
     def in_frame_of_capture(self, normals: Floats) -> Floats:
         """Return normals (P, 3), given in the pixels' own frames, in the capture's."""
         return normals if self.turns is None else np.einsum("pji,pj->pi", self.turns, normals)
@@ -75,7 +79,7 @@ def estimate_under_lamps(estimator: Estimator, observations: NDArray[np.float32]
     return light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
 
 
-def rows_of(lamps: NearLamps, rows: slice) -> NearLamps:
+def rows_of(lamps: NearLamps, rows: slice | NDArray[np.integer]) -> NearLamps:
     """Return the lamps with the points of some pixels."""
     assert lamps.points is not None
     return replace(lamps, points=lamps.points[rows])

@@ -13,6 +13,7 @@ from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, Progress
 from splinecli.methods.layer_progress import LayerProgress, PixelSteps
+from splinecli.methods.refiner import Refiner
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
@@ -31,6 +32,7 @@ class NetworkEstimator:
         loaded: the network with its name and checksum.
         device: the torch device.
         precision: the number format of the convolutions.
+        refines: whether the refinement net, if the weights have one, corrects the map afterwards.
         rotations: number R of averaged estimates, see `rotations_of`.
         batch_size: pixels per batch; memory grows with it (about 0.25 MB a pixel).
 
@@ -46,11 +48,12 @@ class NetworkEstimator:
         *,
         device: torch.device | str = "cpu",
         precision: Precision = "bfloat16",
+        refines: bool = True,
         rotations: int = 1,
         batch_size: int = 1024,
     ) -> None:
         interpolates = loaded.network.config.interpolates
-        if interpolates != (name == "spline-net"):
+        if interpolates == (name == "cnn-ps"):
             kind, fitting = ("SPLINE-Net", "spline-net") if interpolates else ("CNN-PS", "cnn-ps")
             raise ModelError(
                 f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them",
@@ -65,6 +68,8 @@ class NetworkEstimator:
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         self.batch_size = batch_size
         self.network = loaded.network.to(device)
+        refine_net = self.network.refine_net
+        self.refiner = Refiner(refine_net, self.precision) if refines and refine_net is not None else None
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._layers = LayerProgress(self.network)
 

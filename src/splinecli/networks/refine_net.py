@@ -56,7 +56,8 @@ class RefineNet(nn.Module):
         masks = [pad(mask, border)]
         for _ in self.down:
             masks.append(max_pool2d(masks[-1], 2))
-        x = self.enter(torch.cat((pad(features, border), masks[0]), dim=1)) * masks[0]
+        joined = torch.cat((pad(features, border), masks[0]), dim=1)
+        x = self.enter(joined.contiguous(memory_format=torch.channels_last)) * masks[0]
         passed = []
         for scale, blocks in enumerate(self.encode):
             if scale:

@@ -1,0 +1,113 @@
+"""Refinement of a whole capture: tiles, masks, dark pixels, and the scores of single pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from conftest import spiral_lights
+from splinecli.capture import Capture, read_capture
+from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.run import evaluate
+from splinecli.evaluation.scored_pixels import scored_rows
+from splinecli.inference import estimate_normals
+from splinecli.methods.estimator import UNKNOWN_ERROR
+from splinecli.methods.lamp_light import LampLight
+from splinecli.methods.networks import NetworkEstimator
+from splinecli.methods.refiner import Refiner
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.refine_net import REACH, RefineNet
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import LoadedNetwork
+from splinecli.normals import unit
+
+LIGHTS = spiral_lights(6, 60)
+
+
+def lively(network: torch.nn.Module) -> torch.nn.Module:
+    """Fill every parameter with small random numbers."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(0.08 * torch.randn(parameter.shape, generator=generator))
+    return network.eval()
+
+
+def refine(
+    mask: NDArray[np.bool_], tile: int, *, dark: int | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the normals before, and normals and errors after refinement of a random map."""
+    rng = np.random.default_rng(1)
+    count = np.count_nonzero(mask)
+    normals = unit(rng.normal((0, 0, 3), 1, (count, 3))).astype(np.float32)
+    errors = rng.normal((-3, 1), 0.3, (count, 2)).astype(np.float32)
+    observations = (normals @ LIGHTS.T).clip(0).astype(np.float32)
+    if dark is not None:
+        observations[dark], errors[dark] = 0, UNKNOWN_ERROR
+    net = lively(RefineNet())
+    assert isinstance(net, RefineNet)
+    found = Refiner(net, "float32", tile=tile).refine(
+        mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals, errors
+    )
+    return normals, *found
+
+
+def test_tiles_change_nothing() -> None:
+    mask = np.random.default_rng(0).random((2 * REACH + 20, 3 * REACH + 2)) < 0.95
+    mask[30:60, 40:90] = False
+    _, normals, errors = refine(mask, 512)
+    _, tiled, tiled_errors = refine(mask, 32)
+    np.testing.assert_allclose(tiled, normals, atol=1e-4)
+    np.testing.assert_allclose(tiled_errors, errors, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (37, 1), (5, 6)])
+def test_small_and_thin_masks(shape: tuple[int, int]) -> None:
+    before, normals, _ = refine(np.ones(shape, np.bool_), 512)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert np.abs(normals - before).max() > 1e-3
+
+
+def test_dark_pixels_stay() -> None:
+    before, normals, errors = refine(np.ones((8, 9), np.bool_), 512, dark=20)
+    np.testing.assert_array_equal(normals[20], before[20])
+    np.testing.assert_allclose(errors[20], UNKNOWN_ERROR, rtol=1e-6)
+    assert (normals[21] != before[21]).any()
+
+
+def estimator(*, refines: bool) -> NetworkEstimator:
+    tiny = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width": 16, "error_head": True, "refines": True}
+    network = lively(SplineNet(NetworkConfig.from_dict(tiny)))
+    assert isinstance(network, SplineNet)
+    name = "spline-net" if refines else "spline-net-pixelwise"
+    return NetworkEstimator(name, LoadedNetwork(network, "tiny", "0"), precision="float32", refines=refines)
+
+
+def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
+    rng = np.random.default_rng(2)
+    mask = np.ones((7, 8), np.bool_)
+    capture = Capture("c", rng.uniform(0.1, 1, (56, 6)).astype(np.float32), LIGHTS, tuple(range(6)), mask)
+    pixelwise, refined = (estimate_normals(capture, estimator(refines=refines)) for refines in (False, True))
+    alone = estimator(refines=True).estimate(capture.observations, LIGHTS)
+    np.testing.assert_array_equal(pixelwise.normal_map[mask], alone)
+    assert np.abs(refined.normal_map - pixelwise.normal_map).max() > 1e-3
+    assert refined.confidence_map is not None and pixelwise.confidence_map is not None
+    assert np.abs(refined.confidence_map - pixelwise.confidence_map).max() > 1e-3
+
+
+def test_scored_pixels_are_refined_among_all() -> None:
+    """Scoring 50 pixels needs the whole map: they score as they do in the map of `infer`."""
+    folder = Path(__file__).parents[2] / "examples/medallion"
+    method = estimator(refines=True)
+    protocol = Protocol(n_lights=None, trials=1, max_pixels=50)
+    (result,) = evaluate([folder], [method], protocol).results
+    capture = read_capture(folder)
+    errors_deg = estimate_normals(capture, method).error_map_deg
+    assert errors_deg is not None
+    rows = scored_rows(capture, max_pixels=50, seed=protocol.seed)
+    assert result.mae_deg == pytest.approx(errors_deg[capture.mask][rows].mean(), abs=1e-4)
