@@ -301,7 +301,9 @@ def test_the_methods_of_a_draw_share_its_capture(
 ) -> None:
     made: list[int] = []
     see = TrialSource.see
-    monkeypatch.setattr(TrialSource, "see", lambda self, trial: made.append(trial.number) or see(self, trial))
+    monkeypatch.setattr(
+        TrialSource, "see", lambda self, trial, **kind: made.append(trial.number) or see(self, trial, **kind)
+    )
     estimators = [make_estimator("ls"), make_estimator("iw12")]
     evaluate_all([write_dome()], estimators, [Protocol(4, trials=3)], jobs=2)
     assert sorted(made) == [0, 1, 2]

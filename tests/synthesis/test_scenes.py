@@ -46,7 +46,7 @@ def test_a_scene_depends_on_its_seed_and_index_alone() -> None:
 
 
 def test_what_is_rendered() -> None:
-    rendered = render_scene(draw_scene(0, 0, SMALL, tent()), SMALL)
+    rendered = render_scene(draw_scene(0, 2, SMALL, tent()), SMALL)
     pixels = rendered.mask.sum()
     assert rendered.mask.shape == (16, 16)
     assert pixels == 256  # the slopes fill the frame
@@ -58,7 +58,7 @@ def test_what_is_rendered() -> None:
         assert (rendered.observations[name] >= 0).all()
     # The slopes light each other: without bounces the valley is darker, and nowhere brighter.
     direct = SceneConfig(**{**SMALL.__dict__, "bounces": 0})
-    alone = render_scene(draw_scene(0, 0, direct, tent()), direct)
+    alone = render_scene(draw_scene(0, 2, direct, tent()), direct)
     for name in CLASSES:
         added = rendered.observations[name] - alone.observations[name]
         assert added.min() > -1e-6

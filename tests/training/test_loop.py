@@ -257,7 +257,7 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
     further = replace(tiny, start_from=str(tmp_path / "second" / WEIGHTS))
     assert set(Trainer(further, tmp_path / "third", CPU).network.state_dict()) == set(first.state_dict())
     for settings in ({"updates": "error_head"}, {"network": config.network}):
-        with pytest.raises(ModelError, match="the updates 'error_head' need an error head"):
+        with pytest.raises(ModelError, match="the updates 'error_head' and 'refine_net' need"):
             replace(tiny, **settings)
 
 

@@ -115,7 +115,6 @@ class _Network:
 
 _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
     "spline-net": _Network("spline-net", rotations=1, batch_size=1024),
-    "spline-net-pixelwise": _Network("spline-net", rotations=1, batch_size=1024, refines=False),
     "cnn-ps": _Network("cnn-ps", rotations=10, batch_size=512),
     "ls": _least_squares,
     "ls-trimmed": _Solver("trimmed_least_squares", 8192),
@@ -123,4 +122,5 @@ _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
     "iw12": _Solver("iw12", 8192),
     "st14": _Solver("st14", 1024),
     "ia14": _Solver("ia14", 1024),
+    "spline-net-pixelwise": _Network("spline-net", rotations=1, batch_size=1024, refines=False),
 }

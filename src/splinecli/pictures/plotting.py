@@ -25,8 +25,8 @@ class MethodStyle(NamedTuple):
 _STYLES = tuple(
     MethodStyle(colour, marker)
     for colour, marker in zip(
-        ("#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080"),
-        "osD^vXP*",
+        ("#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080", "#7F5F3F"),
+        "osD^vXP*h",
         strict=True,
     )
 )
