@@ -17,6 +17,7 @@ from splinecli.errors import OutputError
 UNFINISHED = ".unfinished"
 """The ending of hidden files and folders that are being written. What a killed process left is removed later."""
 
+_MOST_JSON = 1 << 24  # bytes of a file
 _MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
 
 
@@ -87,6 +88,8 @@ def read_json(path: Path) -> Any:
     """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and for what is no file."""
     if not path.is_file() and path.exists():
         raise ValueError("it is no file")  # a device might never end
+    if path.stat().st_size > _MOST_JSON:
+        raise ValueError(f"it has more than {_MOST_JSON / 1e6:.0f} MB")
     return parse_json(path.read_text("utf-8"))
 
 

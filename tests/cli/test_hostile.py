@@ -55,6 +55,18 @@ def test_process_substitution_in_place_of_light_directions(capture, run):
     assert np.array_equal(np.load("out/sphere/normals.npy"), np.load("expected/sphere/normals.npy"))
 
 
+@posix
+def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
+    """The first megabyte is a whole light file."""
+    command = f"{sys.executable} -m splinecli infer {capture} --method ls --lights"
+    result = shell(
+        f"{command} <(cat {capture}/light_directions.txt; head -c 1000000 /dev/zero | tr '\\0' ' ')"
+    )
+    assert result.returncode == 3
+    assert result.stderr.endswith("found more than 1.0 MB, expected a text file of at most 1.0 MB.\n")
+    assert not Path("out").exists()
+
+
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"lights": [' + "9" * 400 + "]}", "9" * 5_000])
 def test_lights_that_no_parser_likes(capture, run, text):
     Path("lights.json").write_text(text)

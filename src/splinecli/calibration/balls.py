@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
-from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.decoding import decode_image, stored_size
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask, to_linear
 from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
@@ -180,7 +180,8 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
     path = files.mask or files.reference or files.images[0]
     try:
         if files.mask is not None:
-            mask = read_mask(files.mask)
+            expected = ExpectedSize(stored_size(files.images[0])[0], files.images[0].name, "a mask")
+            mask = read_mask(files.mask, expected)
             circle, source, shape = circle_from_mask(mask), "mask", mask.shape
         else:
             gray = _mean_gray(files.images if files.reference is None else [files.reference])

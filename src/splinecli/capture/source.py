@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
+from splinecli.capture.capture_size import check_capture, common_size
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.header import stated_white_level
@@ -103,15 +104,13 @@ class CaptureSource:
             if light_indices is None
             else check_light_indices(light_indices, self.n_lights)
         )
-        first = decode_image(self.files.images[indices[0]])
-        mask = self.read_mask(first.shape[:2])
+        mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
             ground_truth, upside_down = read_ground_truth(
                 self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
             )
-        images = self._stored_pixels(indices, mask, first)
-        del first
+        images = self._stored_pixels(indices, mask)
         saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
         found = collect_observations(images, saturation, progress)
         warnings = [*self.warnings, *found.warnings()]
@@ -157,14 +156,12 @@ class CaptureSource:
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
-        linearise, expected = None, None
+        shape = common_size(self.files.images)[0][:2]
+        expected = ExpectedSize(shape, self.files.images[0].name)
+        linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
+        total = np.zeros(shape[0] * shape[1], np.float32)
         for index, path in enumerate(self.files.images):
             stored = decode_image(path, expected)
-            if linearise is None:
-                shape = stored.shape[:2]
-                expected = ExpectedSize(shape, path.name)
-                linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
-                total = np.zeros(shape[0] * shape[1], np.float32)
             total += self._colours(linearise, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
             if progress is not None:
                 progress()
@@ -176,6 +173,16 @@ class CaptureSource:
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """Return the mask (H, W) for images of this shape. Raises InputError."""
         return read_capture_mask(self.files, shape) if self.automatic_mask is None else self.automatic_mask
+
+    def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:
+        """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
+        size = common_size([self.files.images[index] for index in indices])
+        shape = size[0][:2]
+        if self.automatic_mask is None and self.files.mask is None and not self.files.boundaries:
+            check_capture(size, shape[0] * shape[1], len(indices), self.files.folder)
+        mask = self.read_mask(shape)
+        check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
+        return mask
 
     def lamps_over(self, mask: NDArray[np.bool_], *, step: int = 1) -> NearLamps | None:
         """Return all lamps over a mask (H, W), or over one of every step-th row and column; None for none."""
@@ -197,20 +204,13 @@ class CaptureSource:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)
 
-    def _stored_pixels(
-        self, indices: Sequence[int], mask: NDArray[np.bool_], first: NDArray[Any]
-    ) -> Iterator[StoredPixels]:
-        """Yield the mask's pixels under these lights; `first` is the first image, decoded."""
+    def _stored_pixels(self, indices: Sequence[int], mask: NDArray[np.bool_]) -> Iterator[StoredPixels]:
+        """Yield the mask's pixels under these lights."""
         linearise = Lineariser(self.radiometry, mask, len(self.files.images))
         expected = ExpectedSize(mask.shape, self.files.images[indices[0]].name)
-        stored: NDArray[Any] | None = first
-        del first
         for index in indices:
             path = self.files.images[index]
-            if stored is None:
-                stored = decode_image(path, expected)
-            pixels = stored[mask]
-            stored = None  # free this image before the next one is decoded
+            pixels = decode_image(path, expected)[mask]
             linear, intensity = linearise(pixels, path, index), self.light_intensities[index]
             yield StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
             del pixels, linear

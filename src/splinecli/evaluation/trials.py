@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Lock
@@ -15,6 +16,8 @@ from splinecli.capture.stamp import digest
 from splinecli.evaluation.protocol import Protocol
 from splinecli.files import parse_json, refusals_as_output_errors
 from splinecli.methods import Estimator
+
+_LONGEST_LINE = 1 << 16  # characters
 
 
 @dataclass(frozen=True)
@@ -110,15 +113,16 @@ class TrialStore:
         with refusals_as_output_errors(path):
             if fresh:
                 path.unlink(missing_ok=True)
-            content = path.read_text("utf-8", errors="replace") if path.is_file() else ""
-        for line in content.splitlines():
-            record = _read_line(line)
-            if record is not None:
-                self._scores[record["key"]] = Score(
-                    record["mae_deg"], record["seconds"], record["estimated_intensities"]
-                )
+            lines = _lines(path) if path.is_file() else ()
+            line = "\n"
+            for line in lines:
+                record = _read_line(line)
+                if record is not None:
+                    self._scores[record["key"]] = Score(
+                        record["mae_deg"], record["seconds"], record["estimated_intensities"]
+                    )
         # The next line must not be appended to one that was cut short.
-        self._break_first = bool(content) and not content.endswith("\n")
+        self._break_first = not line.endswith("\n")
 
     def find(self, trial: Trial) -> Score | None:
         """Return the score of a trial, or None where it is not stored."""
@@ -145,6 +149,13 @@ def plan_trials(
         Trial.of(capture, estimator.name, number, draw, protocol, made_of=made_of)
         for number, draw in enumerate(draws)
     ]
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a file, a longer one in parts of _LONGEST_LINE characters."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        while line := file.readline(_LONGEST_LINE):
+            yield line
 
 
 def _read_line(line: str) -> dict[str, Any] | None:

@@ -221,6 +221,10 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
 
 
 def _memory_mib(summary: CaptureSummary) -> float:
-    """Return the memory of observations and estimate in float32, and of one image in float64."""
-    height, width, _ = summary.images[0].shape
-    return BASE_MIB + (summary.n_pixels * (4 * summary.source.n_lights + 40) + 8 * height * width * 3) / 2**20
+    import numpy as np
+
+    from splinecli.capture.capture_size import capture_bytes
+
+    first = summary.images[0]
+    largest = first.shape, np.dtype(first.dtype).itemsize
+    return BASE_MIB + capture_bytes(largest, summary.n_pixels, summary.source.n_lights) / 2**20

@@ -173,12 +173,11 @@ def share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int]
 
 def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
     """Return the normal map (H, W, 3), y up, zero outside the mask."""
-    from splinecli.capture import read_mask, read_normal_map
+    from splinecli.capture import read_normal_map
 
-    mask = None if options.mask is None else read_mask(options.mask)
     is_folder = options.normals.is_dir()
     path = _find_normal_map(options.normals) if is_folder else options.normals
-    normal_map = read_normal_map(path, mask)
+    normal_map = read_normal_map(path, options.mask)
     if options.convention == "directx" or (is_folder and _was_written_as_directx(path)):
         normal_map[..., 1] *= -1
     return normal_map

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError
 from splinecli.files import file_sha256, read_json
+from splinecli.memory import is_out_of_memory
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"
@@ -139,13 +140,28 @@ def parse_entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
 def _check_checksums(entry: Entry, folder: Path) -> None:
     for array, expected in entry.sha256.items():
         path = folder / entry.name / f"{array}.npy"
-        found = file_sha256(path) if path.is_file() else "no such file"
+        found = _sha256(path)
         if found != expected:
             raise InputError(
                 f"does not match the manifest: found {found[:16]}, expected SHA-256 {expected[:16]}...",
                 path=path,
                 hint="Make the set again with 'splinecli prepare'",
             )
+
+
+def _sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, or why it has none. A file that is longer than its array is not read."""
+    if not path.is_file():
+        return "no such file"
+    try:
+        array: np.memmap[Any, Any] = np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # a damaged header fails in a dozen ways
+        if is_out_of_memory(error):
+            raise
+        return "no array"
+    if path.stat().st_size != array.offset + array.nbytes:
+        return "another length"
+    return file_sha256(path)
 
 
 def _check_shapes(entry: Entry, pixels: Pixels, folder: Path) -> None:

@@ -15,6 +15,7 @@ from splinecli.results.templates import render
 
 INDEX = "index.html"
 _OURS = b'<meta name="generator" content="splinecli">'
+_START = 1 << 16  # bytes of a page, which contain this mark
 
 
 class Row(NamedTuple):
@@ -85,7 +86,10 @@ def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Map
 def has_index(folder: Path) -> bool:
     """Return whether the folder has an index.html that splinecli wrote."""
     try:
-        return (folder / INDEX).is_file() and _OURS in (folder / INDEX).read_bytes()
+        if not (folder / INDEX).is_file():
+            return False
+        with (folder / INDEX).open("rb") as file:
+            return _OURS in file.read(_START)
     except OSError:
         return False
 

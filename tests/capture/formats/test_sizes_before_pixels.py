@@ -17,10 +17,13 @@ import pytest
 import tifffile
 from scipy.io import savemat
 
+from splinecli.calibration.balls import calibrate_ball, find_ball_files
+from splinecli.capture import open_capture
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, limit_pixels
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
+from splinecli.capture.lights.light_files import read_light_directions
 from splinecli.errors import InputError
 from splinecli.memory import LARGEST_IMAGE
 
@@ -46,6 +49,14 @@ def write_png(path: Path, size: int = HUGE) -> None:
     path.write_bytes(
         b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
     )
+
+
+def write_claim(path: Path, height: int, width: int) -> None:
+    """A PNG that states a size and has no pixels. Whoever decodes it finds it damaged."""
+    cv2.imwrite(str(path), np.zeros(SMALL, np.uint8))
+    content = path.read_bytes()
+    header = struct.pack(">II", width, height) + content[24:29]
+    path.write_bytes(content[:8] + chunk(b"IHDR", header) + chunk(b"IEND", b""))
 
 
 def write_jpeg(path: Path) -> None:
@@ -136,6 +147,40 @@ def test_images_of_another_size_than_expected(tmp_path: Path) -> None:
     refused(lambda: ground_truth(tmp_path / "a.png"), match)
 
 
+def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> None:
+    ball, capture = tmp_path / "ball", tmp_path / "capture"
+    for folder in (ball, capture):
+        folder.mkdir()
+        for number in range(4):
+            cv2.imwrite(str(folder / f"{number}.png"), np.full(SMALL, 9 + number, np.uint8))
+    np.savetxt(capture / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2)])
+    write_claim(tmp_path / "large.png", 15_000, 15_000)
+    np.save(tmp_path / "normals.npy", np.ones((*SMALL, 3)))
+    sizes = "of 15000 x 15000 pixels, expected 18 x 16 as in 0.png"
+    with pytest.raises(InputError, match=f"found a mask {sizes}"):
+        calibrate_ball(find_ball_files(ball, mask=tmp_path / "large.png"))
+    with pytest.raises(InputError, match="a normal map of 18 x 16 pixels, expected 15000 x 15000"):
+        read_normal_map(tmp_path / "normals.npy", tmp_path / "large.png")
+    write_claim(capture / "1.png", *SMALL)
+    write_claim(capture / "3.png", 15_000, 15_000)
+    with pytest.raises(InputError, match=f"3.png: found an image {sizes}"):
+        open_capture(capture).read()
+
+
+def test_a_capture_larger_than_the_memory_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six images of 361 megapixels: each would fit by itself."""
+    np.savetxt(tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)])
+    for number in range(6):
+        write_claim(tmp_path / f"{number}.png", 19_000, 19_000)
+    monkeypatch.setattr("splinecli.capture.formats.image_size.available_memory", lambda: 5e9)
+    match = r"6 images of 19000 x 19000 pixels.* take 24\.9 GB of memory, but 5\.0 GB are available"
+    refused(lambda: open_capture(tmp_path).read(), match)
+    with pytest.raises(InputError, match="3 images of 19000 x 19000 pixels"):
+        open_capture(tmp_path).read([0, 1, 2])
+
+
 def test_a_tiff_whose_strip_expands_beyond_its_pixels(tmp_path: Path) -> None:
     write_tiff(tmp_path / "a.tif", *SMALL, zlib.compress(bytes(1 << 28), 1))
     refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
@@ -161,7 +206,31 @@ def test_a_mat_file_that_expands_beyond_its_shape(tmp_path: Path) -> None:
 def test_a_text_file_too_long_for_its_pixels(tmp_path: Path) -> None:
     with (tmp_path / "normal.txt").open("wb") as file:
         file.truncate(1 << 31)
-    refused(lambda: ground_truth(tmp_path / "normal.txt"), "expected a text file of at most 67")
+    refused(lambda: ground_truth(tmp_path / "normal.txt"), r"expected a text file of at most 1\.0 MB")
+
+
+def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
+    for name in ("a.png", "a.jpg", "a.tif"):
+        cv2.imwrite(str(tmp_path / name), np.ones(SMALL, np.uint8))
+        with (tmp_path / name).open("ab") as file:
+            file.truncate(1 << 31)
+        refused(
+            lambda name=name: decode_image(tmp_path / name), r"found 2147\.5 MB, expected at most 67\.1 MB"
+        )
+
+
+def test_light_files_with_too_much_text(tmp_path: Path) -> None:
+    (tmp_path / "long.txt").write_text("0 0 1" + " " * 1_000_000)
+    refused(
+        lambda: read_light_directions(tmp_path / "long.txt"),
+        "found 1.0 MB, expected a text file of at most 1.0",
+    )
+    (tmp_path / "lines.txt").write_text("1\n" * 60_000)
+    refused(
+        lambda: read_light_directions(tmp_path / "lines.txt"), "found 60001 lines, expected at most 50000"
+    )
+    (tmp_path / "words.txt").write_text("1 " * 400_000)
+    refused(lambda: read_light_directions(tmp_path / "words.txt"), "found 400000 columns, expected 3")
 
 
 @pytest.fixture

@@ -15,15 +15,15 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.header import stated_size
-from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
-from splinecli.capture.formats.raw import RAW_SUFFIXES, decode_raw
-from splinecli.capture.formats.tiff import decode_tiff
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
+from splinecli.capture.formats.raw import RAW_SUFFIXES, decode_raw, raw_size
+from splinecli.capture.formats.tiff import decode_tiff, tiff_size
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.memory import is_out_of_memory
@@ -39,6 +39,8 @@ _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _DAMAGE = re.compile(
     r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE
 )
+
+_LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previews and colour profiles
 
 _STDERR_LOCK = threading.Lock()
 
@@ -66,7 +68,10 @@ def decode_with_alpha(
 ) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
     try:
-        pixels = _decode(path, expected)
+        size = stored_size(path)
+        check_stored_size(*size, path, expected)
+        _check_length(path, image_bytes(*size))
+        pixels = _decode(path)
     except InputError:
         raise
     except Exception as error:  # decoders raise a dozen types for damaged files
@@ -92,28 +97,60 @@ def decode_with_alpha(
     return pixels, None
 
 
-def _decode(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
-    """Return the pixels (H, W) or (H, W, C) of a file of any format, with alpha. The size is checked first."""
+def stored_size(path: Path) -> tuple[tuple[int, ...], int]:
+    """Return the shape (H, W, C) that the header of an image file states, and the bytes of each number.
 
-    def check(shape: tuple[int, ...], item_bytes: int) -> None:
-        check_stored_size(shape, item_bytes, path, expected)
+    Nothing is decoded.
 
+    Raises:
+        InputError: the file is missing, of another format, or has no whole header.
+    """
+    kind = _kind(path)
+    if kind == "RAW":
+        return raw_size(path, native_stderr)
+    return tiff_size(path) if kind == "TIFF" else stated_size(path)
+
+
+def _check_length(path: Path, n_bytes: int) -> None:
+    """Raise InputError for a file that is far longer than its image of so many bytes, because it is read as a whole."""
+    most, length = n_bytes + _LONGEST_METADATA, path.stat().st_size
+    if length > most:
+        raise InputError(
+            f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
+            path=path,
+        )
+
+
+def _kind(path: Path) -> Literal["RAW", "TIFF", "PNG", "JPEG"]:
+    """Return the format of an image file. Raises InputError."""
     check_file(path, "an image")
     try:
         with path.open("rb") as file:
             start = file.read(_START_BYTES)
-        if start and path.suffix.lower() in RAW_SUFFIXES:
-            return decode_raw(path.read_bytes(), path, native_stderr, check)
-        if start.startswith(_TIFF):
-            return decode_tiff(path, lambda: _decode_with_opencv(path.read_bytes(), path), check)
-        if start.startswith((_PNG, _JPEG)):
-            check(*stated_size(path))
-            data = path.read_bytes()
-            (_check_png if start.startswith(_PNG) else _check_jpeg)(data, path)
-            return _decode_with_opencv(data, path)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    if start and path.suffix.lower() in RAW_SUFFIXES:
+        return "RAW"
+    if start.startswith(_TIFF):
+        return "TIFF"
+    if start.startswith((_PNG, _JPEG)):
+        return "PNG" if start.startswith(_PNG) else "JPEG"
     raise InputError("found neither PNG, TIFF nor JPEG" if start else "the file is empty", path=path)
+
+
+def _decode(path: Path) -> NDArray[Any]:
+    """Return the pixels (H, W) or (H, W, C) of a file of any format, with alpha."""
+    kind = _kind(path)
+    try:
+        if kind == "RAW":
+            return decode_raw(path, native_stderr)
+        if kind == "TIFF":
+            return decode_tiff(path, lambda: _decode_with_opencv(path.read_bytes(), path))
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    (_check_png if kind == "PNG" else _check_jpeg)(data, path)
+    return _decode_with_opencv(data, path)
 
 
 def damaged(path: Path) -> InputError:

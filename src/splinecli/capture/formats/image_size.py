@@ -57,17 +57,38 @@ def check_stored_size(
     """
     if expected is not None:
         expected.check(shape, path)
-    n_pixels, n_bytes = math.prod(shape[:2]), math.prod(shape) * (item_bytes + 4)  # as stored, and in float32
-    found = f"found an image of {_size(shape)} pixels, which takes {_gigabytes(n_bytes)} of memory"
+    n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
+    takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > _max_pixels:
         raise InputError(
-            f"{found}; expected at most {_max_pixels / 1e6:g} megapixels",
+            f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {_max_pixels / 1e6:g} megapixels",
             path=path,
             hint="If the size is right, raise --max-pixels-per-image",
         )
+    check_memory(n_bytes, takes, path)
+
+
+def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
+    """Return the bytes that an image takes in memory, as stored and in float32."""
+    return math.prod(shape) * (item_bytes + 4)
+
+
+def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = None) -> None:
+    """Raise InputError where less memory is available.
+
+    Args:
+        n_bytes: the memory that is needed.
+        takes: subject and verb of the message, such as "found an image, which takes".
+        path: the file or folder that needs it.
+        hint: the remedy.
+    """
     available = available_memory()
     if n_bytes > available:
-        raise InputError(f"{found}, but {_gigabytes(available)} are available", path=path)
+        raise InputError(
+            f"{takes} {_gigabytes(n_bytes)} of memory, but {_gigabytes(available)} are available",
+            path=path,
+            hint=hint,
+        )
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.decoding import stored_size
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import cut_out
+from splinecli.capture.formats.images import cut_out, read_mask
 from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
@@ -34,20 +35,26 @@ _FEWEST_UNIT = 0.6  # share in a picture of normals; in photographs a third has 
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
 
 
-def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | Path | None = None) -> NDArray[np.float32]:
     """Return a normal map (H, W, 3) float32 of any size: unit vectors, or zero where there is no normal.
 
     Args:
         path: any of the files above but text.
-        mask: (H, W), True at the pixels whose normals are read. If a picture's alpha channel cuts something out,
-            that is left out, too.
+        mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
+            something out, that is left out, too.
 
     Raises:
         InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
     """
     path = Path(path)
-    expected = None if mask is None else ExpectedSize(mask.shape, "the mask", "a normal map")
+    expected = None
+    if mask is not None:
+        # Both headers are compared before either file is decoded.
+        shape = stored_size(mask)[0] if isinstance(mask, Path) else mask.shape
+        expected = ExpectedSize(shape, "the mask", "a normal map")
     stored = read_vectors(path, expected)
+    if isinstance(mask, Path):
+        mask = read_mask(mask, ExpectedSize(stored.values.shape, path.name, "a mask"))
     wanted = np.ones(stored.values.shape[:2], np.bool_) if mask is None else mask
     opaque = None if stored.alpha is None else cut_out(stored.alpha)
     if opaque is not None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -25,32 +25,33 @@ RAW_SUFFIXES = (
 """RAW files are recognised by name, because the content of many looks like TIFF."""
 
 
-def decode_raw(
-    data: bytes,
-    path: Path,
-    quiet: Callable[[], AbstractContextManager[object]],
-    check: Callable[[tuple[int, ...], int], None],
-) -> NDArray[np.uint16]:
+Quiet = Callable[[], AbstractContextManager[object]]
+"""Catches what LibRaw prints. It is used only around reading, because it stops progress bars, too."""
+
+
+def raw_size(path: Path, quiet: Quiet) -> tuple[tuple[int, int, int], int]:
+    """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises InputError."""
+    with _damage_as_input_error(path), quiet(), _import_rawpy(path).imread(str(path)) as raw:
+        return (raw.sizes.height, raw.sizes.width, 3), 2
+
+
+def decode_raw(path: Path, quiet: Quiet) -> NDArray[np.uint16]:
     """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
 
     They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
     camera at one setting have the same scale. An orientation is ignored, as in all images.
 
     Args:
-        data: content of the file.
-        path: the file, for messages.
-        quiet: catches what LibRaw prints. It is used only around reading, because it stops progress bars, too.
-        check: receives the size (H, W, C) and the bytes of a number before the pixels are read.
+        path: the file.
+        quiet: see Quiet.
 
     Raises:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
     """
     rawpy = _import_rawpy(path)
-    try:
+    with _damage_as_input_error(path):
         with quiet():
-            raw = rawpy.imread(io.BytesIO(data))
-        check((raw.sizes.height, raw.sizes.width, 3), 2)
-        with quiet():
+            raw = rawpy.imread(io.BytesIO(path.read_bytes()))
             raw.unpack()
         with raw:
             pixels = raw.postprocess(
@@ -69,12 +70,6 @@ def decode_raw(
                 # For uniform objects their normals are better (0.2 and 0.4 degrees).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
-    except (rawpy.LibRawError, OSError):
-        raise InputError(
-            "the RAW file is damaged or of a camera that LibRaw does not know",
-            path=path,
-            hint="Copy it again, or export the photographs as 16-bit linear TIFF",
-        ) from None
     # Some sensors have four colours. The fourth must not become an alpha channel.
     return np.asarray(pixels[:, :, :3], np.uint16)
 
@@ -99,6 +94,19 @@ def _full_scale(raw: rawpy.RawPy) -> int:
     # The black levels of the colours differ a little, and the colour with the highest must reach full scale, too. It is
     # one less because LibRaw drops decimals after scaling: otherwise every seventh white level would end at 65534.
     return max(white - max(raw.black_level_per_channel) - 1, 1)
+
+
+@contextmanager
+def _damage_as_input_error(path: Path) -> Iterator[None]:
+    rawpy = _import_rawpy(path)
+    try:
+        yield
+    except (rawpy.LibRawError, OSError):
+        raise InputError(
+            "the RAW file is damaged or of a camera that LibRaw does not know",
+            path=path,
+            hint="Copy it again, or export the photographs as 16-bit linear TIFF",
+        ) from None
 
 
 def _import_rawpy(path: Path) -> ModuleType:

@@ -20,8 +20,10 @@ _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
 _NUMBER_WITH_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
-MOST_TEXT = 1 << 26
-"""Bytes of the longest text file that is read, unless a file's content says how long it may be."""
+MOST_TEXT = 1_000_000
+"""Bytes of the longest text file that is read, unless the images say how long it may be: 14,000 lights."""
+
+_BYTES_OF_LINE = 20  # at least, on average, in a file of the greatest length: each line takes time and memory
 
 _FROM_PIPES: dict[Path, bytes] = {}
 
@@ -94,9 +96,11 @@ def check_length(path: Path, most: int) -> None:
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
     if length > most:
-        raise InputError(
-            f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB", path=path
-        )
+        raise _too_long(f"{length / 1e6:.1f} MB", most, path)
+
+
+def _too_long(found: str, most: int, path: Path) -> InputError:
+    return InputError(f"found {found}, expected a text file of at most {most / 1e6:.1f} MB", path=path)
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
@@ -117,7 +121,10 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
             return path.read_bytes()
         if path not in _FROM_PIPES:
             with path.open("rb") as pipe:
-                _FROM_PIPES[path] = pipe.read(MOST_TEXT)
+                content = pipe.read(most + 1)
+            if len(content) > most:
+                raise _too_long(f"more than {most / 1e6:.1f} MB", most, path)
+            _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
@@ -145,7 +152,10 @@ def read_lines(
             hint = "Save it as plain UTF-8 text"
             raise InputError("the file is not UTF-8 text", path=path, hint=hint) from None
         text = content.decode("latin-1")
-    return _LINE_END.split(text)
+    lines = _LINE_END.split(text)
+    if len(lines) > most // _BYTES_OF_LINE:
+        raise InputError(f"found {len(lines)} lines, expected at most {most // _BYTES_OF_LINE}", path=path)
+    return lines
 
 
 def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:

@@ -21,11 +21,16 @@ _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
-def decode_tiff(
-    path: Path,
-    decode_with_opencv: Callable[[], NDArray[Any]],
-    check: Callable[[tuple[int, ...], int], None],
-) -> NDArray[Any]:
+def tiff_size(path: Path) -> tuple[tuple[int, int, int], int]:
+    """Return the shape (H, W, samples) of the first picture of a TIFF file, and the bytes of each sample.
+
+    Raises InputError for a damaged header.
+    """
+    with _first_page(path) as page:
+        return (page.imagelength, page.imagewidth, page.samplesperpixel), -(-page.bitspersample // 8)
+
+
+def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> NDArray[Any]:
     """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples).
 
     Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
@@ -34,38 +39,23 @@ def decode_tiff(
     Args:
         path: the file.
         decode_with_opencv: decodes the file with OpenCV.
-        check: receives the size (H, W, samples) and the bytes of a sample before the pixels are read.
 
     Raises:
         InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
     """
-    import tifffile
-
-    damaged = InputError("the TIFF is damaged and cannot be read", path=path, hint="Copy or export it again")
-    with _quiet_tifffile():
-        try:
-            with tifffile.TiffFile(path) as file:
-                page: Any = file.pages.first
-                samples = (page.imagelength, page.imagewidth, page.samplesperpixel)
-                check(samples, -(-page.bitspersample // 8))
-                _check_complete(page, path)
-                photometric = int(page.photometric)
-                if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
-                    raise InputError(
-                        f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
-                        path=path,
-                        hint="Export it as RGB",
-                    )
-                pixels = _decode_page(page)
-        except InputError:
-            raise
-        except Exception as error:  # a damaged header causes struct, key or value errors
-            if is_out_of_memory(error):
-                raise
-            raise damaged from None
+    with _first_page(path) as page:
+        _check_complete(page, path)
+        photometric = int(page.photometric)
+        if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
+            raise InputError(
+                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
+                path=path,
+                hint="Export it as RGB",
+            )
+        pixels = _decode_page(page)
     if pixels is None:
         if photometric == _WHITE_IS_ZERO:
-            raise damaged
+            raise _damaged(path)
         return decode_with_opencv()
     if photometric == _WHITE_IS_ZERO:
         if pixels.dtype.kind == "u":
@@ -73,6 +63,27 @@ def decode_tiff(
         if pixels.dtype == np.bool_:
             return ~pixels
     return pixels
+
+
+@contextmanager
+def _first_page(path: Path) -> Iterator[Any]:
+    """Yield the first page of a TIFF file. What tifffile raises for a damaged file becomes an InputError."""
+    import tifffile
+
+    with _quiet_tifffile():
+        try:
+            with tifffile.TiffFile(path) as file:
+                yield file.pages.first
+        except InputError:
+            raise
+        except Exception as error:  # struct, key, value and other errors
+            if is_out_of_memory(error):
+                raise
+            raise _damaged(path) from None
+
+
+def _damaged(path: Path) -> InputError:
+    return InputError("the TIFF is damaged and cannot be read", path=path, hint="Copy or export it again")
 
 
 def _decode_page(page: Any) -> NDArray[Any] | None:
@@ -98,7 +109,7 @@ def _check_complete(page: Any, path: Path) -> None:
     size = path.stat().st_size
     longest = 2 * math.prod(page.chunks) * page.dtype.itemsize + _LONGEST_EMPTY_PART
     if any(count > longest for count in page.databytecounts):
-        raise InputError("the TIFF is damaged", path=path, hint="Copy or export it again")
+        raise _damaged(path)
     if any(
         count == 0 or offset + count > size
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)

@@ -1,0 +1,57 @@
+"""The common size of a capture's images, and the memory that the capture takes, before any image is decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splinecli.capture.formats.decoding import stored_size
+from splinecli.capture.formats.image_size import ExpectedSize, check_memory, check_stored_size, image_bytes
+from splinecli.capture.formats.raw import RAW_SUFFIXES
+
+_BYTES_OF_PIXEL = (
+    40  # of each pixel of the mask: its estimate, and what the methods keep of it beside its observations
+)
+
+StoredSize = tuple[tuple[int, ...], int]
+"""The shape (H, W, C) of an image as stored, and the bytes of each number."""
+
+
+def common_size(images: Sequence[Path]) -> StoredSize:
+    """Return the size of the largest of some images, from their headers.
+
+    Raises:
+        InputError: an image has another height or width than the first, is too large, or has no whole header.
+    """
+    first = largest = stored_size(images[0])
+    check_stored_size(*first, images[0])
+    expected = ExpectedSize(first[0], images[0].name)
+    for path in images[1:]:
+        # Opening a RAW file takes long. Its size is compared when it is decoded.
+        if path.suffix.lower() not in RAW_SUFFIXES:
+            size = stored_size(path)
+            expected.check(size[0], path)
+            largest = max(largest, size, key=lambda size: image_bytes(*size))
+    return largest
+
+
+def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
+    """Return the bytes that `infer` takes for a capture: observations and estimate in float32, and one image.
+
+    Args:
+        largest: the size of the largest image.
+        n_pixels: the number of the mask's pixels.
+        n_lights: the number of images that are read.
+    """
+    return n_pixels * (4 * n_lights + _BYTES_OF_PIXEL) + image_bytes(*largest)
+
+
+def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
+    """Raise InputError where a capture takes more memory than there is; see capture_bytes."""
+    height, width = largest[0][:2]
+    check_memory(
+        capture_bytes(largest, n_pixels, n_lights),
+        f"{n_lights} images of {width} x {height} pixels, {n_pixels} of them in the mask, take",
+        folder,
+        hint="Mask the object, reduce the images, or choose fewer lights",
+    )
