@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import errno
 import json
-import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from kills import content, killed_at
-from splinecli.errors import OutputError
-from splinecli.publishing import COMPLETE, DRAFT, FINISHED, LOCK, UNDONE, BusyError, held_folder, new_files
+from splinecli import files
+from splinecli.capture.paths import check_file
+from splinecli.errors import InputError, OutputError
+from splinecli.files import COMPLETE, UNFINISHED
+from splinecli.locks import LOCK
+from splinecli.publishing import DRAFT, FINISHED, UNDONE, held_folder, new_files
 
 REPORT = "report.json"
 OLD = {REPORT: b"old", "a.txt": b"old a", "only old.txt": b"old", "pictures/1.png": b"old 1"}
@@ -19,15 +23,15 @@ NEW = {REPORT: b"new", "a.txt": b"new a", "only new.txt": b"new", "pictures/2.pn
 MINE = {"notes.txt": b"mine"}
 
 
-def write(folder: Path, files: dict[str, bytes]) -> None:
-    for name, value in files.items():
+def write(folder: Path, contents: dict[str, bytes]) -> None:
+    for name, value in contents.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(value)
 
 
-def publish(folder: Path, files: dict[str, bytes] = NEW) -> None:
+def publish(folder: Path, contents: dict[str, bytes] = NEW) -> None:
     with held_folder(folder), new_files(folder, report=REPORT, stale=OLD) as stage:
-        write(stage, files)
+        write(stage, contents)
 
 
 def test_new_files_replace_earlier_ones_and_leave_others(tmp_path: Path) -> None:
@@ -121,37 +125,6 @@ def test_a_hostile_plan_removes_nothing(tmp_path: Path, plan: str) -> None:
     assert (tmp_path / "kept").exists()
 
 
-def test_a_folder_is_written_into_by_one_at_a_time(tmp_path: Path) -> None:
-    pytest.importorskip("fcntl", reason="this system has no such locks")
-    folder = tmp_path / "run"
-    with held_folder(folder):
-        with (
-            pytest.raises(BusyError, match=r"run: another splinecli process is writing into this folder"),
-            held_folder(folder),
-        ):
-            pytest.fail("two at once")
-        (folder / "content").touch()
-    with held_folder(folder):
-        assert (folder / "content").exists()
-    assert content(folder) == {"content": b""}
-
-
-def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path: Path) -> None:
-    """Each process adds one to a number in a file: with two at once, some would be lost."""
-    number, children = tmp_path / "number", []
-    number.write_text("0")
-    for _ in range(4):
-        child = os.fork()
-        if child == 0:
-            for _ in range(50):
-                with held_folder(tmp_path, wait=True):
-                    number.write_text(str(int(number.read_text()) + 1))
-            os._exit(0)
-        children.append(child)
-    assert all(os.waitpid(child, 0)[1] == 0 for child in children)
-    assert number.read_text() == "200"
-
-
 def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), held_folder(tmp_path / "new" / "deeper"):
         raise ZeroDivisionError
@@ -163,6 +136,64 @@ def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_process_was_writing_goes(tmp_path: Path) -> None:
-    write(tmp_path, {f"{DRAFT}/files/a": b"", ".checkpoint.safetensors.x1.unfinished": b"half", **MINE})
-    with held_folder(tmp_path):
-        assert content(tmp_path) == {LOCK: b"", **MINE}
+    ours = {f"{DRAFT}/files/a": b"", f".checkpoint.safetensors.x1{UNFINISHED}": b"half"}
+    mine = MINE | {".draft.unfinished/a": b"mine", ".b.unfinished": b"mine", f".mine{UNFINISHED}/a": b"mine"}
+    write(tmp_path, ours | mine)
+    found: list[str] = []
+    with held_folder(tmp_path, found.append):
+        assert content(tmp_path) == {LOCK: b"", **mine}
+    assert found == [f"{tmp_path}: {UNDONE}"]
+
+
+def test_everything_is_on_the_disk_before_an_earlier_file_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The order of syncs and of changes, as a power cut would see it."""
+    folder = tmp_path / "new" / "out"
+    publish(folder, OLD)
+    events: list[tuple[str, str]] = []
+    sync, rename, unlink, replace = files.sync, Path.rename, Path.unlink, Path.replace
+
+    def record(kind: str, path: Path) -> None:
+        events.append((kind, path.relative_to(tmp_path).as_posix()))
+
+    def follow(kind: str, change: Callable[..., object]) -> Callable[..., object]:
+        def changed(path: Path, *args: object, **options: object) -> object:
+            record(kind, path)
+            return change(path, *args, **options)
+
+        return changed
+
+    for module in ("files", "publishing"):
+        monkeypatch.setattr(f"splinecli.{module}.sync", follow("sync", sync))
+    for name, change in (("rename", rename), ("unlink", unlink), ("replace", replace)):
+        monkeypatch.setattr(Path, name, follow(name, change))
+    publish(folder)
+    marked = next(place for place, (kind, _) in enumerate(events) if kind == "rename")
+    draft = f"new/out/{DRAFT}"
+    staged = {draft, f"{draft}/plan.json", f"{draft}/files", f"{draft}/files/pictures"}
+    assert staged | {f"{draft}/files/{name}" for name in NEW} <= {path for _, path in events[:marked]}
+    assert events[marked + 1] == ("sync", "new/out")
+    last = max(place for place, (kind, _) in enumerate(events) if kind == "replace")
+    assert {("sync", "new/out"), ("sync", "new/out/pictures")} <= set(events[last + 1 :]) | set(
+        events[marked:last]
+    )
+    assert ("sync", "new/out") in events[last + 1 :]
+
+
+def test_the_names_of_new_folders_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr("splinecli.files.sync", synced.append)
+    files.write_bytes(tmp_path / "a" / "b" / "c.txt", b"")
+    assert {tmp_path, tmp_path / "a", tmp_path / "a" / "b"} <= set(synced)
+    synced.clear()
+    with held_folder(tmp_path / "d" / "e"):
+        assert {tmp_path, tmp_path / "d"} <= set(synced)
+
+
+def test_no_reader_takes_a_file_from_an_unfinished_folder(tmp_path: Path) -> None:
+    write(tmp_path, {"lights.txt": b"0 0 1", f"{COMPLETE}/files/report.json": b"{}"})
+    with pytest.raises(
+        InputError, match=r"lights\.txt: lies in a folder with new files of an interrupted run"
+    ):
+        check_file(tmp_path / "lights.txt", "a file")

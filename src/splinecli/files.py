@@ -14,8 +14,11 @@ from typing import Any
 
 from splinecli.errors import OutputError
 
-UNFINISHED = ".unfinished"
+UNFINISHED = ".splinecli-unfinished"
 """The ending of hidden files and folders that are being written. What a killed process left is removed later."""
+
+COMPLETE = ".new.splinecli-complete"
+"""A hidden folder of complete new files that are being moved to their places; see publishing."""
 
 _MOST_JSON = 1 << 24  # bytes of a file
 _MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
@@ -48,6 +51,7 @@ def write_bytes(path: Path, content: bytes) -> None:
             temporary.chmod(0o666 & ~current_umask())
             sync(temporary)
             temporary.replace(path)
+            sync_names(path.parent, *made)
         finally:
             # This also runs on Ctrl-C, so no partial file and no empty folder is left.
             if temporary is not None:
@@ -70,6 +74,20 @@ def sync(path: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+def sync_names(folder: Path, *made: Path) -> None:
+    """Wait until the names in a folder, and those of folders that were made, are on the disk. Raises OSError."""
+    for place in dict.fromkeys((folder, *(new.parent for new in made))):
+        sync(place)
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Return whether new files are being moved to their places in a folder, or a killed process left this unfinished.
+
+    Until that is done, the folder may have files of two runs.
+    """
+    return (folder / COMPLETE).is_dir()
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -3,36 +3,38 @@
 New files are first written into a hidden folder inside the output folder and synced to disk. One rename then marks them
 as complete. After that they are moved to their places, the report last. A process that is killed before this rename
 leaves the earlier files as they were. If it is killed later, the next process that holds the folder moves the rest. In
-between the folder has no report, so nothing describes a mixture of old and new files.
+between the folder has no report, or only the new one when all is in its place, so nothing describes a mixture of old
+and new files. No reader of splinecli takes a file from such a folder (see is_unfinished).
 """
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import IO
 
 from splinecli.errors import OutputError
-from splinecli.files import UNFINISHED, check_writable, parse_json, refusals_as_output_errors, sync
+from splinecli.files import (
+    COMPLETE,
+    UNFINISHED,
+    check_writable,
+    is_unfinished,
+    read_json,
+    refusals_as_output_errors,
+    sync,
+    sync_names,
+)
+from splinecli.locks import locked
 
-LOCK = ".lock"
-"""The lock file in a folder that only one process at a time may write into."""
-
-DRAFT, COMPLETE = f".new{UNFINISHED}", ".new.complete"
-"""Hidden folders of new files: while they are written, and from the rename on that marks them as complete."""
+DRAFT = f".new{UNFINISHED}"
+"""The hidden folder of new files while they are written. A rename to COMPLETE marks them as complete."""
 
 _FILES, _PLAN = "files", "plan.json"
 
 FINISHED = "an interrupted run left new files that were not yet in their places; they are now"
 UNDONE = "an interrupted run left unfinished files, which are removed"
-
-
-class BusyError(OutputError):
-    """Another process writes into the folder."""
 
 
 @contextmanager
@@ -55,18 +57,14 @@ def held_folder(
     check_writable(folder)
     made: list[Path] = []
     try:
-        with refusals_as_output_errors(folder):
-            made = [place for place in (folder, *folder.parents) if not place.exists()]
-            lock = _locked_file(folder, wait=wait)
-        try:
+        with ExitStack() as stack:
             with refusals_as_output_errors(folder):
+                made = [place for place in (folder, *folder.parents) if not place.exists()]
+                stack.enter_context(locked(folder, wait=wait))
+                sync_names(folder, *made)
                 for found in _put_in_order(folder):
                     warn(f"{folder}: {found}")
             yield
-        finally:
-            with suppress(OSError):  # Windows removes no file that is open
-                (folder / LOCK).unlink()
-            lock.close()
     finally:
         with suppress(OSError):
             for place in made:
@@ -97,7 +95,7 @@ def new_files(folder: Path, *, report: str, stale: Iterable[str] = ()) -> Iterat
                 _check_place(folder / name)
             plan = {"report": report, "remove": [name for name in stale if name not in names]}
             (draft / _PLAN).write_text(json.dumps(plan), "utf-8")
-            for path in (*_files_in(draft), draft / _FILES, draft):
+            for path in (*draft.rglob("*"), draft):
                 sync(path)
             draft.rename(folder / COMPLETE)
         except BaseException:
@@ -116,50 +114,16 @@ def new_files(folder: Path, *, report: str, stale: Iterable[str] = ()) -> Iterat
             ) from error
 
 
-def is_unfinished(folder: Path) -> bool:
-    """Return whether a killed process left complete new files in the folder that are not yet in their places."""
-    return (folder / COMPLETE).is_dir()
-
-
-def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
-    """Return the open lock file of a folder, which is made as needed."""
-    while True:
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            file = (folder / LOCK).open("a")
-        except FileNotFoundError:  # another process removed the folder, because it was empty
-            continue
-        try:
-            import fcntl
-        except ImportError:  # this system has no such locks
-            return file
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            file.close()
-            raise BusyError(
-                "another splinecli process is writing into this folder",
-                path=folder,
-                hint="Wait for it to end, or choose another -o",
-            ) from None
-        except OSError:  # some network drives have no locks
-            return file
-        with suppress(FileNotFoundError):
-            # The process that held the lock removes the file, and another may have made a new one since.
-            if (folder / LOCK).stat().st_ino == os.fstat(file.fileno()).st_ino:
-                return file
-        file.close()
-
-
 def _put_in_order(folder: Path) -> list[str]:
     """Finish or undo what a killed process left in the folder, and say so."""
     done = []
-    for path in folder.glob(f".*{UNFINISHED}"):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
+    if (folder / DRAFT).is_dir():
+        shutil.rmtree(folder / DRAFT)
         done = [UNDONE]
+    for path in folder.glob(f".*{UNFINISHED}"):
+        if path.is_file():
+            path.unlink()
+            done = [UNDONE]
     if is_unfinished(folder):
         _install(folder)
         done = [FINISHED]
@@ -168,6 +132,7 @@ def _put_in_order(folder: Path) -> list[str]:
 
 def _install(folder: Path) -> None:
     """Move complete new files to their places. Whatever part of this was done before, the result is the same."""
+    sync(folder)  # before an earlier file goes
     files = folder / COMPLETE / _FILES
     remove, report = _read_plan(folder)
     # Without its report, everything is in its place.
@@ -176,17 +141,21 @@ def _install(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
         for path in sorted(_files_in(files), key=lambda path: path == files / report):
             place = folder / path.relative_to(files)
+            made = [parent for parent in place.parents if not parent.exists()]
             place.parent.mkdir(parents=True, exist_ok=True)
             path.replace(place)
+            if place.parent != folder:
+                sync_names(place.parent, *made)
         sync(folder)
     shutil.rmtree(folder / COMPLETE)
+    sync(folder)
 
 
 def _read_plan(folder: Path) -> tuple[list[str], str]:
     """Return the names to remove and the report's name. The folder may come from somebody else: check the names."""
     path = folder / COMPLETE / _PLAN
     try:
-        plan = parse_json(path.read_text("utf-8"))
+        plan = read_json(path)
         remove, report = list(plan["remove"]), plan["report"]
         if all(_is_inside(name) for name in (*remove, report)):
             return remove, report

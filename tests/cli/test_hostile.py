@@ -45,6 +45,23 @@ def test_devices_and_pipes_are_refused_at_once(capture, run):
 
 
 @posix
+@pytest.mark.parametrize(
+    "name", ["mask.png", "ambient.tif", "light_intensities.txt", "image9.png", "Normal_gt.npy", "rti.lp"]
+)
+@pytest.mark.parametrize("kind", ["a pipe", "a broken link"])
+def test_what_is_no_file_is_not_passed_over(capture, run, name, kind):
+    for other in ("mask.png", "normals_gt.npy", *(["light_directions.txt"] if name == "rti.lp" else [])):
+        (capture / other).unlink()
+    if kind == "a pipe":
+        os.mkfifo(capture / name)
+    else:
+        (capture / name).symlink_to("nothing")
+    result = run("infer", capture, "--method", "ls")
+    problem = "found a pipe, expected a file" if kind == "a pipe" else "the file does not exist"
+    assert (result.code, result.err) == (3, f"splinecli: sphere/{name}: {problem}.\n")
+
+
+@posix
 def test_process_substitution_in_place_of_light_directions(capture, run):
     run("infer", capture, "--method", "ls", "-o", "expected")
     command = f"{sys.executable} -m splinecli infer {capture} --method ls --lights"

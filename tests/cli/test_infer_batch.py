@@ -16,11 +16,13 @@ import pytest
 import tifffile
 
 from splinecli.errors import InputError, OutputError, UsageError
+from splinecli.files import UNFINISHED
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
+from splinecli.publishing import UNDONE
 
 
 def read_report(folder: Path) -> dict:
@@ -77,8 +79,10 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
     before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
     broken.write_bytes(whole)
+    Path("out", f".index.html.x{UNFINISHED}").touch()  # a killed process was writing this
     again = run("infer", *captures, "--method", "ls")
     assert again.code == 0
+    assert f"splinecli: warning: out: {UNDONE}" in again.err
     assert again.out.startswith("out/third: ")
     assert "out/second: already done, skipped\n" in again.err
     assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")

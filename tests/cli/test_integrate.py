@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from splinecli.files import COMPLETE
 from splinecli.normals import encode_picture
 
 SHAPE = (40, 50)
@@ -154,6 +155,15 @@ def test_refusals(run, golden):
         messages.append(result.err.replace(f"{Path.cwd()}/", ""))
     golden("integrate_refusals.txt", "".join(messages))
     assert not Path("out").exists()
+
+
+def test_normals_in_an_unfinished_folder_are_refused(run):
+    Path("results", COMPLETE, "files").mkdir(parents=True)
+    Path("normals.npy").rename("results/normals.npy")
+    for given in ("results", "results/normals.npy"):
+        result = run("integrate", given, "-o", "out")
+        assert result.code == 3
+        assert "new files of an interrupted run, which are not all in their places" in result.err
 
 
 def test_quiet_prints_nothing(run):

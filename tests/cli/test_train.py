@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splinecli.files import UNFINISHED
+from splinecli.publishing import UNDONE
+
 
 @pytest.fixture(autouse=True)
 def small_runs(tmp_path, monkeypatch):
@@ -197,9 +200,13 @@ def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
 def test_resuming_a_finished_run_says_so(run, no_pictures):
     run("train", "-o", "run", "--steps", 1)
     before = {path.name: path.read_bytes() for path in Path("run").iterdir()}
+    Path("run", f".weights.safetensors.x{UNFINISHED}").touch()  # a killed process was writing this
     result = run("train", "-o", "run", "--resume", "--steps", 1)
     assert (result.code, result.out) == (0, "run/weights.safetensors\n")
-    assert result.err == "run: the run is at its end already. Give it more --steps or --minutes to go on.\n"
+    assert result.err == (
+        f"splinecli: warning: run: {UNDONE}\n"
+        "run: the run is at its end already. Give it more --steps or --minutes to go on.\n"
+    )
     assert {path.name: path.read_bytes() for path in Path("run").iterdir()} == before
 
 

@@ -72,11 +72,32 @@ def test_a_line_cut_short_is_dropped(tmp_path: Path) -> None:
     assert read_metrics(tmp_path / METRICS) == ROWS
 
 
+@pytest.mark.parametrize("step", ["9" * 5000, "²", "-", "1e3"])
+def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) -> None:
+    log = RunLog(tmp_path, 0)
+    for row in ROWS[:2]:
+        log.append(row)
+    with (tmp_path / METRICS).open("a", encoding="utf-8") as file:
+        file.write(f"{step},1" + ",1.0" * 9 + "\n")
+    again = RunLog(tmp_path, 100)
+    assert again.set_aside is None
+    assert read_metrics(tmp_path / METRICS) == ROWS[:2]
+
+
+def test_every_damaged_file_is_kept(tmp_path: Path) -> None:
+    for number in range(3):
+        (tmp_path / METRICS).write_text(f"damage {number}\n")
+        RunLog(tmp_path, 0)
+    kept = ("metrics.damaged.csv", "metrics.damaged-2.csv", "metrics.damaged-3.csv")
+    assert [(tmp_path / name).read_text() for name in kept] == ["damage 0\n", "damage 1\n", "damage 2\n"]
+
+
 @pytest.mark.parametrize("text", ["", "step\n50\n", "step,loss\n50,1.0\n"])
-def test_a_file_of_another_version_is_replaced(tmp_path: Path, text: str) -> None:
+def test_a_file_of_another_version_is_set_aside(tmp_path: Path, text: str) -> None:
     (tmp_path / METRICS).write_text(text)
     RunLog(tmp_path, 50).append(ROWS[0])
     assert read_metrics(tmp_path / METRICS) == ROWS[:1]
+    assert (tmp_path / "metrics.damaged.csv").read_text() == text
 
 
 def read_png(path: Path) -> np.ndarray:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from splinecli.errors import InputError
+from splinecli.files import is_unfinished
 
 _OPEN_FILES = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
@@ -37,13 +38,10 @@ def find_mode(path: Path) -> int | None:
         raise _unreadable(path, error.strerror) from None
 
 
-def is_file(path: Path) -> bool:
-    """Return whether there is a file; False also if the system refuses to answer."""
-    return stat.S_ISREG(_mode_or_zero(path))
-
-
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
-    """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
+    """Raise InputError unless there is a whole file. Anything else, such as a device, might never end or never begin.
+
+    A file in a folder that is unfinished (see is_unfinished) may belong to another run than the files beside it.
 
     Args:
         path: the path.
@@ -56,6 +54,24 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
         kind = next(words for matches, words in _KINDS if matches(mode))
         raise InputError(f"found {kind}, expected {expected}", path=path)
+    if is_unfinished(path.parent):
+        raise InputError(
+            "lies in a folder with new files of an interrupted run, which are not all in their places",
+            path=path,
+            hint="Run the command that writes into that folder again, which finishes this",
+        )
+
+
+def is_found_file(path: Path) -> bool:
+    """Return whether an entry of a folder, with the name of a file that is read, is a file; False for a folder.
+
+    Raises:
+        InputError: it is anything else, such as a pipe or a broken link. To pass over it would hide that.
+    """
+    if is_folder(path):
+        return False
+    check_file(path, "a file")
+    return True
 
 
 def is_substitution(path: Path) -> bool:

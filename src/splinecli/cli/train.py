@@ -57,7 +57,10 @@ def train(
         settings = replace(settings, steps=steps, minutes=0.0)
     if minutes is not None:
         settings = replace(settings, minutes=minutes)
-    with open_run(settings, output, device.value, resume=resume, tensorboard=tensorboard) as trainer:
+    warn = Messages(quiet=quiet).warn
+    with open_run(
+        settings, output, device.value, resume=resume, tensorboard=tensorboard, warn=warn
+    ) as trainer:
         _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
         if not quiet and trainer.workers.leads:
             print(printable(output / WEIGHTS))

@@ -97,7 +97,7 @@ def infer_batch(
         outcomes.append(outcome)
         yield outcome
     if with_index:
-        _write_index(outcomes, output)
+        _write_index(outcomes, output, observer)
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
@@ -194,7 +194,7 @@ def _earlier_outcome(
 
 def _failure(name: str, folder: Path, error: Exception) -> Outcome:
     """Return what became of a capture that failed. Raises OutputError again, but for BusyError: it ends the batch."""
-    from splinecli.publishing import BusyError
+    from splinecli.locks import BusyError
 
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
@@ -219,12 +219,12 @@ def _failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
     return Outcome(name, "failed", _error_document(error, name), error.exit_code, trace)
 
 
-def _write_index(outcomes: Sequence[Outcome], output: Path) -> None:
+def _write_index(outcomes: Sequence[Outcome], output: Path, observer: Observer) -> None:
     """Write the page of all captures. Of those that changed it shows the results that were kept."""
     from splinecli.files import write_text
     from splinecli.publishing import held_folder
     from splinecli.results.index import INDEX, index_page, with_earlier
 
     reports = [outcome.report for outcome in outcomes if outcome.status != "changed"]
-    with held_folder(output, wait=True):
+    with held_folder(output, observer.warn, wait=True):
         write_text(output / INDEX, index_page(with_earlier(reports, output)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import InputError, UsageError
-from splinecli.files import read_json
+from splinecli.files import is_unfinished, read_json
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, write_surface
 
@@ -184,7 +184,6 @@ def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
 
 
 def _find_normal_map(folder: Path) -> Path:
-    from splinecli.publishing import is_unfinished
     from splinecli.results.files import NORMALS
 
     if is_unfinished(folder):

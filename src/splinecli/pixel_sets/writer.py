@@ -12,6 +12,7 @@ import numpy as np
 from splinecli import __version__
 from splinecli.errors import OutputError
 from splinecli.files import check_writable, file_sha256, write_text
+from splinecli.locks import LOCK
 from splinecli.pixel_sets.store import (
     ARRAYS,
     FORMAT,
@@ -22,7 +23,7 @@ from splinecli.pixel_sets.store import (
     parse_entries,
     read_manifest,
 )
-from splinecli.publishing import LOCK, new_files
+from splinecli.publishing import new_files
 
 
 class PixelSetWriter:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -42,7 +42,13 @@ def configure_run(
 
 @contextmanager
 def open_run(
-    config: TrainingConfig, folder: Path, device_name: str, *, resume: bool, tensorboard: bool
+    config: TrainingConfig,
+    folder: Path,
+    device_name: str,
+    *,
+    resume: bool,
+    tensorboard: bool,
+    warn: Callable[[str], object] = lambda _: None,
 ) -> Iterator[Trainer]:
     """Join the other processes, lock the folder and yield the trainer.
 
@@ -52,6 +58,7 @@ def open_run(
         device_name: "auto", "cpu" or "cuda".
         resume: continue from the checkpoint.
         tensorboard: also write TensorBoard's event files.
+        warn: receives a sentence about what a killed process had left in the folder.
 
     Raises:
         UsageError: the processes cannot share a batch, the device is not available, or TensorBoard is not installed.
@@ -66,5 +73,5 @@ def open_run(
         stack.callback(leave_workers)
         workers.shards(config.shards)  # raises UsageError before the folder is made
         if workers.leads:
-            stack.enter_context(held_folder(folder))
+            stack.enter_context(held_folder(folder, warn))
         yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard)

@@ -49,6 +49,10 @@ class Metrics:
     validation_deg: float | None = None
 
 
+_HEADER = ",".join(field.name for field in fields(Metrics))
+_LONGEST = 1 << 26  # bytes of a metrics.csv, about half a million lines
+
+
 class RunLog:
     """Writer of the log files in `folder`. Its methods raise OutputError when a file cannot be written."""
 
@@ -113,16 +117,23 @@ def _parse(row: dict[str, str]) -> Metrics:
 
 
 def _set_aside_if_damaged(path: Path) -> Path | None:
-    """Rename a metrics.csv that cannot be read, and return its new path; None where nothing is wrong."""
+    """Rename a metrics.csv that cannot be read to a name that is free, and return its new path; None if it is whole."""
     try:
         if path.exists():
-            if not path.is_file():
-                raise ValueError("it is no file")
+            if not path.is_file() or path.stat().st_size > _LONGEST:
+                raise ValueError("it is no such file")
             # A full disk may cut the last line.
             read_metrics(path, leave_out_last=True)
+            with path.open(encoding="utf-8") as file:
+                if file.readline().rstrip("\n") != _HEADER:
+                    raise ValueError("another version wrote it")
         return None
     except (ValueError, TypeError, KeyError, csv.Error):
         aside = path.with_suffix(".damaged.csv")
+        number = 1
+        while aside.exists():
+            number += 1
+            aside = path.with_suffix(f".damaged-{number}.csv")
         with refusals_as_output_errors(aside):
             path.replace(aside)
         return aside
@@ -132,16 +143,24 @@ def _drop_lines_after(step: int, path: Path) -> None:
     """Remove the lines of later steps from a metrics.csv, or the whole file where no line is left."""
     if not path.exists():
         return
-    header, *lines = path.read_text("utf-8").splitlines() or [""]
-    expected = ",".join(field.name for field in fields(Metrics))
-    # A full disk may cut the last line, and then its step may lack digits.
-    whole = [line.split(",") for line in lines if line.count(",") == expected.count(",")]
-    kept = [",".join(values) for values in whole if values[0].isdigit() and int(values[0]) <= step]
-    if kept and header == expected:
-        write_text(path, "\n".join([header, *kept]) + "\n")
-    else:  # The run stopped before its first checkpoint, or another version wrote the file.
+    _, *lines = path.read_text("utf-8").splitlines()
+    kept = [line for line in lines if _step_of(line) <= step]
+    if kept:
+        write_text(path, "\n".join([_HEADER, *kept]) + "\n")
+    else:  # The run stopped before its first checkpoint.
         with refusals_as_output_errors(path):
             path.unlink()
+
+
+def _step_of(line: str) -> float:
+    """Return the step of a line, or infinity for the last line of a file, which a full disk may have cut."""
+    values = line.split(",")
+    if len(values) != _HEADER.count(",") + 1:
+        return math.inf
+    try:
+        return _parse(dict(zip(_HEADER.split(","), values, strict=True))).step
+    except ValueError:
+        return math.inf
 
 
 def _open_events(folder: Path, step: int) -> Any:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splinecli.capture.layouts.image_lists import IMAGE_SUFFIXES, PICTURE_SUFFIXES, list_folder
-from splinecli.capture.paths import check_file, is_file, resolve
+from splinecli.capture.paths import check_file, is_found_file, resolve
 from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
@@ -118,8 +118,8 @@ def gather_files(
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names in the folder, ignoring case; None if there is none."""
-    files = {entry.name.lower(): entry for entry in list_folder(folder) if is_file(entry)}
-    return next((files[name] for name in names if name in files), None)
+    files = {entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names}
+    return next((files[name] for name in names if name in files and is_found_file(files[name])), None)
 
 
 def find_lights(folder: Path) -> Path | None:
@@ -127,7 +127,7 @@ def find_lights(folder: Path) -> Path | None:
     plain = find_named(folder, LIGHT_DIRECTIONS)
     if plain is not None:
         return plain
-    named = [e for e in list_folder(folder) if e.name.lower().endswith(NAMED_LIGHTS) and is_file(e)]
+    named = [e for e in list_folder(folder) if e.name.lower().endswith(NAMED_LIGHTS) and is_found_file(e)]
     if len(named) > 1:
         raise InputError(
             f"found {len(named)} light files: {', '.join(path.name for path in named)}",

@@ -20,7 +20,7 @@ from splinecli.capture.layouts.capture_files import (
 )
 from splinecli.capture.layouts.image_lists import list_folder, list_images
 from splinecli.capture.lights.light_files import read_light_directions
-from splinecli.capture.paths import is_file, is_folder, resolve
+from splinecli.capture.paths import is_folder, resolve
 from splinecli.errors import InputError
 
 TREES = ("PRPS", "PRPS_Diffuse")
@@ -119,7 +119,9 @@ def _is_object(folder: Path) -> bool:
 
 def _has_marks(folder: Path) -> bool:
     marks = {
-        entry.name.lower() for entry in list_folder(folder) if entry.name.lower() in _MARKS and is_file(entry)
+        entry.name.lower()
+        for entry in list_folder(folder)
+        if entry.name.lower() in _MARKS and not is_folder(entry)
     }
     return len(marks) >= _ENOUGH_MARKS
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splinecli.capture.formats.raw import RAW_SUFFIXES
 from splinecli.capture.formats.text import read_lines
-from splinecli.capture.paths import find_mode, is_file, resolve
+from splinecli.capture.paths import check_file, find_mode, is_found_file, resolve
 from splinecli.errors import InputError
 
 _DEVELOPED = (".png", ".tif", ".tiff")
@@ -79,7 +79,7 @@ def list_images(
         for entry in list_folder(folder)
         if entry.suffix.lower() in IMAGE_SUFFIXES
         and entry.stem.lower() not in leave_out_stems
-        and is_file(entry)
+        and is_found_file(entry)
         and resolve(entry) not in others
     ]
     raw, developed = (
@@ -121,13 +121,14 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
                 line=line,
                 hint="Add --images-elsewhere if you trust this file",
             )
-        if not is_file(image):
+        if find_mode(image) is None:
             raise InputError(
                 f'the image "{name}" does not exist',
                 path=path,
                 line=line,
                 hint="Correct the name or remove the line",
             )
+        check_file(image, "an image")
         if image in images:
             raise InputError(f'the image "{name}" is also on line {images[image]}', path=path, line=line)
         images[image] = line

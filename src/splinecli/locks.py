@@ -1,0 +1,106 @@
+"""Locks of folders: one process at a time writes into a folder. A lock ends with its process, however that ends."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from splinecli.errors import OutputError
+
+LOCK = ".lock"
+"""The lock file in a folder that only one process at a time may write into. It is removed at the end."""
+
+_SECONDS_BETWEEN_TRIES = 0.02
+
+
+class BusyError(OutputError):
+    """Another process writes into the folder."""
+
+
+@contextmanager
+def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Make a folder and lock it.
+
+    Args:
+        folder: the folder.
+        wait: wait for another process that has locked the folder, instead of raising BusyError.
+
+    Raises:
+        BusyError: another process has locked the folder.
+        OutputError: another user left a lock file, which this process may not open.
+        OSError: the folder cannot be made or written.
+    """
+    file = _locked_file(folder, wait=wait)
+    try:
+        yield
+    finally:
+        # Windows removes no file that is open. Elsewhere, whoever locks the file after it is removed sees that.
+        if os.name == "nt":
+            file.close()
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        file.close()
+
+
+def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
+    """Return the open lock file of a folder, which is made as needed."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            file = (folder / LOCK).open("a")
+        except FileNotFoundError:  # another process removed the folder, because it was empty
+            continue
+        except PermissionError:
+            if not (folder / LOCK).exists():
+                raise
+            raise OutputError(
+                "this lock file belongs to another user, who may be writing into the folder",
+                path=folder / LOCK,
+                hint="If no splinecli process of that user runs, remove the file. Otherwise choose another -o",
+            ) from None
+        try:
+            got = _try_lock(file)
+        except OSError:  # some network drives have no locks
+            return file
+        if got and _is_current(file, folder / LOCK):
+            return file
+        file.close()
+        if not got and not wait:
+            raise BusyError(
+                "another splinecli process is writing into this folder",
+                path=folder,
+                hint="Wait for it to end, or choose another -o",
+            )
+        if not got:
+            time.sleep(_SECONDS_BETWEEN_TRIES)
+
+
+def _try_lock(file: IO[str]) -> bool:
+    """Lock an open file, unless another process has locked it. Raises OSError where there are no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        windows: Any = importlib.import_module("msvcrt")
+        try:
+            windows.locking(file.fileno(), windows.LK_NBLCK, 1)
+        except PermissionError:
+            return False
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _is_current(file: IO[str], path: Path) -> bool:
+    """Return whether an open file is still the one at the path: its last owner removes it, and others make it anew."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
