@@ -34,6 +34,7 @@ def estimate_normals(
     white_level: float | None = None,
     weights: str | None = None,
     rotations: int | None = None,
+    distil: bool | None = None,
     batch_size: int | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     precision: Literal["auto", "float32", "bfloat16"] = "auto",
@@ -63,6 +64,8 @@ def estimate_normals(
             integer images; floating-point images then have none.
         weights: name or file of a network's weights. None is the method's own.
         rotations: number of rotations of the lights whose normals a network averages. None is the method's own.
+        distil: let a small network learn the method on a sample of the pixels and estimate the rest. False uses the
+            method on every pixel; None takes the faster way for 100,000 pixels and more.
         batch_size: pixels per batch. None is the method's own.
         device: where to compute; "auto" is a CUDA GPU if there is one.
         precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
@@ -83,9 +86,12 @@ def estimate_normals(
         Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and normal estimation
         networks, ICCV 2019.
     """
+    from dataclasses import replace
+
     from splinecli.capture.arrays import capture_from_arrays
     from splinecli.inference import estimate_normals
     from splinecli.methods import MethodOptions, check_method, make_estimator
+    from splinecli.pipeline.distillation import distil_for
 
     check_method(method)
     capture = capture_from_arrays(
@@ -98,7 +104,11 @@ def estimate_normals(
         as_stored=as_stored,
     )
     options = MethodOptions(weights, rotations, batch_size, device, precision)
-    return estimate_normals(capture, make_estimator(method, options), progress=progress)
+    estimator = make_estimator(method, options)
+    distilled, warnings = distil_for(capture, estimator, distil)
+    if warnings:
+        capture = replace(capture, warnings=(*capture.warnings, *warnings))
+    return estimate_normals(capture, distilled or estimator, progress=progress)
 
 
 def integrate_normals(

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import Progress, confidence, refiner_of, tells_confidence
+from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
 from splinecli.methods.lamp_light import LampLight, rows_of
 from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
-TILE_PIXELS = 16_384
 _UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
 
 
@@ -56,7 +55,7 @@ def estimate_normals(
     capture: Capture,
     estimator: Estimator,
     *,
-    tile_pixels: int = TILE_PIXELS,
+    tile_pixels: int | None = None,
     progress: Progress | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
@@ -64,7 +63,7 @@ def estimate_normals(
     The capture of the result has the points of this surface.
 
     Args:
-        tile_pixels: number of pixels that the estimator gets at once.
+        tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
         progress: called with the number of pixels just finished: after each batch of the estimator, and up to 128 times
             a batch of a network, not only after each tile.
 
@@ -73,6 +72,8 @@ def estimate_normals(
     """
     started = time.perf_counter()
     capture = find_surface(capture)
+    if tile_pixels is None:
+        tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
     normals = np.empty((capture.n_pixels, 3), np.float32)
     errors = np.empty((capture.n_pixels, 2), np.float32) if tells_confidence(estimator) else None
     for start in range(0, capture.n_pixels, tile_pixels):

@@ -280,6 +280,25 @@ def test_network_on_a_matte_sphere(capture, run):
     assert report["angular_error_deg"]["mean"] < 2.5
 
 
+def test_distilled(capture, run):
+    """A sphere of 1,600 pixels: a quarter of them are learned."""
+    (report,) = json.loads(run("infer", capture, "--distil", "--maps", "confidence", "--json").out)
+    told = report["distillation"]
+    assert 0 < told["sample"] <= report["n_pixels"] / 4
+    assert told["held_out"] == pytest.approx(told["sample"] / 8, abs=1)
+    assert told["angle_to_network_deg"]["mean"] < told["expected_error_deg"]
+    assert report["angular_error_deg"]["mean"] < 2.5
+    assert report["options"]["distil"] is True
+    assert read_report(Path("out/sphere"))["distillation"] == told
+    kept = run("infer", capture, "--exact")
+    assert "contains results made with" in kept.err
+    (report,) = json.loads(run("infer", capture, "--exact", "--overwrite", "--json").out)
+    assert report["distillation"] is None
+    refused = run("infer", capture, "--distil", "--method", "ls", "-o", "ls")
+    assert refused.code == 2
+    assert "method ls gives no confidence and cannot be distilled" in refused.err
+
+
 def test_three_lights_are_warned_about(capture, run):
     result = run("infer", capture, "--light-indices", "1,2,3")
     assert result.code == 0

@@ -48,6 +48,7 @@ LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
 NEAR_LAMPS = "near_lamps"
 LOW_CONFIDENCE = "low_confidence"
+NOT_DISTILLED = "not_distilled"
 REPEATED_IMAGES = "repeated_images"
 REFINED_LIGHTS = "refined_lights"
 SATURATED = "saturated"
@@ -188,6 +189,15 @@ def low_confidence(expected_under_5: float) -> CaptureWarning:
         LOW_CONFIDENCE,
         f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5 degrees. The"
         " lights, the mask or the images are probably wrong: see docs/troubleshooting.md.",
+    )
+
+
+def not_distilled(angle_deg: float, expected_deg: float) -> CaptureWarning:
+    """Warn of a capture that a perceptron could not learn, so that it took longer than expected."""
+    return CaptureWarning(
+        NOT_DISTILLED,
+        f"The network estimated every pixel. A small one learned from a sample, but was {angle_deg:.1f} degrees away"
+        f" from it, where it expects errors of {expected_deg:.1f} degrees.",
     )
 
 

@@ -35,7 +35,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--update",
             *REPEAT,
         ),
-        "Speed": SPEED,
+        "Speed": ("--distil", *SPEED),
     },
     "info": {
         "Input": ("--mask", "--ground-truth", *VALUES, *LIMITS),

@@ -55,6 +55,9 @@ class Estimator(Protocol):
         ...
 
 
+TILE_PIXELS = 16_384
+"""Pixels that an estimator gets at once, unless it has a `tile_pixels` of its own."""
+
 CONFIDENT_DEG = 5.0
 """Confidence is the probability that a normal is off by at most this angle."""
 

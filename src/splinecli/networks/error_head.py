@@ -45,3 +45,8 @@ def probability_within(error: Tensor, limit_deg: float) -> Tensor:
     """Return the probability (P,) that the error is at most limit_deg."""
     median, shape = error.unbind(-1)
     return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg + _MORE_DEG)) - median))
+
+
+def median_error_deg(error: Tensor) -> Tensor:
+    """Return the medians (P,) of distributions (P, 2) in degrees."""
+    return error[:, 0].exp().rad2deg() - _MORE_DEG

@@ -61,6 +61,7 @@ def _infer_into(
     """Do the work of infer_capture in the folder of results, which the caller holds."""
     from splinecli.capture.capture_warnings import low_confidence
     from splinecli.inference import estimate_normals
+    from splinecli.pipeline.distillation import distil_for
     from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
     from splinecli.results.files import write_estimate
     from splinecli.results.report import report_of
@@ -78,8 +79,10 @@ def _infer_into(
         warnings += capture.warnings[before:]
     if estimator is None:
         estimator = make_method(options)
+    distilled, found = distil_for(capture, estimator, options.distil, observer)
+    warnings += found
     with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
-        estimate = estimate_normals(capture, estimator, progress=advance)
+        estimate = estimate_normals(capture, distilled or estimator, progress=advance)
     warnings += _method_warnings(estimator, capture)
     expected = estimate.expected_under_5
     if expected is not None and expected < LEAST_EXPECTED:
@@ -95,6 +98,7 @@ def _infer_into(
         as_stored=options.as_stored,
         read_seconds=read_seconds,
         warnings=warnings,
+        distillation=None if distilled is None else distilled.report(),
     )
     return write_estimate(
         estimate,

@@ -47,6 +47,7 @@ class InferOptions:
         method: a name that `splinecli.methods.method_names` lists.
         weights: a shipped name or a file. None for the method's own.
         rotations, batch_size: of a network. None for the method's own.
+        distil: learn the network on a sample of the pixels; False for the network on every pixel, None for the faster.
         output: results go to `output`/<capture name>/.
         formats: names of `splinecli.results.files.NORMALS`.
         maps: names of `splinecli.results.files.MAPS`.
@@ -82,6 +83,7 @@ class InferOptions:
     method: str = DEFAULT_METHOD
     weights: str | None = None
     rotations: int | None = None
+    distil: bool | None = None
     batch_size: int | None = field(default=None, compare=False)
     device: Device = field(default="auto", compare=False)
     precision: Precision = "auto"

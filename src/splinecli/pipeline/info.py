@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 PIXELS_PER_SECOND = 2000
 """Speed of spline-net on a laptop's processor. benchmarks/inference_speed.py measures that of your machine."""
 
+LEARNED_PER_SECOND = 500
+"""Pixels of the sample of a distilled network: a pixel's time in the network, and that of learning it."""
+
+DISTILLED_PER_SECOND = 150_000
+"""Speed of reading, of the distilled network and of writing together."""
+
 STARTING_SECONDS = 3
 """Time that infer takes besides the pixels."""
 
@@ -215,9 +221,20 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         },
         "expect": {
             "memory_mib": round(_memory_mib(summary)),
-            "seconds": round(STARTING_SECONDS + summary.n_pixels / PIXELS_PER_SECOND),
+            "seconds": round(STARTING_SECONDS + _seconds(summary)),
         },
     }
+
+
+def _seconds(summary: CaptureSummary) -> float:
+    """Return the time of spline-net on a capture, distilled from the size where `infer` does so."""
+    from splinecli.methods.pupil_size import pupil_sizes
+    from splinecli.pipeline.distillation import AUTOMATIC_FROM
+
+    count, lamps = summary.n_pixels, summary.source.lamps
+    if count < AUTOMATIC_FROM or (lamps is not None and lamps.used):
+        return count / PIXELS_PER_SECOND
+    return pupil_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
 
 
 def _memory_mib(summary: CaptureSummary) -> float:

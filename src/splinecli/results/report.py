@@ -26,6 +26,7 @@ def report_of(
     as_stored: bool,
     read_seconds: float,
     warnings: Sequence[CaptureWarning],
+    distillation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), all but `seconds.write` and `files`, which write_estimate adds.
 
@@ -37,6 +38,7 @@ def report_of(
         as_stored: whether the capture was read without any restoration.
         read_seconds: seconds that reading the capture took.
         warnings: what the user should know about the result.
+        distillation: what DistilledEstimator.report returns; None where the method estimated every pixel.
     """
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5
@@ -55,6 +57,7 @@ def report_of(
         "image_size": [width, height],
         "device": estimator.device,
         "precision": estimator.precision,
+        "distillation": distillation,
         "seconds": {"read": round(read_seconds, 3), "estimate": round(estimate.seconds, 3)},
         "peak_memory_mib": peak_memory_mib(),
         "warnings": [asdict(warning) for warning in warnings],

@@ -28,6 +28,12 @@ ROTATIONS = Option(
     min=1,
     help="Average the network's result over R rotations of the lights. [default: 1; cnn-ps: 10]",
 )
+DISTIL = Option(
+    None,
+    "--distil/--exact",
+    help="Let a small network learn the method on a sample of the pixels and estimate the rest, or use the method"
+    " on every pixel. [default: the faster one from 100,000 pixels, else --exact]",
+)
 STIFFNESS = Option(
     2.0, metavar="K", min=0, help="How sharply the surface may break at edges. 0 keeps it in one piece."
 )

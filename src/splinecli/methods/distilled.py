@@ -1,0 +1,216 @@
+"""An estimator made for one capture: a perceptron that learned a network's normals on a sample of the pixels.
+
+One capture has one set of lights and a few materials, so most of its pixels say the same. The network estimates a
+sample of them, the perceptron learns it and estimates the rest at some 80 times the speed. What the perceptron does
+not follow is mostly the network's noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network,
+arXiv 1503.02531).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splinecli.errors import UsageError
+from splinecli.methods.estimator import (
+    UNKNOWN_ERROR,
+    ConfidentEstimator,
+    Directions,
+    Observations,
+    Progress,
+    refiner_of,
+)
+from splinecli.methods.least_squares import TOWARDS_CAMERA
+from splinecli.methods.perceptron import BATCH, Perceptron
+from splinecli.methods.pixel_sample import PixelSample, draw_sample
+from splinecli.methods.pupil_size import FEWEST_PIXELS, PupilSize
+from splinecli.networks.error_head import median_error_deg
+from splinecli.normals import angle_between_deg
+
+_CANDIDATES = 100_000  # pixels that the sample is drawn from
+_HELD_OUT = 1 / 8  # of the sample
+_TILE = 2048  # pixels whose hidden layers stay in a processor's cache
+_RARE_SHARE = 0.01  # of the pixels, and
+_RARE_PER_SAMPLE = 2  # times the sample are the most pixels of rare kinds that go through the network
+_LARGEST_SHARE = (
+    0.7  # of the expected error; on rendered pixels, more cost 0.3 degrees and more against the truth
+)
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """What was learned, and how well.
+
+    Args:
+        sample: number of pixels that the network estimated for learning.
+        held_out: number of these that were not learned. They are an even sample of the capture.
+        mean_deg, p95_deg: angles between perceptron and network on the pixels held out.
+        expected_deg: the mean error that the network expects of itself on them.
+    """
+
+    sample: int
+    held_out: int
+    mean_deg: float
+    p95_deg: float
+    expected_deg: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the perceptron follows the network as closely as the network's own errors deserve."""
+        return self.mean_deg <= _LARGEST_SHARE * self.expected_deg
+
+
+class DistilledEstimator:
+    """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see distil."""
+
+    tells_confidence = True
+    tile_pixels = 1 << 18
+    """The few rare pixels of a tile still fill a batch of the network."""
+
+    def __init__(
+        self, teacher: ConfidentEstimator, perceptron: Perceptron, sample: PixelSample, found: Distillation
+    ) -> None:
+        self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
+        self.distillation = found
+        self.n_unlike = 0
+        self.name, self.weights = teacher.name, teacher.weights
+        self.refiner = refiner_of(teacher)
+        self.device, self.precision = teacher.device, teacher.precision
+        self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
+
+    def report(self) -> dict[str, Any]:
+        """Return how the capture was estimated so far, as JSON values."""
+        found = self.distillation
+        return {
+            "sample": found.sample,
+            "held_out": found.held_out,
+            "angle_to_network_deg": {"mean": round(found.mean_deg, 4), "p95": round(found.p95_deg, 4)},
+            "expected_error_deg": round(found.expected_deg, 4),
+            "unlike_pixels": self.n_unlike,
+        }
+
+    def estimate(
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+    ) -> NDArray[np.float32]:
+        """Estimate unit normals (P, 3) from observations (P, F) under the capture's lights (F, 3); see Estimator."""
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
+
+    def estimate_with_error(
+        self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see ConfidentEstimator."""
+        normals = np.empty((len(observations), 3), np.float32)
+        errors = np.empty((len(observations), 2), np.float32)
+        unlike = np.empty(len(observations), np.bool_)
+        for start in range(0, len(observations), _TILE):
+            rows = slice(start, start + _TILE)
+            normals[rows], errors[rows], unlike[rows] = self._apply(observations[rows])
+            if progress is not None:
+                progress(int(np.count_nonzero(~unlike[rows])))
+        if unlike.any():
+            self.n_unlike += int(np.count_nonzero(unlike))
+            normals[unlike], errors[unlike] = self._teacher.estimate_with_error(
+                observations[unlike], light_directions, progress=progress
+            )
+        return normals, errors
+
+    @torch.inference_mode()
+    def _apply(
+        self, observations: Observations
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        """Return the perceptron's normals and errors of some pixels, and which pixels are rare or unlike the sample."""
+        inputs = self._perceptron.inputs(torch.as_tensor(observations).to(self.device))
+        normals, errors = (found.cpu().numpy() for found in self._perceptron(inputs))
+        dark = ~(observations > 0).any(axis=1)
+        normals[dark | ~normals.any(axis=1)] = TOWARDS_CAMERA
+        errors[dark] = UNKNOWN_ERROR
+        return normals, errors, self._sample.unlike(inputs).cpu().numpy() & ~dark
+
+
+def distil(
+    teacher: ConfidentEstimator,
+    observations: Observations,
+    light_directions: NDArray[np.floating],
+    size: PupilSize,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> DistilledEstimator:
+    """Return an estimator for the pixels of one capture that learned from `teacher` on a sample of them.
+
+    The result is the same for the same seed.
+
+    Args:
+        observations: (P, F), of all pixels of the capture.
+        light_directions: (F, 3), of distant lights.
+        progress: called with numbers of pixels; in all, twice the pixels of the sample.
+
+    Raises:
+        UsageError: fewer than FEWEST_PIXELS pixels are lit.
+    """
+    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    chosen = np.sort(rng.choice(len(observations), min(_CANDIDATES, len(observations)), replace=False))
+    candidates = observations[chosen]
+    candidates = candidates[(candidates > 0).any(axis=1)]
+    if len(candidates) < FEWEST_PIXELS:
+        raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
+    lights = torch.as_tensor(light_directions, dtype=torch.float32)
+    perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
+    with torch.inference_mode(False), torch.enable_grad():
+        inputs = perceptron.inputs(torch.as_tensor(candidates).to(teacher.device))
+        rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / len(observations))
+        sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
+        taught = teacher.estimate_with_error(
+            candidates[sample.rows.numpy()], light_directions, progress=progress
+        )
+        inputs = inputs[sample.rows.to(inputs.device)]
+        normals, errors = (
+            torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught
+        )
+        held = round(_HELD_OUT * len(inputs))  # the first pixels are an even sample of all
+        share = len(inputs) / size.steps
+        done = 0.0
+
+        def count() -> None:
+            nonlocal done
+            done += share
+            if progress is not None and done >= 1:
+                progress(int(done))
+                done -= int(done)
+
+        perceptron.learn(
+            inputs[held:],
+            normals[held:],
+            errors[held:],
+            steps=size.steps,
+            generator=generator,
+            progress=count,
+        )
+    with torch.inference_mode():
+        angles = angle_between_deg(perceptron(inputs[:held])[0].cpu().numpy(), normals[:held].cpu().numpy())
+    found = Distillation(
+        sample=len(inputs),
+        held_out=held,
+        mean_deg=float(angles.mean()),
+        p95_deg=float(np.quantile(angles, 0.95)),
+        expected_deg=float(median_error_deg(errors[:held]).mean()),
+    )
+    return DistilledEstimator(teacher, perceptron, sample, found)
+
+
+def seconds_of_learning(light_directions: NDArray[np.floating], size: PupilSize, device: str) -> float:
+    """Measure a few steps of learning, and return the time of all. The network's time on the sample comes on top."""
+    generator = torch.Generator().manual_seed(0)
+    lights = torch.as_tensor(light_directions, dtype=torch.float32)
+    perceptron = Perceptron(lights, size.width, generator).to(device)
+    inputs = perceptron.inputs(torch.rand(BATCH, len(lights), generator=generator).to(device))
+    for steps in (2, 10):  # the first steps take longer
+        started = time.perf_counter()
+        perceptron.learn(inputs, inputs[:, -3:], inputs[:, :2], steps=steps, generator=generator)
+        seconds = (time.perf_counter() - started) / steps
+    return seconds * size.steps

@@ -1,0 +1,100 @@
+"""A sample of pixels that is spread over their appearance, so that it contains rare materials and highlights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+CELLS = 256
+"""Number of groups of pixels of like appearance."""
+
+EVEN_SHARE = 0.5
+"""Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups."""
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """A sample of pixels, and the appearances that it covers.
+
+    Args:
+        rows: (N,) distinct numbers of the pixels. The first n_even are an even sample of all pixels.
+        n_even: number of pixels that were drawn evenly from all.
+        centres: (K, C), the features at the centres of the groups.
+        rare: (K,) bool, the groups of fewest pixels.
+        reach: the largest distance of a pixel, among those that could be drawn, from the nearest centre.
+    """
+
+    rows: Tensor
+    n_even: int
+    centres: Tensor
+    rare: Tensor
+    reach: float
+
+    def unlike(self, features: Tensor) -> Tensor:
+        """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
+        distance, group = torch.cdist(features, self.centres).min(dim=1)
+        # Rounding must not make a pixel unlike itself.
+        return self.rare[group] | (distance > 1.001 * self.reach + 1e-4)
+
+
+def draw_sample(
+    features: Tensor, size: int, generator: torch.Generator, *, rare_share: float = 0.0
+) -> PixelSample:
+    """Draw a sample of `size` pixels, or half of all pixels if that is less.
+
+    The pixels are grouped around centres: each further centre is the pixel farthest from all centres so far (Gonzalez,
+    Clustering to minimize the maximum intercluster distance, 1985). Rare appearances thereby get groups of their own.
+
+    Args:
+        features: (P, C) of the pixels that may be drawn, in any order.
+        generator: on the CPU.
+        rare_share: largest share of the pixels in groups that count as rare.
+    """
+    order = torch.randperm(len(features), generator=generator)
+    size = min(size, len(features) // 2)
+    n_even = round(EVEN_SHARE * size)
+    centres, nearest, reach = _group(features)
+    counts = torch.bincount(nearest, minlength=len(centres))
+    left = order[n_even:]
+    # One pixel of each group in turn, until there are enough.
+    turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
+    rows = torch.cat((order[:n_even], left[turns[: size - n_even]]))
+    return PixelSample(rows, n_even, features[centres], _rarest(counts, rare_share), reach)
+
+
+def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Return the pixels (K,) at the centres, the group of each pixel (P,), and the largest distance from a centre."""
+    centres = [int(((features - features.mean(dim=0)) ** 2).sum(dim=1).argmin())]
+    squares = (features * features).sum(dim=1)
+    distance = torch.full_like(squares, torch.inf)
+    nearest = torch.zeros(len(features), dtype=torch.long, device=features.device)
+    for number in range(min(CELLS, len(features))):
+        centre = centres[number]
+        new = squares - 2 * (features @ features[centre]) + squares[centre]
+        nearest[new < distance] = number
+        distance = torch.minimum(distance, new)
+        centres.append(int(distance.argmax()))
+    return (
+        torch.tensor(centres[:-1], device=features.device),
+        nearest,
+        float(distance.amax().clamp(min=0).sqrt()),
+    )
+
+
+def _rank_in_group(groups: Tensor) -> Tensor:
+    """Return how many earlier pixels are in the group of each pixel (P,)."""
+    by_group = torch.argsort(groups, stable=True)
+    counts = torch.bincount(groups)
+    rank = torch.empty_like(groups)
+    rank[by_group] = torch.arange(len(groups)) - (counts.cumsum(0) - counts)[groups[by_group]]
+    return rank
+
+
+def _rarest(counts: Tensor, share: float) -> Tensor:
+    """Return the groups (K,) of fewest pixels that have at most this share of all together."""
+    by_count = torch.argsort(counts, stable=True)
+    rare = torch.empty_like(counts, dtype=torch.bool)
+    rare[by_count] = counts[by_count].cumsum(0) <= share * int(counts.sum())
+    return rare

@@ -1,0 +1,33 @@
+"""How much a distilled estimator learns, by the size of the capture. This file is imported without PyTorch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FEWEST_PIXELS = 64
+"""The smallest sample that can be learned from."""
+
+
+@dataclass(frozen=True)
+class PupilSize:
+    """How much is learned.
+
+    Args:
+        sample: number of pixels that the network estimates.
+        steps: steps of learning.
+        width: units in each hidden layer of the perceptron.
+    """
+
+    sample: int
+    steps: int
+    width: int
+
+
+def pupil_sizes(n_pixels: int) -> tuple[PupilSize, PupilSize]:
+    """Return the usual size for a capture of n_pixels, and the size where that one is not enough.
+
+    Each pixel of the sample is learned some 25 times.
+    """
+    usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
+    larger = min(3 * usual, n_pixels // 2)
+    return PupilSize(usual, max(500, usual // 10), 192), PupilSize(larger, max(500, larger // 10), 320)

@@ -1,0 +1,87 @@
+"""Replace a network by a distilled estimator where that is faster, or where the user asks for it."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from splinecli.errors import UsageError
+from splinecli.pipeline.observer import SILENT, Observer
+
+if TYPE_CHECKING:
+    from splinecli.capture import Capture
+    from splinecli.capture.capture_warnings import CaptureWarning
+    from splinecli.methods import Estimator
+    from splinecli.methods.distilled import DistilledEstimator
+    from splinecli.methods.estimator import ConfidentEstimator
+    from splinecli.methods.pupil_size import PupilSize
+
+AUTOMATIC_FROM = 100_000
+"""Pixels of the smallest capture for which a network is distilled unless the user asks for it."""
+
+GAIN = 2.0
+"""Above that size, learning must be this many times as fast as the network on every pixel. A GPU may not need it."""
+
+
+def distil_for(
+    capture: Capture,
+    estimator: Estimator,
+    wanted: bool | None,
+    observer: Observer = SILENT,
+) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
+    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
+
+    Near lamps give each pixel its own light directions, so their captures are never distilled.
+
+    Args:
+        wanted: whether to distil; None for the faster way.
+
+    Raises:
+        UsageError: it is wanted, but the lamps are near, the method gives no confidence, or the capture is too small.
+    """
+    from splinecli.methods.estimator import tells_confidence
+
+    if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
+        return None, []
+    if not tells_confidence(estimator):
+        return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
+    if capture.lamps is not None:
+        return _refuse(wanted, f"{capture.name}: captures under near lamps cannot be distilled")
+    from splinecli.capture.capture_warnings import not_distilled
+    from splinecli.methods.distilled import distil
+    from splinecli.methods.pupil_size import FEWEST_PIXELS, pupil_sizes
+
+    sizes = pupil_sizes(capture.n_pixels)
+    if sizes[0].sample < FEWEST_PIXELS:
+        return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
+    if wanted is None and not _is_faster(capture, estimator, sizes[0]):
+        return None, []
+    for size in sizes:
+        with observer.progress(f"{capture.name}: learning", 2 * size.sample) as advance:
+            distilled = distil(
+                estimator, capture.observations, capture.light_directions, size, progress=advance
+            )
+        if distilled.distillation.is_good:
+            return distilled, []
+    return None, [not_distilled(distilled.distillation.mean_deg, distilled.distillation.expected_deg)]
+
+
+def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarning]]:
+    if wanted:
+        raise UsageError(problem, hint="Leave --distil out")
+    return None, []
+
+
+def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: PupilSize) -> bool:
+    """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
+    import numpy as np
+
+    from splinecli.methods.distilled import seconds_of_learning
+
+    rows = np.linspace(0, capture.n_pixels - 1, 1024).astype(np.intp)
+    for _ in range(2):  # the first time, a GPU also loads its kernels
+        started = time.perf_counter()
+        estimator.estimate(capture.observations[rows], capture.light_directions)
+        per_pixel = (time.perf_counter() - started) / len(rows)
+    learning = size.sample * per_pixel + seconds_of_learning(capture.light_directions, size, estimator.device)
+    return GAIN * learning < capture.n_pixels * per_pixel

@@ -1,0 +1,221 @@
+"""Distilled estimators, taught by estimators whose answers and mistakes are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from conftest import cap_directions, spiral_lights
+from splinecli.errors import UsageError
+from splinecli.methods.distilled import DistilledEstimator, distil
+from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
+from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.pupil_size import PupilSize, pupil_sizes
+from splinecli.normals import angle_between_deg, unit
+
+Floats = NDArray[np.floating]
+LIGHTS = spiral_lights(8, 50)
+SIZE = PupilSize(sample=1600, steps=160, width=64)
+SMALL = PupilSize(sample=800, steps=80, width=32)
+
+
+def shade(normals: Floats, gloss: float) -> NDArray[np.float32]:
+    """Return observations (P, 8): Lambert's cosine and a Phong lobe."""
+    half = unit(LIGHTS + np.array((0.0, 0.0, 1.0)))
+    lobe = np.clip(normals @ half.T, 0, None) ** 30
+    return (np.clip(normals @ LIGHTS.T, 0, None) + gloss * lobe).astype(np.float32)
+
+
+@dataclass
+class Teacher:
+    """Knows the normal and the error of each pixel by heart. Counts the pixels it is asked for."""
+
+    observations: NDArray[np.float32]
+    normals: Floats
+    errors: Floats
+    name: str = "taught"
+    weights: None = None
+    device: str = "cpu"
+    precision: str = "float32"
+    fingerprint: str = "taught"
+    tells_confidence: bool = True
+    asked: int = 0
+    places: dict[bytes, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.places = {row.tobytes(): place for place, row in enumerate(self.observations)}
+
+    def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Floats:
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
+
+    def estimate_with_error(
+        self, observations: Any, light_directions: Any, *, progress: Any = None
+    ) -> tuple[Floats, Floats]:
+        np.testing.assert_array_equal(light_directions, LIGHTS)
+        self.asked += len(observations)
+        if progress is not None:
+            progress(len(observations))
+        places = [self.places[row.tobytes()] for row in observations]
+        return self.normals[places], self.errors[places]
+
+
+def log_median(degrees: float) -> tuple[float, float]:
+    return math.log(math.radians(degrees)), math.log(2)
+
+
+def noisy(normals: Floats, degrees: float, seed: int = 5) -> Floats:
+    """Return normals turned by about so many degrees."""
+    noise = (
+        np.random.default_rng(seed).normal(size=normals.shape)
+        * math.radians(degrees)
+        / math.sqrt(math.pi / 2)
+    )
+    return unit(normals + noise - normals * (normals * noise).sum(axis=1, keepdims=True))
+
+
+def glossy(count: int = 8000) -> tuple[Floats, NDArray[np.float32]]:
+    normals = cap_directions(count, 50)
+    return normals, shade(normals, 0.8)
+
+
+def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
+    normals, observations = glossy()
+    teacher = Teacher(observations, noisy(normals, 4), np.tile(log_median(4), (8000, 1)))
+    found = distil(teacher, observations, LIGHTS, SIZE)
+    assert tells_confidence(found)
+    error = angle_between_deg(found.estimate(observations, LIGHTS), normals).mean()
+    assert angle_between_deg(teacher.normals, normals).mean() == pytest.approx(4, abs=0.1)
+    assert angle_between_deg(LeastSquares().estimate(observations, LIGHTS), normals).mean() > 4
+    assert error < 4 / 2
+    told = found.distillation
+    assert told.mean_deg == pytest.approx(4, abs=0.8)  # 200 pixels are held out
+    assert told.expected_deg == pytest.approx(4, abs=0.2)
+    assert told.held_out == pytest.approx(told.sample / 8, abs=1)
+    assert teacher.asked == told.sample + found.n_unlike < 1800
+    np.testing.assert_allclose(np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5)
+
+
+def test_it_learns_where_its_teacher_is_unsure() -> None:
+    normals = cap_directions(6000, 50)
+    dull = np.arange(6000) % 2 == 0
+    observations = np.where(dull[:, None], shade(normals, 0), shade(normals, 0) ** 2)
+    errors = np.where(dull[:, None], log_median(1), log_median(12))
+    found = distil(Teacher(observations, normals, errors), observations, LIGHTS, SIZE)
+    learned = confidence(found.estimate_with_error(observations, LIGHTS)[1])
+    truth = confidence(errors.astype(np.float32))
+    assert np.abs(learned[dull].mean() - truth[dull].mean()) < 0.1
+    assert np.abs(learned[~dull].mean() - truth[~dull].mean()) < 0.1
+
+
+def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
+    """Fails if the sample is even, and if the perceptron estimates all other pixels."""
+    normals, observations = glossy(20_000)
+    rare = np.arange(20_000) % 1000 == 3
+    observations[rare] = observations[rare][:, ::-1] ** 4
+    taught = np.where(rare[:, None], np.array((0.6, 0.0, 0.8)), normals)
+    teacher = Teacher(observations, taught, np.tile(log_median(2), (20_000, 1)))
+    found = distil(teacher, observations, LIGHTS, SIZE)
+    angles = angle_between_deg(found.estimate(observations, LIGHTS), taught)
+    assert (angles[rare] < 1e-3).mean() > 0.9
+    assert found.n_unlike <= 0.01 * 20_000
+    assert found.report()["unlike_pixels"] == found.n_unlike
+
+
+def test_pixels_unlike_all_others_are_left_to_the_teacher() -> None:
+    normals, observations = glossy()
+    stranger = np.zeros((1, 8), np.float32)
+    stranger[0, 2] = 0.4
+    teacher = Teacher(
+        np.concatenate((observations, stranger)),
+        np.concatenate((normals, [(0.0, -0.6, 0.8)])),
+        np.tile(log_median(2), (8001, 1)),
+    )
+    found = distil(teacher, observations, LIGHTS, SIZE)
+    asked = teacher.asked
+    estimate, errors = found.estimate_with_error(stranger, LIGHTS)
+    assert teacher.asked == asked + 1
+    np.testing.assert_allclose(estimate, [(0.0, -0.6, 0.8)], atol=1e-6)
+    np.testing.assert_allclose(errors, [log_median(2)], atol=1e-6)
+
+
+def test_dark_pixels_have_no_normal() -> None:
+    normals, observations = glossy(3000)
+    observations[::100] = 0
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
+    estimate, errors = distil(teacher, observations, LIGHTS, SIZE).estimate_with_error(observations, LIGHTS)
+    np.testing.assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
+    np.testing.assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
+
+
+def test_the_scale_of_a_pixel_does_not_matter() -> None:
+    normals, observations = glossy(3000)
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
+    found = distil(teacher, observations, LIGHTS, SMALL)
+    common = observations[~np.isin(np.arange(3000), np.flatnonzero(found._apply(observations)[2]))]
+    np.testing.assert_allclose(found._apply(common)[0], found._apply(common * 64)[0], atol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
+    normals, observations = glossy(3000)
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
+
+    def run(seed: int) -> DistilledEstimator:
+        return distil(teacher, observations, LIGHTS, SMALL, seed=seed)
+
+    torch.manual_seed(3)
+    expected = torch.rand(3)
+    torch.manual_seed(3)
+    first, again, other = (run(seed).estimate(observations, LIGHTS) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-4
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_a_teacher_without_sense_is_noticed() -> None:
+    """Held-out pixels show it: learning random normals by heart is no success."""
+    _, observations = glossy(3000)
+    random = cap_directions(3000, 80, seed=8)
+    teacher = Teacher(observations, random, np.tile(log_median(3), (3000, 1)))
+    assert not distil(teacher, observations, LIGHTS, SMALL).distillation.is_good
+
+
+def test_progress_counts_the_sample_twice_and_each_pixel_once() -> None:
+    normals, observations = glossy(3000)
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
+    learning: list[int] = []
+    found = distil(teacher, observations, LIGHTS, SMALL, progress=learning.append)
+    assert sum(learning) == pytest.approx(2 * found.distillation.sample, abs=2)
+    estimating: list[int] = []
+    found.estimate(observations, LIGHTS, progress=estimating.append)
+    assert sum(estimating) == 3000
+
+
+def test_its_map_is_refined_as_that_of_its_teacher() -> None:
+    normals, observations = glossy(3000)
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
+    assert refiner_of(distil(teacher, observations, LIGHTS, SMALL)) is None
+    teacher.refiner = refiner = object()  # type: ignore[attr-defined]
+    assert refiner_of(distil(teacher, observations, LIGHTS, SMALL)) is refiner
+
+
+def test_too_few_pixels() -> None:
+    normals, observations = glossy(50)
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (50, 1)))
+    with pytest.raises(UsageError, match="50 pixels are lit, too few to distil the network"):
+        distil(teacher, observations, LIGHTS, SIZE)
+
+
+def test_sizes_grow_with_the_capture() -> None:
+    assert pupil_sizes(100_000)[0] == PupilSize(sample=10_000, steps=1000, width=192)
+    assert pupil_sizes(1_600_000)[0].sample == 20_000
+    assert pupil_sizes(8_000)[0].sample == 2000
+    for n_pixels in (1000, 100_000, 24_000_000):
+        usual, larger = pupil_sizes(n_pixels)
+        assert usual.sample < larger.sample < n_pixels
+        assert usual.width < larger.width

@@ -1,0 +1,110 @@
+"""When a network is distilled, and what becomes of a capture that cannot be learned."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from conftest import cap_directions, spiral_lights
+from splinecli.capture import Capture
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.errors import UsageError
+from splinecli.methods import distilled, pupil_size
+from splinecli.methods.least_squares import LeastSquares
+from splinecli.methods.pupil_size import PupilSize
+from splinecli.pipeline import distillation
+from splinecli.pipeline.distillation import AUTOMATIC_FROM, distil_for
+
+LIGHTS = spiral_lights(6, 40)
+
+
+@dataclass
+class Teacher:
+    """Least squares with an error, or random normals, that takes its time."""
+
+    random: bool = False
+    seconds: float = 0.0
+    name: str = "taught"
+    weights: None = None
+    device: str = "cpu"
+    precision: str = "float32"
+    fingerprint: str = "taught"
+    tells_confidence: bool = True
+    asked: int = 0
+
+    def estimate(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
+
+    def estimate_with_error(self, observations: Any, light_directions: Any, *, progress: Any = None) -> Any:
+        self.asked += len(observations)
+        time.sleep(self.seconds)
+        errors = np.tile(np.float32((np.log(np.radians(3)), 0.7)), (len(observations), 1))
+        if self.random:
+            return cap_directions(len(observations), 80), errors
+        return LeastSquares().estimate(observations, light_directions), errors
+
+
+def capture(count: int, lamps: NearLamps | None = None) -> Capture:
+    observations: NDArray[Any] = cap_directions(count, 40) @ LIGHTS.T
+    return Capture("matte", observations, LIGHTS, tuple(range(6)), np.ones((1, count), bool), lamps=lamps)
+
+
+def test_small_captures_and_exact_ones_are_not_distilled() -> None:
+    teacher = Teacher()
+    assert distil_for(capture(3000), teacher, None) == (None, [])
+    assert distil_for(capture(AUTOMATIC_FROM), teacher, False) == (None, [])
+    assert teacher.asked == 0
+
+
+def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pupil_size, "pupil_sizes", lambda _: (PupilSize(750, 50, 16),) * 2)
+    teacher = Teacher()
+    found, warnings = distil_for(capture(3000), teacher, True)
+    assert found is not None
+    assert warnings == []
+    assert teacher.asked == found.distillation.sample == 750
+
+
+@pytest.mark.parametrize(("learning", "faster"), [(0.1, True), (1e9, False)])
+def test_large_captures_are_distilled_where_that_is_faster(
+    monkeypatch: pytest.MonkeyPatch, learning: float, faster: bool
+) -> None:
+    """The teacher takes at least 20 microseconds a pixel, so 2 seconds for all and 0.002 for the sample."""
+    monkeypatch.setattr(distilled, "seconds_of_learning", lambda *_: learning)
+    monkeypatch.setattr(pupil_size, "pupil_sizes", lambda _: (PupilSize(100, 20, 16),) * 2)
+    found, warnings = distil_for(capture(AUTOMATIC_FROM), Teacher(seconds=0.02), None)
+    assert (found is not None) == faster
+    assert warnings == []
+
+
+def test_learning_takes_time() -> None:
+    small = distilled.seconds_of_learning(LIGHTS, PupilSize(100, 20, 8), "cpu")
+    assert 0 < small < distilled.seconds_of_learning(LIGHTS, PupilSize(100, 2_000_000, 8), "cpu")
+
+
+def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = PupilSize(500, 50, 16), PupilSize(900, 50, 16)
+    monkeypatch.setattr(pupil_size, "pupil_sizes", lambda _: sizes)
+    teacher = Teacher(random=True)
+    found, (warning,) = distil_for(capture(3000), teacher, True)
+    assert found is None
+    assert warning.code == "not_distilled"
+    assert "where it expects errors of 2.9 degrees" in warning.text
+    assert teacher.asked == 500 + 900  # both sizes were tried
+
+
+def test_refused() -> None:
+    lamps = NearLamps.of(400 * LIGHTS, 1.0, (1, 3000), equal=True)
+    for few, estimator, problem in (
+        (capture(3000), LeastSquares(), "method ls gives no confidence and cannot be distilled"),
+        (capture(3000, lamps), Teacher(), "matte: captures under near lamps cannot be distilled"),
+        (capture(200), Teacher(), "matte: 200 pixels are too few to distil"),
+    ):
+        with pytest.raises(UsageError, match=problem):
+            distil_for(few, estimator, True)
+        assert distillation.distil_for(few, estimator, None) == (None, [])
