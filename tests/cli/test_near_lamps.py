@@ -117,12 +117,15 @@ def test_wrong_files_are_named(run, bump: Path) -> None:
     np.savetxt(bump / "light_positions.txt", POSITIONS)
     for name, text, message in (
         ("pixel_size.txt", "1 2\n", 'pixel_size.txt:1: found "1 2", expected one number above 0'),
+        ("pixel_size.txt", "# width\n0.9 mm\n", 'pixel_size.txt:2: found "0.9 mm", expected one number'),
         ("camera_matrix.txt", "1 2\n3 4\n", "camera_matrix.txt: found 2 x 2 numbers, expected 3 x 3"),
         (
             "light_positions.txt",
             "1 2 -3\n" * 7,
-            "light_positions.txt:1: found a light below the horizon",
+            "light_positions.txt:1: found a lamp behind the object",
         ),
+        ("light_positions.txt", "0 0 0\n" * 7, "found a zero vector, expected a lamp position"),
+        ("light_positions.txt", "1 2 3\n" * 5, "found 5 lamp positions, expected 7"),
     ):
         (bump / "pixel_size.txt").write_text("2\n")
         (bump / name).write_text(text)
@@ -186,6 +189,16 @@ def test_evaluate_and_prepare(run, bump: Path) -> None:
     refused = run("prepare", "bump", "-o", "set")
     assert refused.code == 3
     assert "near lamps, and training needs distant lights" in refused.err
+
+
+def test_positions_are_no_angles(run, bump: Path) -> None:
+    np.savetxt(bump / "light_positions.txt", POSITIONS)
+    (bump / "pixel_size.txt").write_text("2\n")
+    result = run("infer", "bump", "--method", "ls", "--lights-format", "azel")
+    assert result.code == 2
+    assert (
+        "--lights-format azel concerns light directions, but bump/light_positions.txt has pos" in result.err
+    )
 
 
 def test_albedo_and_saturation(run, bump: Path) -> None:

@@ -95,13 +95,22 @@ def test_info_lists_the_readings(run, medallion):
     assert good.code == 0
     rows = json.loads(good.out)["light_candidates"]
     assert rows[0]["reading"] == "as given"
-    assert rows[0]["rim"] > 0.99 and max(row["advantage"] for row in rows) == 0
-    assert len(rows) >= 8
+    assert rows[0]["rim"] > 0.99 and max(row["advantage"] or 0 for row in rows) == 0
+    assert len(rows) >= 12
+    orders = {row["reading"].split()[0]: row["misfit"] for row in rows if row["advantage"] is None}
+    assert set(orders) == {"if", "in", "with"}
+    assert min(orders.values()) > rows[0]["misfit"]
     write_lights(medallion, lambda lights: lights[:, [1, 0, 2]])
     wrong = run("info", medallion, "--strict", "--check-lights")
     assert wrong.code == 3
     assert "--light-frame exchanged" in wrong.err
     assert "x and y exchanged  " in wrong.out
+    assert "in reversed order, beginning with light" in wrong.out
+    assert "advantage: evidence from curl and outline" in wrong.out
+    assert (
+        "splinecli: medallion: an input is probably wrong (light_frame), as the warnings say"
+        in wrong.err.replace(str(medallion), "medallion")
+    )
 
 
 def test_unknown_frames_are_refused_before_anything_is_read(run, medallion):
@@ -134,7 +143,56 @@ def test_a_relief_without_outline_gets_both_mends(run, medallion):
     write_lights(medallion, lambda lights: lights * (1, -1, 1))
     err = run("info", medallion).err
     assert "--light-frame x-left or y-down." in err or "--light-frame y-down or x-left." in err
+    assert "with x negated or with y negated (" in err or "with y negated or with x negated (" in err
     assert "without a closed outline, only you can tell which is right" in err
+
+
+def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
+    usual = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "-o", "usual")
+    assert (usual.code, usual.err) == (0, "")
+    few = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "--strict", "--json")
+    assert few.code == 0
+    (warning,) = json.loads(few.out)[0]["warnings"]
+    assert warning["code"] == "lights_unchecked"
+    assert warning["text"].endswith("their order (fewer than 6 lights, or too few lit pixels).")
+    mask = np.zeros((128, 128), np.uint8)
+    mask[40:90, 40:90] = 255
+    cv2.imwrite(str(medallion / "mask.png"), mask)
+    write_lights(medallion, lambda lights: lights * (-1, -1, 1))
+    relief = run("info", medallion, "--strict")
+    assert relief.code == 0
+    assert (
+        "could not be checked of the lights of light_directions.txt: whether x and y are both" in relief.err
+    )
+
+
+def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):
+    def zenith_angles(lights):
+        azimuth = np.arctan2(lights[:, 1], lights[:, 0])
+        return np.degrees(np.stack((azimuth, np.arccos(lights[:, 2])), axis=1))
+
+    write_lights(medallion, zenith_angles)
+    result = run("info", medallion, "--lights-format", "azel", "--strict", "--json")
+    assert result.code == 3
+    assert json.loads(result.out)["warning_codes"] == ["light_frame"]
+    assert "much better if their elevations count from the camera axis (misfit" in result.err
+    assert "Replace each elevation by 90 degrees minus it." in result.err
+
+
+def test_a_file_of_all_intensities_fits_a_light_file_that_names_some_images(run, medallion):
+    lights = np.loadtxt(medallion / "light_directions.txt")
+    (medallion / "light_directions.txt").unlink()
+    intensities = medallion / "light_intensities.txt"
+    rows = intensities.read_text().splitlines()
+    chosen = [8, 0, 2, 3, 5, 6, 9]
+    text = "".join(f"{i + 1:02}.png {x} {y} {z}\n" for i in chosen for x, y, z in [lights[i]])
+    (medallion / "lights.txt").write_text(text)
+    normals = []
+    for content in (rows, [rows[i] for i in chosen]):
+        intensities.write_text("\n".join(content))
+        assert run("infer", medallion, "--method", "ls", "--overwrite").code == 0
+        normals.append(np.load("out/medallion/normals.npy"))
+    np.testing.assert_array_equal(*normals)
 
 
 def test_other_faults_of_captures(run, medallion):

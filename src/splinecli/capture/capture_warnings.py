@@ -44,6 +44,7 @@ LIGHTS_CROWDED = "lights_crowded"
 KEPT_LIGHTS = "kept_lights"
 LAMP_DISTANCE = "lamp_distance"
 LIGHTS_MATCHED = "lights_matched"
+LIGHTS_UNCHECKED = "lights_unchecked"
 LIGHT_FRAME = "light_frame"
 LIGHT_ORDER = "light_order"
 NEAR_LAMPS = "near_lamps"
@@ -243,12 +244,8 @@ def refined_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureW
     )
 
 
-def kept_lights() -> CaptureWarning:
-    return CaptureWarning(
-        KEPT_LIGHTS,
-        "The light directions were not refined: no others near them fit the images much better, or there are fewer"
-        " than 6 lights or too few pixels.",
-    )
+def kept_lights(reason: str) -> CaptureWarning:
+    return CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {reason}.")
 
 
 def few_lights(n_lights: int) -> CaptureWarning:

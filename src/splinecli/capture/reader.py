@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
@@ -17,7 +18,7 @@ from splinecli.capture.formats.orientation import UPRIGHT, common_orientation
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
-from splinecli.capture.lights.light_angles import LightForm
+from splinecli.capture.lights.light_angles import LightForm, RowForm
 from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.named_lights import NamedLights, read_lights
@@ -25,7 +26,7 @@ from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource, Progress
-from splinecli.errors import UsageError
+from splinecli.errors import InputError, UsageError
 
 EQUAL = "equal"
 """Given in place of a file of intensities: all lights have the same intensity."""
@@ -69,12 +70,17 @@ def open_capture(
     overrides = Overrides(*(None if file is None else Path(file) for file in named))
     if lamps.positions is not None and lights is not None:
         raise UsageError("--lights and --light-positions contradict each other", hint="Leave one out")
+    form: RowForm = lights_format
     near = find_lamps(Path(folder), overrides.lights, lamps)
     if near is not None and near.used and near.positions is not None:
-        # Positions are vectors, whatever form a light file has.
-        overrides, lights_format = replace(overrides, lights=near.positions), "xyz"
+        if lights_format != "xyz":
+            raise UsageError(
+                f"--lights-format {lights_format} concerns light directions, but {near.positions} has positions",
+                hint="Leave it out, or use --light-distance with a file of directions",
+            )
+        overrides, form = replace(overrides, lights=near.positions), "positions"
     files = find_capture_files(folder, overrides)
-    source = _read_lights(files, radiometry, light_frame, lights_format, near, equal=equal)
+    source = _read_lights(files, radiometry, light_frame, form, near, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     ambient = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     if radiometry.ambient is None and ambient is not None:
@@ -122,7 +128,7 @@ def _read_lights(
     files: CaptureFiles,
     radiometry: RadiometricCalibration,
     frame: LightFrame,
-    form: LightForm,
+    form: RowForm,
     lamps: LampFiles | None,
     *,
     equal: bool,
@@ -132,7 +138,7 @@ def _read_lights(
     Args:
         equal: whether all lights have the same intensity, whatever the files say.
     """
-    path = files.light_directions
+    path, in_folder = files.light_directions, files.images
     warnings: list[CaptureWarning] = []
     intensities = None
     named = read_lights(path, len(files.images), frame, form)
@@ -152,7 +158,7 @@ def _read_lights(
     if equal:
         intensities = None
     elif files.light_intensities is not None:
-        intensities = read_light_intensities(files.light_intensities, len(files.images))
+        intensities = _read_intensities(files.light_intensities, files.images, in_folder)
     near = lamps is not None and lamps.used
     # Geometry gives the intensities of near lamps that are equally strong.
     known = equal or near or intensities is not None
@@ -171,3 +177,15 @@ def _read_lights(
         light_frame=frame,
         lamps=lamps,
     )
+
+
+def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> NDArray[np.float64]:
+    """Return the intensities (F, 3) of images from a file with a line for each, or for each image of the folder."""
+    if len(images) < len(in_folder):
+        try:
+            intensities = read_light_intensities(path, len(in_folder))
+        except InputError:
+            pass  # the file is for the chosen images, or wrong in any case
+        else:
+            return intensities[[in_folder.index(image) for image in images]]
+    return read_light_intensities(path, len(images))

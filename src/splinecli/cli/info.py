@@ -69,8 +69,13 @@ def info(
         light_frame=light_frame,
         lights_format=lights_format.value,
         check_lights=check_lights,
+        strict=strict,
     )
-    report = describe_capture(options, Messages(quiet=quiet))
+    messages = Messages(quiet=quiet)
+    report = describe_capture(options, messages)
     print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)
-    wrong = strict and not PROBABLY_WRONG.isdisjoint(report["warning_codes"])
-    return InputError.exit_code if wrong else 0
+    wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
+    if strict and wrong:
+        messages.error(f"{capture}: an input is probably wrong ({', '.join(wrong)}), as the warnings say.")
+        return InputError.exit_code
+    return 0

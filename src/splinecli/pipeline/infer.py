@@ -67,7 +67,7 @@ def _infer_into(
     from splinecli.results.report import report_of
 
     source, capture, read_seconds = _read(folder, options, observer)
-    warnings = [*capture.warnings, *check_capture(source, capture)]
+    warnings = [*capture.warnings, *check_capture(source, capture, strict=options.strict)]
     refuse_if_strict(warnings, capture.name, strict=options.strict)
     if options.refine_lights:
         from splinecli.capture.restore.light_refinement import refine_capture

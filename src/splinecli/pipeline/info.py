@@ -57,6 +57,7 @@ class InfoOptions:
         plot: a PNG file that a plot of the lights is written to.
         overwrite: replace an earlier plot.
         check_lights: also list the readings of the light file that were compared.
+        strict: also warn of what could not be checked.
     """
 
     capture: Path
@@ -74,6 +75,7 @@ class InfoOptions:
     plot: Path | None = None
     overwrite: bool = False
     check_lights: bool = False
+    strict: bool = False
 
     def open(self) -> CaptureSource:
         """Open the capture under these options. Raises InputError, UsageError."""
@@ -120,7 +122,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         write_bytes(options.plot, sky_plot(source.light_directions, source.files.name))
     check, warnings = None, summary.warnings()
     if summary.sample is not None:
-        check, found = check_sample(source, summary.sample, range(source.n_lights))
+        check, found = check_sample(source, summary.sample, range(source.n_lights), strict=options.strict)
         warnings += found
     for warning in warnings:
         observer.warn(str(warning))
@@ -164,17 +166,22 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     """Return the table of readings of the light file; nothing if it was not asked for."""
-    if candidates is None:
+    if not candidates:
         return []
-    lines = [f"{'reading of the light file':48}{'misfit':>8}{'curl':>8}{'outline':>9}{'advantage':>11}"]
+    width = max(30, *(len(row["reading"]) + 2 for row in candidates))
+    lines = [f"{'reading of the light file':{width}}{'misfit':>8}{'curl':>8}{'outline':>9}{'advantage':>11}"]
     for row in candidates:
         misfit = "-" if row["misfit"] is None else f"{100 * row['misfit']:.0f} %"
         curl, rim, advantage = (
             "-" if row[key] is None else f"{row[key]:{form}}"
             for key, form in (("curl", ".2f"), ("rim", "+.2f"), ("advantage", "+.2f"))
         )
-        lines.append(f"{row['reading']:48}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
-    return lines
+        lines.append(f"{row['reading']:{width}}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
+    return [
+        *lines,
+        "misfit: what the reading leaves of the images, as a share of what random orders leave; it judges orders",
+        "advantage: evidence from curl and outline, against the file as given; from 1 on it gives a warning",
+    ]
 
 
 def _check_plot(plot: Path, source: CaptureSource, *, overwrite: bool) -> None:

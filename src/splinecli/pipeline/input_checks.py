@@ -22,23 +22,25 @@ SMALLEST_SPREAD = 0.1
 """Lights that determine normals worse than this carry a warning; see light_spread."""
 
 
-def check_capture(source: CaptureSource, capture: Capture) -> list[CaptureWarning]:
-    """Return warnings about a capture that was read from this source."""
+def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
+    """Return warnings about a capture that was read from this source; see check_sample."""
     from splinecli.capture.sample import sample_observations
 
     sample = sample_observations(capture.observations, capture.mask)
     if capture.estimated_intensities is not None:
         # They were estimated under the lights that are in question.
         sample = replace(sample, observations=sample.observations * capture.estimated_intensities)
-    return check_sample(source, sample, capture.light_indices)[1]
+    return check_sample(source, sample, capture.light_indices, strict=strict)[1]
 
 
 def check_sample(
-    source: CaptureSource, sample: Sample, indices: Sequence[int]
+    source: CaptureSource, sample: Sample, indices: Sequence[int], *, strict: bool = False
 ) -> tuple[LightCheck, list[CaptureWarning]]:
     """Return what a sample of the images with these indices says about the lights, and all warnings.
 
-    The observations are not divided by estimated intensities.
+    Args:
+        sample: its observations are not divided by estimated intensities.
+        strict: also warn of what the images do not tell.
     """
     from splinecli.capture import capture_warnings, image_checks
     from splinecli.capture.lights.light_advice import light_warnings
@@ -52,7 +54,8 @@ def check_sample(
         observations = _as_distant(source, sample, indices)
     factors = find_factors(observations, intensities_known=source.intensities_measured)
     check = check_lights(observations, sample.mask, source.light_directions, indices, names, factors)
-    warnings = light_warnings(check, source.light_frame, source.files.light_directions)
+    light_file = source.files.light_directions
+    warnings = light_warnings(check, source.light_frame, light_file, strict=strict)
     spread, in_cone = light_spread(lights)
     if spread < SMALLEST_SPREAD:
         warnings.append(capture_warnings.lights_crowded(max(spread, 1e-3), in_cone=in_cone))

@@ -29,9 +29,20 @@ def write(folder: Path, text: str, encoding: str = "utf-8") -> Path:
         ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
         ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
         ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
+        ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
+        ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
         ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
     ],
-    ids=["header", "utf-16", "decimal-commas", "commas-and-semicolons", "counted-from-1", "counted-from-0"],
+    ids=[
+        "header",
+        "utf-16",
+        "decimal-commas",
+        "commas-and-semicolons",
+        "counted-from-1",
+        "z-first",
+        "y-first",
+        "counted-from-0",
+    ],
 )
 def test_plain_files(tmp_path: Path, text: str, encoding: str) -> None:
     path = write(tmp_path, ("\ufeff" if encoding == "utf-16-le" else "") + text, encoding)
@@ -52,9 +63,10 @@ def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | No
     [
         "image,x,y,z\nimg10.png,-0.48,0.36,0.8\nimg2.png,0.6,0,0.8\nimg1.png,0,0,1\nimg3.png,0,-0.6,0.8",
         'C:\\shoot\\img3.PNG 0 -0,6 0,8\n"img2.png" 0,6 0 0,8\nimg1.png 0 0 1\nimg10.png -0,48 0,36 0,8',
+        "name z y x\nimg1 1 0 0\nimg2 0.8 0 0.6\nimg3 0.8 -0.6 0\nimg10 0.8 0.36 -0.48",
         "4\nimg1 0 0 1\nimg2 0.6 0 0.8\nimg3 0 -0.6 0.8\nimg10 -0.48 0.36 0.8",
     ],
-    ids=["csv", "paths", "stems"],
+    ids=["csv", "paths", "header", "stems"],
 )
 def test_rows_that_name_their_image(tmp_path: Path, text: str) -> None:
     lights = read_lights(write(tmp_path, text), 4)
@@ -110,10 +122,24 @@ def test_angles(tmp_path: Path, text: str | None) -> None:
     np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
 
 
-@pytest.mark.parametrize("text", ["0 90\n30 45\n120 45\n240 45", "1 0 90\n2 30 45\n3 120 45\n4 240 45"])
-def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match=r"angles, expected 3 columns.*add --lights-format azel"):
-        read_light_directions(write(tmp_path, text), 4)
+def test_the_header_of_angles_tells_their_order(tmp_path: Path) -> None:
+    text = "Elevation,Azimuth\n90,0\n53.130102,0\n53.130102,270\n53.130102,143.130102"
+    directions = read_light_directions(write(tmp_path, text), 4, form="azel")
+    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 90\n30 45\n120 45\n240 45", "2 columns of angles, expected 3 columns"),
+        ("1 0 90\n2 30 45\n3 120 45\n4 240 45", "a number and two angles, expected 3 columns"),
+        ("0 30 1\n90 40 1\n180 45 1\n270 30 1", "azimuth, elevation and 1, expected x y z.*Leave the third"),
+        ("a.png 0 30\nb.png 90 40\nc.png 180 45", "a name and 2 numbers"),
+    ],
+)
+def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"found {message}.*add --lights-format azel"):
+        read_lights(write(tmp_path, text), text.count("\n") + 1)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +147,8 @@ def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str) -> None:
     [
         ("30 45\n120 100\n240 45", r":2: found azimuth 120 and elevation 100, expected -360 to 360"),
         ("30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
-        ("0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians"),
+        ("0.5 0.7\n2.1 0.8\n4.2 0.9", "no angle is above 2 pi, so they look like radians.*57.2958"),
+        ("azimuth zenith\n30 45\n120 40\n240 45", r':1: found the column "zenith".*90 minus the angle'),
         ("0 0 1\n1 0 1\n0 1 1\n1 1 1", r"found 3 columns, expected 2 \(azimuth elevation\)"),
     ],
 )
@@ -131,5 +158,7 @@ def test_refused_angles(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_positions_of_lamps_are_no_angles(tmp_path: Path) -> None:
+    at_one_height = "300 40 500\n-300 20 500\n0 -90 500\n10 80 500"
+    assert len(read_light_directions(write(tmp_path, at_one_height))) == 4
     directions = read_light_directions(write(tmp_path, "300 400 1200\n-300 0 400\n0 900 1200\n1 2 2"))
     np.testing.assert_allclose(directions[1], (-0.6, 0, 0.8))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import read_number_rows
+from splinecli.capture.formats.text import is_number, read_lines, read_number_rows
 from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights, find_named
 from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
@@ -209,14 +209,19 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
 
 
 def _read_pixel_size(path: Path) -> float:
-    rows = read_number_rows(path, expected="a text file with one number")
-    if len(rows.rows) != 1 or len(rows.rows[0]) != 1 or rows.rows[0][0] <= 0:
+    lines = enumerate(read_lines(path, expected="a text file with one number"), start=1)
+    content = [(line, text.partition("#")[0].strip()) for line, text in lines]
+    content = [(line, text) for line, text in content if text] or [(1, "")]
+    line, text = content[0]
+    size = float(text) if is_number(text) else 0.0
+    if len(content) != 1 or not 0 < size < math.inf:
         raise InputError(
-            f'found "{rows.texts[0][:40]}", expected one number above 0, the width of a pixel',
+            f'found "{text[:40]}", expected one number above 0, the width of a pixel',
             path=path,
-            line=rows.lines[0],
+            line=line,
+            hint="Write the number alone; its unit is that of the lamps' positions",
         )
-    return rows.rows[0][0]
+    return size
 
 
 def _find(folders: list[Path], names: tuple[str, ...]) -> Path | None:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, CaptureWarning
+from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, LIGHTS_UNCHECKED, CaptureWarning
 from splinecli.capture.lights.light_check import Candidate, LightCheck
 from splinecli.capture.lights.light_frames import LightFrame
-from splinecli.capture.lights.light_order import UNKNOWN_ORDER
+from splinecli.capture.lights.light_order import UNKNOWN_ORDER, ZENITH
 
 BOTH_NEGATED = LightFrame((-1, -1, 1))
 
@@ -18,18 +18,25 @@ TOLD_APART = 0.5
 """Smallest difference of advantages that tells two frames apart."""
 
 
-def light_warnings(check: LightCheck, frame: LightFrame, light_file: Path) -> list[CaptureWarning]:
+def light_warnings(
+    check: LightCheck, frame: LightFrame, light_file: Path, *, strict: bool = False
+) -> list[CaptureWarning]:
     """Return the warnings about lights that were read in a frame.
 
     Args:
         frame: the frame in which the light file was read, which the advice replaces.
+        strict: also warn of what the images do not tell. It says nothing about most reliefs without an outline.
     """
     warnings = []
     if check.order is not None:
-        warnings.append(CaptureWarning(LIGHT_ORDER, _order_text(check, light_file)))
+        code = LIGHT_FRAME if check.order == ZENITH else LIGHT_ORDER
+        warnings.append(CaptureWarning(code, _order_text(check, light_file)))
     if check.best is not None:
         code = LIGHT_FRAME if check.best.frame is not None else LIGHT_ORDER
         warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file)))
+    if strict and check.unchecked:
+        text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
+        warnings.append(CaptureWarning(LIGHTS_UNCHECKED, text))
     return warnings
 
 
@@ -45,20 +52,31 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
     return (
         f"The images fit the lights of {light_file.name} much better {check.order}"
         f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against"
-        f" {100 * check.given_misfit:.0f} %). Check that its lines are in the order of the images."
+        f" {100 * check.given_misfit:.0f} %). {_remedy(check.order)}"
     )
 
 
+def _remedy(order: str | None) -> str:
+    if order == ZENITH:
+        return "Replace each elevation by 90 degrees minus it."
+    return "Check that its lines are in the order of the images."
+
+
 def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
-    figures = [f"curl {best.curl:.2f} against {check.given.curl:.2f}"]
-    if best.rim is not None and check.given.rim is not None:
-        figures.append(f"outline {best.rim:+.2f} against {check.given.rim:+.2f}")
+    pairs = (("curl", best.curl, check.given.curl, ".2f"), ("outline", best.rim, check.given.rim, "+.2f"))
+    figures = [
+        f"{name} {one:{form}} against {other:{form}}"
+        for name, one, other, form in pairs
+        if one is not None and other is not None and f"{one:{form}}" != f"{other:{form}}"
+    ]
+    twin = mirror_twin(check, best)
     words = best.name if best.frame is None else f"with {best.name}"
+    if twin is not None:
+        words += f" or with {twin.name}"
     text = f"The lights give normals that fit a surface much better {words} ({', '.join(figures)})"
     if best.frame is None:
         return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
     advice = f"{text}: run again with --light-frame {best.frame.after(frame)}."
-    twin = mirror_twin(check, best)
     if twin is not None and twin.frame is not None:
         return (
             f"{advice[:-1]} or {twin.frame.after(frame)}. They exchange hollows and bumps; without a closed outline,"
@@ -79,12 +97,20 @@ def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
-    """Return the compared readings of a light file as JSON values; figures that cannot be told are null."""
+    """Return the compared readings of a light file as JSON values; figures that cannot be told are null.
+
+    Frames come first, then orders, which are judged by their misfit alone.
+    """
     figures = ("misfit", "curl", "rim", "advantage")
-    return [
+    frames = [
         {"reading": candidate.name, **{name: _rounded(getattr(candidate, name)) for name in figures}}
         for candidate in check.candidates
     ]
+    orders = [
+        {"reading": words, **dict.fromkeys(figures), "misfit": _rounded(misfit)}
+        for words, misfit in check.tried
+    ]
+    return frames + orders
 
 
 def _rounded(value: float | None) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -13,8 +14,17 @@ from splinecli.errors import InputError
 LightForm = Literal["xyz", "azel"]
 """The numbers of a light: a vector, or azimuth and elevation in degrees."""
 
-COLUMNS = {"xyz": {3: "x y z"}, "azel": {2: "azimuth elevation"}}
+RowForm = LightForm | Literal["positions"]
+"""The numbers of a row in a file of lights or of near lamps."""
+
+COLUMNS: dict[RowForm, dict[int, str]] = {
+    "xyz": {3: "x y z"},
+    "azel": {2: "azimuth elevation"},
+    "positions": {3: "x y z"},
+}
 """The number of columns of each form, and their meaning."""
+
+_ZENITH = ("zen", "polar", "incl", "colat", "coelev")
 
 AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format azel"
 
@@ -46,14 +56,41 @@ def check_angles(table: NumberRows) -> None:
             "no angle is above 2 pi, so they look like radians, expected degrees",
             path=table.path,
             line=table.lines[0],
+            hint="Multiply them by 180 / pi = 57.2958",
         )
 
 
+def refuse_zenith(header: list[str], path: Path, line: int) -> None:
+    """Raise InputError for a header with an angle from the camera axis in place of the elevation."""
+    found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
+    if found is not None:
+        raise InputError(
+            f'found the column "{found[:40]}", expected azimuth and elevation',
+            path=path,
+            line=line,
+            hint="The elevation is 90 minus the angle from the camera axis",
+        )
+
+
+def zenith_as_elevation(light_directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lights (..., 3) whose angles from the camera axis are the elevations of these."""
+    level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
+    across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
+    return np.concatenate((across, level), axis=-1)
+
+
 def refuse_angles(table: NumberRows) -> None:
-    """Raise InputError for rows that are plainly angles: two columns, or a count and two columns."""
+    """Raise InputError for rows that are plainly angles: two columns, or with a count, or with one radius for all."""
     lengths = {len(row) for row in table.rows}
     numbered = lengths == {3} and counts_rows([row[0] for row in table.rows]) is not None
     largest = max((abs(value) for row in table.rows for value in row[-2:]), default=0)
+    if len(table.rows) > 3 and lengths == {3} and not numbered and _have_one_radius(table.rows):
+        raise InputError(
+            f"found azimuth, elevation and {table.rows[0][2]:g}, expected x y z",
+            path=table.path,
+            line=table.lines[0],
+            hint=f"Leave the third column out. {AZEL_HINT}",
+        )
     if len(table.rows) > 3 and largest > 2 and (lengths == {2} or numbered):
         found = "a number and two angles" if numbered else "2 columns of angles"
         raise InputError(
@@ -62,6 +99,13 @@ def refuse_angles(table: NumberRows) -> None:
             line=table.lines[0],
             hint=AZEL_HINT,
         )
+
+
+def _have_one_radius(rows: tuple[tuple[float, ...], ...]) -> bool:
+    """Return whether rows look like azimuth, elevation and the same radius; vectors around an object have y < 0."""
+    azimuth, elevation, radius = np.array(rows).T
+    all_in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
+    return bool(np.ptp(radius) == 0 and all_in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90)
 
 
 def counts_rows(column: list[float]) -> int | None:

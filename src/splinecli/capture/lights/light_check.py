@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from splinecli.capture.lights.frame_evidence import RoughNormals, rough_normals
 from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
-from splinecli.capture.lights.light_order import UNKNOWN_ORDER, check_order, shift_steps, shift_words
+from splinecli.capture.lights.light_order import (
+    MIN_LIGHTS,
+    UNKNOWN_ORDER,
+    check_order,
+    shift_steps,
+    shift_words,
+)
 
 Array = NDArray[np.float64]
 
@@ -71,6 +77,7 @@ class LightCheck:
         order: the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits.
         given_misfit, order_misfit: as in Candidate, of the given order and of the better one.
         best: the reading that gives better normals; None if there is none. Its frame is relative to the given one.
+        tried: readings of the order in words, each with its misfit.
         outline_counts: how much the normals at the mask's edge count, from 0 to 1.
     """
 
@@ -79,11 +86,28 @@ class LightCheck:
     given_misfit: float | None = None
     order_misfit: float | None = None
     best: Candidate | None = None
+    tried: tuple[tuple[str, float], ...] = ()
     outline_counts: float = 0.0
 
     @property
     def given(self) -> Candidate:
         return self.candidates[0]
+
+    @property
+    def unchecked(self) -> list[str]:
+        """What the images do not tell about the lights, in words."""
+        missing = []
+        if self.given_misfit is None:
+            missing.append(f"their order (fewer than {MIN_LIGHTS} lights, or too few lit pixels)")
+        if self.order == UNKNOWN_ORDER or self.best is not None:
+            return missing
+        if not np.isfinite(self.given.curl):
+            missing.append("their frame (too few pixels)")
+        elif 2 * RIM_WEIGHT * self.outline_counts * abs(self.given.rim or 0) < 1:
+            missing.append(
+                "whether x and y are both negated (the mask's edge is no clear outline of the object)"
+            )
+        return missing
 
 
 def check_lights(
@@ -127,7 +151,7 @@ def check_lights(
     order = found.order
     if order is not None and best is not None and best.frame is None:
         order, best = best.name, None  # one of several orders that fit, told by the normals
-    return LightCheck((first, *ranked), order, found.given_misfit, found.misfit, best, weight)
+    return LightCheck((first, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight)
 
 
 def light_spread(light_directions: Array) -> tuple[float, bool]:

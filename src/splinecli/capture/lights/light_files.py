@@ -22,7 +22,7 @@ from splinecli.capture.formats.text import (
 )
 from splinecli.capture.lights.light_angles import (
     COLUMNS,
-    LightForm,
+    RowForm,
     check_angles,
     counts_rows,
     directions_from_angles,
@@ -39,20 +39,20 @@ _FILE = "a text file with a line {} for each image"
 
 
 def read_light_directions(
-    path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: LightForm = "xyz"
+    path: StrPath, n_images: int | None = None, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) float64 from a text file or an .npy file, in the order of the file.
 
-    A row is x y z, separated by spaces, tabs, commas or semicolons. A header, and a first line with only the number of
-    lights, are accepted (the University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox);
-    3 x 3 is read as rows. A first column that counts the rows, from 0 or 1, gives their order. Vectors may have any
-    length above zero.
+    A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the columns in another
+    order, and a first line with only the number of lights, are accepted (the University of Washington's lights.txt). If
+    N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is read as rows. A first column that counts the rows, from 0 or 1,
+    gives their order. Vectors may have any length above zero.
 
     Args:
         path: the file.
         n_images: the number of lights that is expected, if it is known.
         frame: the frame of the file.
-        form: whether a row is a vector or two angles.
+        form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
         InputError: with the line, for a wrong number of columns, a word that is no finite number, a zero
@@ -68,7 +68,7 @@ def read_light_directions(
 
 
 def directions_of(
-    table: NumberRows, n_images: int | None, frame: LightFrame, form: LightForm
+    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
 ) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
     table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
@@ -77,13 +77,16 @@ def directions_of(
         check_angles(table)
         vectors = directions_from_angles(vectors)
     else:
-        refuse_angles(table)
-        vectors, transposed = _one_light_a_row(table, COLUMNS[form], "light directions", n_images)
+        if form == "xyz":
+            refuse_angles(table)
+        what = "lamp positions" if form == "positions" else "light directions"
+        vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
     return unit_directions(
         vectors @ frame.matrix.T + 0.0,  # no -0
         table.path,
         [table.lines[2 if transposed else light] for light in range(len(vectors))],
         [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))],
+        of_lamps=form == "positions",
     )
 
 
@@ -96,7 +99,7 @@ def read_light_positions(
         InputError: as read_light_directions, which checks the same numbers as directions from the origin; also for
             rows that name their images.
     """
-    read_light_directions(path, n_images, frame)
+    read_light_directions(path, n_images, frame, "positions")
     rows = read_light_rows(Path(path), expected=_FILE.format("x y z"), n_numbers=3)
     if rows.names is not None:
         raise InputError(
@@ -115,6 +118,8 @@ def unit_directions(
     path: Path,
     lines: Sequence[int | None],
     places: Sequence[str],
+    *,
+    of_lamps: bool = False,
 ) -> NDArray[np.float64]:
     """Return vectors (F, 3) at unit length.
 
@@ -123,6 +128,7 @@ def unit_directions(
         path: the file, for messages.
         lines: the line of each vector in the file.
         places: words for the place of each vector on its line.
+        of_lamps: whether the vectors are positions of lamps, for messages.
 
     Raises:
         InputError: a zero vector, or a light that is not above the horizon.
@@ -135,14 +141,15 @@ def unit_directions(
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
             raise InputError(
-                f"found a zero vector{place}, expected a light direction",
+                f"found a zero vector{place}, expected a {'lamp position' if of_lamps else 'light direction'}",
                 path=path,
                 line=line,
                 hint="Write x y z towards the light, or remove the line and its image",
             )
         if z <= 0:
             raise InputError(
-                f"found a light below the horizon{place} (z = {vector[2]:g}), expected z > 0",
+                f"found a {'lamp behind the object' if of_lamps else 'light below the horizon'}{place}"
+                f" (z = {vector[2]:g}), expected z > 0",
                 path=path,
                 line=line,
                 hint="z points away from the camera in this file: add --light-frame z-away"

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.lights.light_angles import zenith_as_elevation
 from splinecli.capture.lights.light_fit import (
     Factors,
     fit_residual,
@@ -47,6 +48,9 @@ could explain: highlights and shadows."""
 UNKNOWN_ORDER = "unknown"
 """The order of the lights does not fit, and no simple other one does."""
 
+ZENITH = "if their elevations count from the camera axis"
+"""The reading of lights whose file has zenith angles in place of elevations, in words."""
+
 RANDOM_FIT = 0.85
 """Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
 
@@ -63,6 +67,7 @@ class LightOrder:
         intensities: (F,), those that fit these lights best; ones where they are known.
         given_misfit, misfit: of the given order and of this one, as shares of random orders'; None where there are too
             few lights.
+        tried: readings in words, each with its misfit as a share of random orders'.
         turns: rows of shifted_orders that fit as well, with the matrices (3, 3) that take the lights there. They turn a
             regular ring of lights.
     """
@@ -72,6 +77,7 @@ class LightOrder:
     intensities: Array
     given_misfit: float | None = None
     misfit: float | None = None
+    tried: tuple[tuple[str, float], ...] = ()
     turns: tuple[tuple[int, Array], ...] = ()
 
 
@@ -94,29 +100,40 @@ def check_order(
     if factors is None or len(lights) < MIN_LIGHTS:
         return LightOrder(None, lights, np.ones(len(lights)))
 
-    def found(
-        order: str | None, lights: Array, misfit: float, turns: tuple[tuple[int, Array], ...] = ()
-    ) -> LightOrder:
-        return LightOrder(order, lights, factors.intensities(lights[None])[0], share, misfit / usual, turns)
-
     random = random_misfits(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
     given = float(factors.misfits(lights[None])[0])
     share, limit = given / usual, given * (BETTER_ORDER if len(lights) > FEW else BETTER_ORDER_OF_FEW)
     shifted = light_directions[shifted_orders(n_all)[:, chosen]]
     shift_misfits = factors.misfits(shifted)
-    best = int(shift_misfits.argmin())
-    if share > MIN_MISFIT and shift_misfits[best] < limit:
-        mended = float(shift_misfits[best])
-        turns = _turns(shifted[best], shifted, shift_misfits <= max(1.3 * mended, 0.05 * usual))
-        return found(shift_words(best, n_all), shifted[best], mended, turns)
     swaps = swapped_orders(len(lights))
     swap_misfits = factors.misfits(lights[swaps])
-    best = int(swap_misfits.argmin())
-    if share > MIN_SWAP_MISFIT and swap_misfits[best] < limit:
-        one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
-        words = f"with those of {one} and {other} exchanged"
-        return found(words, lights[swaps[best]], float(swap_misfits[best]))
+    swap = int(swap_misfits.argmin())
+    one, other = (names[int(i)] for i in np.flatnonzero(swaps[swap] != np.arange(len(lights))))
+    zenith = zenith_as_elevation(lights)
+    # The best shift, the best shift of the reversed order, the best exchange, and angles from the camera axis.
+    forward, backward = 1 + int(shift_misfits[1:n_all].argmin()), n_all + int(shift_misfits[n_all:].argmin())
+    candidates = (
+        (shift_words(forward, n_all), shifted[forward], float(shift_misfits[forward])),
+        (shift_words(backward, n_all), shifted[backward], float(shift_misfits[backward])),
+        (f"with those of {one} and {other} exchanged", lights[swaps[swap]], float(swap_misfits[swap])),
+        (ZENITH, zenith, float(factors.misfits(zenith[None])[0])),
+    )
+    tried = tuple((words, misfit / usual) for words, _, misfit in candidates)
+
+    def found(
+        order: str | None, lights: Array, misfit: float, turns: tuple[tuple[int, Array], ...] = ()
+    ) -> LightOrder:
+        intensities = factors.intensities(lights[None])[0]
+        return LightOrder(order, lights, intensities, share, misfit / usual, tried, turns)
+
+    *of_all, exchanged, of_angles = candidates
+    words, better, mended = min((*of_all, of_angles), key=lambda candidate: candidate[2])
+    if share > MIN_MISFIT and mended < limit:
+        fits = shift_misfits <= max(1.3 * mended, 0.05 * usual)
+        return found(words, better, mended, () if words == ZENITH else _turns(better, shifted, fits))
+    if share > MIN_SWAP_MISFIT and exchanged[2] < limit:
+        return found(*exchanged)
     judged = factors.residual < MAX_RESIDUAL
     by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
     suspected = by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)

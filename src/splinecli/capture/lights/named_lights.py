@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_angles import COLUMNS, LightForm
+from splinecli.capture.lights.light_angles import COLUMNS, RowForm
 from splinecli.capture.lights.light_files import NPY, directions_of, read_light_directions, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import image_name, read_light_rows
@@ -86,7 +86,7 @@ class NamedLights:
 
 
 def read_lights(
-    path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: LightForm = "xyz"
+    path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> NamedLights | Array:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 

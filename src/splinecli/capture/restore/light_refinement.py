@@ -96,7 +96,9 @@ def refine_capture(
         intensities_known=intensities_known,
     )
     if found is None:
-        return replace(capture, warnings=(*capture.warnings, capture_warnings.kept_lights()))
+        return replace(
+            capture, warnings=(*capture.warnings, capture_warnings.kept_lights(_why_kept(capture)))
+        )
     intensities = capture.estimated_intensities
     if not intensities_known:
         intensities = found.intensities if intensities is None else intensities * found.intensities
@@ -109,6 +111,14 @@ def refine_capture(
         estimated_intensities=intensities,
         warnings=(*capture.warnings, warning),
     )
+
+
+def _why_kept(capture: Capture) -> str:
+    if capture.n_lights < MIN_LIGHTS:
+        return f"there are fewer than {MIN_LIGHTS} lights"
+    if _choose_pixels(capture.observations) is None:
+        return f"there are fewer than {_MIN_PIXELS} lit pixels"
+    return "no others near them fit the images much better"
 
 
 def check_light_error(error_deg: float, *, needs_option: bool = False) -> None:
