@@ -10,21 +10,22 @@ from torch.nn.functional import interpolate, max_pool2d, normalize, pad
 
 from splinecli.networks.refine_features import CHANNELS, split_features
 
-WIDTHS = (32, 64, 96)
-"""Channels at the full, the half and the quarter resolution."""
+WIDTHS = (32, 64, 96, 64)
+"""Channels at the full resolution, and at a half, a quarter and an eighth of it."""
 
-BLOCKS = (1, 2, 3)
-"""Residual blocks of each scale on the way down; the two finer scales have one more on the way up."""
+ENCODING_BLOCKS = (1, 2, 3, 2)
+DECODING_BLOCKS = (1, 1, 0)
+"""Residual blocks of each scale on the way down, and on the way up."""
 
 COARSEST = 2 ** (len(WIDTHS) - 1)
 """Side of the coarsest scale's pixels. The origins of tiles are multiples of it."""
 
-REACH = 48
+REACH = 88
 """No pixel further away than this changes a result."""
 
 
 class RefineNet(nn.Module):
-    """An encoder-decoder of three scales with residual blocks. It has no norm and starts as the identity.
+    """An encoder-decoder of four scales with residual blocks. It has no norm and starts as the identity.
 
     After each layer, everything outside the mask is zero. A pixel outside the mask is therefore the same as one outside
     of the image, so tiles with an overlap of REACH give the same as the whole image.
@@ -37,9 +38,12 @@ class RefineNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
             nn.ModuleList(_MaskedBlock(width) for _ in range(count))
-            for width, count in zip(WIDTHS, BLOCKS, strict=True)
+            for width, count in zip(WIDTHS, ENCODING_BLOCKS, strict=True)
         )
-        self.decode = nn.ModuleList(_MaskedBlock(width) for width in WIDTHS[:-1])
+        self.decode = nn.ModuleList(
+            nn.ModuleList(_MaskedBlock(width) for _ in range(count))
+            for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
+        )
         self.out = nn.Conv2d(WIDTHS[0], 5, 3, padding=1)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
@@ -67,7 +71,9 @@ class RefineNet(nn.Module):
                 x = block(x, masks[scale])
         for scale in reversed(range(len(passed))):
             x = passed[scale] + interpolate(self.up[scale](x), scale_factor=2, mode="nearest")
-            x = self.decode[scale](x * masks[scale], masks[scale])
+            x = x * masks[scale]
+            for block in self.decode[scale]:  # type: ignore[attr-defined]
+                x = block(x, masks[scale])
         change = self.out(torch.relu(x))[..., :height, :width].float()
         normals, error = split_features(features.float())
         return normalize(normals + change[:, :3], dim=1) * mask, (error + change[:, 3:]) * mask
