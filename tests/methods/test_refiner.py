@@ -62,7 +62,7 @@ def test_tiles_change_nothing() -> None:
     _, normals, errors = refine(mask, 512)
     _, tiled, tiled_errors = refine(mask, 32)
     np.testing.assert_allclose(tiled, normals, atol=1e-4)
-    np.testing.assert_allclose(tiled_errors, errors, rtol=1e-4)
+    np.testing.assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
 
 

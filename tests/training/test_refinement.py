@@ -1,0 +1,157 @@
+"""Whole scenes as captures, and the training of the refinement net on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splinecli.errors import UsageError
+from splinecli.networks.refine_features import CHANNELS
+from splinecli.networks.spline_net import SplineNet
+from splinecli.networks.weights import load_weights
+from splinecli.pixel_sets.store import Pixels, PixelSet
+from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.synthesis.batches import CaptureConfig
+from splinecli.synthesis.whole_capture import photograph_scene
+from splinecli.training import tasks
+from splinecli.training.config import TrainingConfig
+from splinecli.training.defaults import WEIGHTS
+from splinecli.training.loop import Trainer
+from splinecli.training.refinement import ScenePool, refinement_losses, stack_maps
+
+CPU = torch.device("cpu")
+FLAWLESS = CaptureConfig(
+    light_direction_error_share=0.0,
+    light_intensity_error_share=0.0,
+    unequal_lights_share=0.0,
+    saturated_share=0.0,
+    sensor_noise=False,
+)
+
+
+def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    directions = torch.randn(lights, 3, generator=generator).abs()
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    return torch.rand(pixels, lights, generator=generator), directions
+
+
+def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
+    radiance, directions = scene()
+    observations, calibrated = photograph_scene(
+        radiance, directions, FLAWLESS, torch.Generator().manual_seed(0)
+    )
+    exposure = (observations / radiance)[radiance < 0.9].unique()
+    assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
+    torch.testing.assert_close(exposure, exposure[0].expand(len(exposure)))
+    torch.testing.assert_close(calibrated, directions)
+
+
+def test_errors_of_calibration_are_those_of_the_capture() -> None:
+    """Every pixel has the same factor under one light."""
+    radiance, directions = scene()
+    config = replace(FLAWLESS, light_intensity_error_share=1.0, unequal_lights_share=1.0)
+    observations, _ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(1))
+    factors = torch.where(radiance < 0.9, observations / radiance, torch.nan)
+    spread = factors.nan_to_num(0).amax(0) - factors.nan_to_num(9).amin(0)
+    assert spread.max() < 1e-5
+    assert factors.nanmean(0).std() > 1e-3
+
+
+def test_saturated_captures_are_restored() -> None:
+    """A matte scene whose brightest observations are clipped comes out as it was, apart from the exposure."""
+    generator = torch.Generator().manual_seed(5)
+    _, directions = scene(lights=12)
+    normals = torch.nn.functional.normalize(torch.rand(400, 3, generator=generator) + 0.3, dim=1)
+    radiance = normals @ directions.T * torch.rand(400, 1, generator=generator)
+    config = replace(FLAWLESS, saturated_share=1.0)
+    observations, _ = photograph_scene(radiance, directions, config, torch.Generator().manual_seed(2))
+    assert observations.max() > 1.02
+    ratio = observations / radiance
+    assert ratio.std() < 0.03 * ratio.mean()
+
+
+@pytest.fixture
+def bumpy_set(tmp_path: Path) -> PixelSet:
+    """Two matte scenes of 14 x 14 pixels, a smooth normal each, whose pixels are disturbed one by one."""
+    writer = PixelSetWriter(tmp_path / "bumpy")
+    for index in range(2):
+        rng = np.random.default_rng(index)
+        lights = rng.normal((0, 0, 2), 1, (9, 3))
+        lights[:, 2] = np.abs(lights[:, 2]) + 0.5
+        lights = (lights / np.linalg.norm(lights, axis=1, keepdims=True)).astype(np.float32)
+        normals = np.tile(np.float32((0.28 * index, 0, 0.96)), (196, 1))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        observations = (normals @ lights.T).clip(0) * rng.uniform(0.5, 1.5, (196, 9))
+        mask = np.ones((14, 14), np.bool_)
+        writer.add(
+            f"s{index}",
+            f"s{index}",
+            "a test",
+            {},
+            Pixels(observations.astype(np.float32), normals, lights, mask),
+        )
+    return writer.finish()
+
+
+@pytest.fixture
+def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch) -> TrainingConfig:
+    for name, value in (("FIRST_EXAMPLES", 3), ("VALIDATION_SCENES", 2)):
+        monkeypatch.setattr(tasks, name, value)
+    return replace(
+        tiny,
+        network=replace(tiny.network, error_head=True, refines=True),
+        sources={str(bumpy_set.folder): 1.0},
+        updates="refine_net",
+        batch_size=2,
+        shards=1,
+        steps=25,
+        learning_rate=3e-3,
+        warmup_steps=0,
+        average_decay=0.0,
+    )
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
+    refining: TrainingConfig, tmp_path: Path
+) -> None:
+    trainer = Trainer(refining, tmp_path / "run", CPU)
+    before = {name: tensor.clone() for name, tensor in trainer.network.state_dict().items()}
+    first_deg = trainer.task.validation_deg(trainer.average, bfloat16=False)
+    metrics = trainer.run()
+    assert metrics is not None and metrics.validation_deg is not None
+    assert metrics.validation_deg < 0.7 * first_deg
+    after = load_weights(tmp_path / "run" / WEIGHTS).network.state_dict()
+    changed = {name for name in before if not torch.equal(after[name].half(), before[name].half())}
+    assert changed and all(name.startswith("refine_net.") for name in changed)
+
+
+def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
+    torch.manual_seed(0)
+    network = SplineNet(refining.network)
+    scenes = [(bumpy_set, entry) for entry in bumpy_set.entries]
+
+    def pool(seed: int) -> ScenePool:
+        made = ScenePool(scenes, network, refining.pixels, seed)
+        made.add()
+        return made
+
+    one, again, other = pool(1).examples[0], pool(1).examples[0], pool(2).examples[0]
+    assert one.features.shape == (CHANNELS, 14, 14)
+    assert torch.equal(one.features, again.features)
+    assert not torch.equal(one.features, other.features)
+    drawn = pool(1).draw(3, torch.Generator().manual_seed(0))
+    # A turn changes no angle between estimate and truth, and so no loss before refinement.
+    assert drawn.normals.shape == (3, 3, 14, 14)
+    straight = refinement_losses(network, stack_maps([one])).before
+    torch.testing.assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
+
+
+def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="rendered scenes"):
+        Trainer(replace(refining, sources={"generator": 1.0}), tmp_path, CPU)
