@@ -109,8 +109,8 @@ def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.Monk
         updates="refine_net",
         batch_size=2,
         shards=1,
-        steps=25,
-        learning_rate=3e-3,
+        steps=60,
+        learning_rate=1e-3,
         warmup_steps=0,
         average_decay=0.0,
     )
@@ -134,7 +134,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
 def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
     torch.manual_seed(0)
     network = SplineNet(refining.network)
-    scenes = [(bumpy_set, entry) for entry in bumpy_set.entries]
+    scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
 
     def pool(seed: int) -> ScenePool:
         made = ScenePool(scenes, network, refining.pixels, seed)

@@ -20,6 +20,8 @@ from splinecli.synthesis.faults import (
 _BRIGHT_SHARE = 1e-3
 """Share of the observations that may be brighter than the one from which the exposure is chosen."""
 
+_GRAINY_SHARE = 2 / 3
+
 _MOST_SATURATED = 0.03
 """Largest share of clipped observations in an overexposed capture."""
 
@@ -31,7 +33,9 @@ def photograph_scene(
 
     The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
     places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 %
-    of the observations are clipped, and restored as `infer` does.
+    of the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also
+    have a grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where
+    images are shifted by a part of a pixel or light arrives from neighbours.
 
     Args:
         radiance: (P, F).
@@ -52,6 +56,8 @@ def photograph_scene(
     exposed = (arriving * ((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)).clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
+        grain = 10 ** uniform(-2.5, -1.2) * (uniform() < _GRAINY_SHARE)
+        exposed = exposed * (1 + grain * torch.randn(exposed.shape, generator=generator)).clamp(min=0)
         row = add_sensor_noise(exposed.reshape(1, -1), generator)
         exposed = quantise(row, config.eight_bit_share, generator).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)

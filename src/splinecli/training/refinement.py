@@ -30,7 +30,11 @@ MOST_EXAMPLES = 2000
 """More replace the oldest ones. One takes about a megabyte."""
 
 CROP = 128
-"""Side of the part of a larger map that a step sees."""
+"""Side of the part of a larger map that an example has."""
+
+_ENLARGED_SHARE = 0.6
+_MOST_ENLARGED = 3.0
+"""A share of the captures is enlarged, by a factor from 1 to this one."""
 
 ERROR_WEIGHT = 0.05
 """Weight of the likelihood of the errors beside the angle in radians."""
@@ -66,7 +70,7 @@ class ScenePool:
     A capture depends only on (seed, its number). A run that continues begins with new captures.
 
     Args:
-        scenes: entries of pixel sets.
+        scenes: pixel sets with some of their entries, and the weight of each set.
         network: a SPLINE-Net with an error head, on the device of the captures.
         config: number of lights and the faults of a capture.
         seed: seed of all captures.
@@ -74,7 +78,7 @@ class ScenePool:
 
     def __init__(
         self,
-        scenes: Sequence[tuple[PixelSet, Entry]],
+        scenes: Sequence[tuple[PixelSet, Sequence[Entry], float]],
         network: SplineNet,
         config: CaptureConfig,
         seed: int,
@@ -90,7 +94,9 @@ class ScenePool:
         """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
         seeds = np.random.SeedSequence((self.seed, self._made)).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(seeds[0] >> np.uint64(1)))
-        pixel_set, entry = self.scenes[int(torch.randint(len(self.scenes), (), generator=generator))]
+        weights = torch.tensor([weight for _, _, weight in self.scenes])
+        pixel_set, entries, _ = self.scenes[int(torch.multinomial(weights, 1, generator=generator))]
+        entry = entries[int(torch.randint(len(entries), (), generator=generator))]
         example = _photograph(pixel_set, entry, self.network, self.config, generator)
         if len(self.examples) < MOST_EXAMPLES:
             self.examples.append(example)
@@ -99,7 +105,7 @@ class ScenePool:
         self._made += 1
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
-        """Draw `count` captures, turn, mirror and crop each, and stack them as float32 (count, ...)."""
+        """Draw `count` captures, turn and mirror each, and stack them as float32 (count, ...)."""
         drawn = [
             _turned(self.examples[int(index)], generator)
             for index in torch.randint(
@@ -121,20 +127,54 @@ def _photograph(
     most = min(config.max_lights, entry.n_lights)
     counts = draw_light_counts(1, config.min_lights, most, min(config.usual_lights, most), generator)
     chosen = choose_in_cone(lights, int(counts), generator)
-    radiance = torch.from_numpy(np.asarray(pixels.observations[:, chosen.numpy()], np.float32))
+    mask = torch.from_numpy(np.array(pixels.mask))
+    scale = 1 + (_MOST_ENLARGED - 1) * float(torch.rand((), generator=generator))
+    scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
+    box = _draw_box(mask, round(CROP / scale), generator)
+    kept = torch.zeros_like(mask)
+    kept[box] = mask[box]
+    rows = kept[mask].numpy()
+    values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(
+        np.float32
+    )
+    maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
+    radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
     observations, lights = photograph_scene(radiance, lights[chosen], config, generator)
     features = pixel_features(network, observations, lights)
-    mask = torch.from_numpy(np.array(pixels.mask))
-    rows, columns = (torch.nonzero(mask.any(dim=axis)).flatten() for axis in (1, 0))
-    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
-    def placed(values: Tensor) -> Tensor:
-        maps = torch.zeros(values.shape[1], *mask.shape, dtype=torch.float16)
-        maps[:, mask] = values.T.half().cpu()
-        return maps[:, *box].clone()
 
-    truth = torch.from_numpy(np.array(pixels.normals))
-    return SceneMaps(placed(features), placed(truth), mask[None, *box].clone())
+def _placed(values: Tensor, mask: Tensor) -> Tensor:
+    """Return maps (C, H, W) of the values (P, C) of a mask's pixels."""
+    maps = torch.zeros(values.shape[1], *mask.shape)
+    maps[:, mask] = values.T.cpu()
+    return maps
+
+
+def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """Return maps (C, H, W) and their mask, enlarged by bilinear interpolation between pixels of the mask.
+
+    A scene is rendered at few pixels, so its surface bends much from one to the next. A photograph of a real object
+    has more pixels, and its neighbours are more alike.
+    """
+    if scale == 1:
+        return maps, mask
+    weighed = torch.cat((maps * mask, mask[None].float()))
+    found = torch.nn.functional.interpolate(weighed[None], scale_factor=scale, mode="bilinear")[0]
+    return found[:-1] / found[-1:].clamp(min=0.5), found[-1] > 0.5
+
+
+def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slice, slice]:
+    """Return a part of a map, `side` pixels a side at most, around a random pixel of the object."""
+    places = mask.nonzero()
+    middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
+    lowest, highest = places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist()
+    starts = [
+        max(low, min(at - side // 2, high - side))
+        for at, low, high in zip(middle, lowest, highest, strict=True)
+    ]
+    top, left = (slice(start, min(start + side, high)) for start, high in zip(starts, highest, strict=True))
+    return top, left
 
 
 @torch.no_grad()
@@ -167,13 +207,10 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
 
 
 def _turned(example: SceneMaps, generator: torch.Generator) -> SceneMaps:
-    draw = torch.rand(4, generator=generator, device=generator.device).tolist()
-    height, width = example.mask.shape[-2:]
-    top, left = int(draw[0] * max(height - CROP + 1, 1)), int(draw[1] * max(width - CROP + 1, 1))
-    box = slice(top, top + CROP), slice(left, left + CROP)
-    quarters, mirror = int(4 * draw[2]), draw[3] < 0.5
-    features, normals = turn_features(example.features[:, *box], example.normals[:, *box], quarters, mirror)
-    mask = example.mask[:, *box]
+    draw = torch.rand(2, generator=generator, device=generator.device).tolist()
+    quarters, mirror = int(4 * draw[0]), draw[1] < 0.5
+    features, normals = turn_features(example.features, example.normals, quarters, mirror)
+    mask = example.mask
     mask = (mask.flip(-1) if mirror else mask).rot90(quarters, (-2, -1))
     return SceneMaps(features, normals, mask)
 

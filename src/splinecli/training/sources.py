@@ -124,16 +124,19 @@ def open_sources(
 
 @dataclass(frozen=True)
 class Scenes:
-    """The rendered scenes of a run that trains the refinement net; see Sources for `sets` and `single_scene_sets`."""
+    """The pixel sets for the refinement net: of each its scenes for training or validation, and its weight.
 
-    training: tuple[tuple[PixelSet, Entry], ...]
-    validation: tuple[tuple[PixelSet, Entry], ...]
+    See Sources for `sets` and `single_scene_sets`.
+    """
+
+    training: tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]
+    validation: tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]
     sets: dict[str, str]
     single_scene_sets: tuple[str, ...]
 
 
 def open_scenes(config: TrainingConfig) -> Scenes:
-    """Open the pixel sets of a configuration as whole scenes. Each scene is equally likely, whatever its set's weight.
+    """Open the pixel sets of a configuration as whole scenes.
 
     Raises:
         UsageError: there are no pixel sets, or the generator is among the sources.
@@ -147,11 +150,10 @@ def open_scenes(config: TrainingConfig) -> Scenes:
     sets = {name: open_pixel_set(Path(name)) for name, weight in config.sources.items() if weight > 0}
     parts = _split_sets(sets, config.held_share)
 
-    def together(validate: bool) -> tuple[tuple[PixelSet, Entry], ...]:
+    def together(validate: bool) -> tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]:
         return tuple(
-            (sets[name], entry)
+            (sets[name], tuple(validation or training if validate else training), config.sources[name])
             for name, (training, validation) in parts.items()
-            for entry in (validation or training if validate else training)
         )
 
     return Scenes(
