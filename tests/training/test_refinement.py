@@ -17,7 +17,7 @@ from splinecli.pixel_sets.store import Pixels, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.whole_capture import photograph_scene
-from splinecli.training import tasks
+from splinecli.training import refinement, tasks
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import WEIGHTS
 from splinecli.training.loop import Trainer
@@ -131,7 +131,10 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
     assert changed and all(name.startswith("refine_net.") for name in changed)
 
 
-def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
+def test_captures_of_a_pool(
+    refining: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refinement, "_ENLARGED_SHARE", 0.0)
     torch.manual_seed(0)
     network = SplineNet(refining.network)
     scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
@@ -150,6 +153,20 @@ def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> No
     assert drawn.normals.shape == (3, 3, 14, 14)
     straight = refinement_losses(network, stack_maps([one])).before
     torch.testing.assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
+
+
+def test_enlarged_maps_mix_nothing_from_outside_of_the_mask() -> None:
+    """Each half of the object has a value of its own; everything outside is far off."""
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[4:16, 5:25] = True
+    maps = torch.full((1, 20, 30), 1000.0)
+    maps[0, :, :15], maps[0, :, 15:] = 2.0, 5.0
+    enlarged, inside = refinement._enlarged(maps, mask, 2.5)
+    assert inside.shape == (50, 75)
+    assert int(inside.sum()) == pytest.approx(2.5**2 * 240, rel=0.05)
+    found = enlarged[0, inside]
+    assert (float(found.min()), float(found.max())) == pytest.approx((2, 5))
+    assert float((found < 2.001).float().mean()) == pytest.approx(0.5, abs=0.05)
 
 
 def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:
