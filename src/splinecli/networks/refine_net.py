@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, max_pool2d, normalize, pad
+from torch.nn.functional import conv2d, interpolate, max_pool2d, normalize, pad
 
 from splinecli.networks.refine_features import CHANNELS, split_features
 
@@ -17,15 +18,25 @@ ENCODING_BLOCKS = (1, 2, 3, 2)
 DECODING_BLOCKS = (1, 1, 0)
 """Residual blocks of each scale on the way down, and on the way up."""
 
+SIGMAS = (0.7, 1.5, 3.0)
+"""Widths in pixels of the smoothed normals that the net weighs against the estimated one."""
+
+_LEAST_MEDIAN, _LARGEST_MEDIAN = (
+    -6.0,
+    1.0,
+)  # logarithms of errors in radians, for the weights of the smoothing
+
 COARSEST = 2 ** (len(WIDTHS) - 1)
 """Side of the coarsest scale's pixels. The origins of tiles are multiples of it."""
 
-REACH = 88
+REACH = 96
 """No pixel further away than this changes a result."""
 
 
 class RefineNet(nn.Module):
     """An encoder-decoder of four scales with residual blocks. It has no norm and starts as the identity.
+
+    The result is the estimated normal, plus weighted differences from it to smoothed normals, plus a correction.
 
     After each layer, everything outside the mask is zero. A pixel outside the mask is therefore the same as one outside
     of the image, so tiles with an overlap of REACH give the same as the whole image.
@@ -33,7 +44,7 @@ class RefineNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.enter = nn.Conv2d(CHANNELS + 1, WIDTHS[0], 3, padding=1)
+        self.enter = nn.Conv2d(CHANNELS + 1 + 3 * len(SIGMAS), WIDTHS[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
@@ -44,7 +55,7 @@ class RefineNet(nn.Module):
             nn.ModuleList(_MaskedBlock(width) for _ in range(count))
             for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
         )
-        self.out = nn.Conv2d(WIDTHS[0], 5, 3, padding=1)
+        self.out = nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
 
@@ -60,7 +71,9 @@ class RefineNet(nn.Module):
         masks = [pad(mask, border)]
         for _ in self.down:
             masks.append(max_pool2d(masks[-1], 2))
-        joined = torch.cat((pad(features, border), masks[0]), dim=1)
+        normals, error = split_features(features)
+        towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
+        joined = torch.cat((pad(torch.cat((features, *towards), dim=1), border), masks[0]), dim=1)
         x = self.enter(joined.contiguous(memory_format=torch.channels_last)) * masks[0]
         passed = []
         for scale, blocks in enumerate(self.encode):
@@ -74,9 +87,30 @@ class RefineNet(nn.Module):
             x = x * masks[scale]
             for block in self.decode[scale]:  # type: ignore[attr-defined]
                 x = block(x, masks[scale])
-        change = self.out(torch.relu(x))[..., :height, :width].float()
-        normals, error = split_features(features.float())
-        return normalize(normals + change[:, :3], dim=1) * mask, (error + change[:, 3:]) * mask
+        change = self.out(torch.relu(x))[..., :height, :width].to(normals.dtype)
+        corrected = normals + change[:, :3]
+        for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
+            corrected = corrected + weight * difference
+        return normalize(corrected, dim=1) * mask, (error + change[:, 3:5]) * mask
+
+
+def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
+    """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask.
+
+    Normals weigh as much as they are certain: by one over the median of their errors, whose logarithm is given.
+    """
+    weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
+    found = []
+    # In float32 whatever the layers compute in: differences of normals are small.
+    with torch.autocast(normals.device.type, enabled=False):
+        for sigma in SIGMAS:
+            reach = math.ceil(3 * sigma)
+            place = torch.arange(-reach, reach + 1, dtype=normals.dtype, device=normals.device)
+            kernel = (-0.5 * (place / sigma).square()).exp().expand(3, 1, 1, -1)
+            across = conv2d(normals * weight, kernel, padding=(0, reach), groups=3)
+            both = conv2d(across, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
+            found.append(normalize(both, dim=1) * mask)
+    return found
 
 
 class _MaskedBlock(nn.Module):
