@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric, solve_by_cramer
+from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
 
 ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 """Places of xx, yy, zz, xy, xz, yz in a matrix."""
@@ -61,16 +61,3 @@ def test_product_with_a_vector() -> None:
         rtol=1e-12,
         atol=1e-12,
     )
-
-
-def test_cramer_s_rule() -> None:
-    generator = torch.Generator().manual_seed(0)
-    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
-    vector = torch.randn(1000, 3, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close(
-        solve_by_cramer(matrix, vector), torch.linalg.solve(matrix, vector), rtol=1e-9, atol=1e-9
-    )
-
-
-def test_cramer_s_rule_for_a_singular_matrix_is_finite() -> None:
-    assert torch.isfinite(solve_by_cramer(torch.zeros(2, 3, 3), torch.ones(2, 3))).all()

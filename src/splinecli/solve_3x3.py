@@ -1,10 +1,7 @@
 """Closed-form solutions of many 3 x 3 systems at once: about ten times as fast as LAPACK.
 
-Use `inverse_3x3`. It takes NumPy arrays and torch tensors alike, gives the covariance too, and limits its pivots from
-below, so that the result stays positive definite.
-
-`solve_by_cramer` is for the Lambertian fit alone. The shipped networks start from that fit, and their stored
-predictions depend on its last bits.
+`inverse_3x3` takes NumPy arrays and torch tensors alike. It limits its pivots from below, so that the result stays
+positive definite.
 """
 
 from __future__ import annotations
@@ -15,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from torch import Tensor
 
-SMALLEST_DETERMINANT = 1e-12
-"""`solve_by_cramer` replaces determinants that are nearer to zero by this value."""
+SMALLEST_PIVOT = 1e-12
+"""A usual limit of the pivots where the lights are unit vectors and the largest weight is about 1."""
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
@@ -60,28 +56,4 @@ def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> N
     x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
     entries = [np.einsum("pf,pf->p", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
     right_side = [np.einsum("pf,pf->p", axis, values) for axis in (x, y, z)]
-    return np.stack(multiply_symmetric(inverse_3x3(entries, SMALLEST_DETERMINANT), right_side), axis=1)
-
-
-def solve_by_cramer(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve matrix (P, 3, 3) @ x = vector (P, 3) for x (P, 3) by Cramer's rule.
-
-    The matrices must be scaled such that a determinant of SMALLEST_DETERMINANT means singular.
-    """
-    import torch
-    from torch.linalg import cross
-
-    first, second, third = matrix.unbind(-1)
-    minor = cross(second, third)
-    determinant = _dot(first, minor)[..., None]
-    solution = torch.stack(
-        (_dot(vector, minor), _dot(first, cross(vector, third)), _dot(first, cross(second, vector))), dim=-1
-    )
-    limit = torch.full_like(determinant, SMALLEST_DETERMINANT)
-    return solution / torch.where(determinant.abs() < SMALLEST_DETERMINANT, limit, determinant)
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Return the dot products (P,) of vectors (P, 3), as `(a * b).sum(-1)` does but faster."""
-    x, y, z = (a * b).unbind(-1)
-    return x + y + z
+    return np.stack(multiply_symmetric(inverse_3x3(entries, SMALLEST_PIVOT), right_side), axis=1)

@@ -75,7 +75,7 @@ def capture_figures(
     title = f"{name}, {heading(protocol)}{_listed(trial.lights)}"
     figures = [_maps_figure(capture, estimates, stem, title)]
     for estimator in estimators:
-        if estimator.name == "spline-net":
+        if estimator.name.startswith("spline-net"):
             whole = stored.capture if trial.as_stored else stored.restore(stored.estimate_intensities())
             chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
             png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)

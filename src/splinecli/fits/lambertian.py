@@ -9,10 +9,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splinecli.solve_3x3 import solve_by_cramer
+from splinecli.fits.weighted_least_squares import weighted_sum
+from splinecli.observation_map import dot
+from splinecli.solve_3x3 import SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
 
 SHADOW_SHARE = 0.05
 ITERATIONS = 5
+_PRIOR = 1e-4
 
 
 def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor | None = None) -> Tensor:
@@ -24,17 +27,17 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
         valid: (P, F) bool, all by default.
     """
     counts = torch.ones_like(observations) if valid is None else valid.to(observations.dtype)
-    lights = light_directions.expand(*observations.shape, 3)
-    lit = torch.where(observations < SHADOW_SHARE, 1e-3, 1.0) * counts
+    x, y, z = light_directions.unbind(-1)
+    products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
     # A weak prior towards the last solution keeps pixels with fewer than three lit lights solvable.
-    prior = 1e-4 * torch.eye(3, dtype=observations.dtype, device=observations.device)
+    prior = observations.new_tensor((_PRIOR,) * 3 + (0.0,) * 3)
+    lit = torch.where(observations < SHADOW_SHARE, 1e-3, 1.0) * counts
     solution = observations.new_tensor((0.0, 0.0, 1e-3)).expand(len(observations), 3)
     weight = lit
     for _ in range(ITERATIONS):
-        weighted = lights * weight[..., None]
-        matrix = weighted.transpose(1, 2) @ lights + prior
-        vector = (weighted.transpose(1, 2) @ observations[..., None])[..., 0] + solution @ prior
-        solution = solve_by_cramer(matrix, vector)
-        residual = (lights @ solution[..., None])[..., 0] - observations
+        inverse = inverse_3x3((weighted_sum(weight, products) + prior).unbind(-1), SMALLEST_PIVOT)
+        right_side = weighted_sum(weight * observations, light_directions) + _PRIOR * solution
+        solution = torch.stack(multiply_symmetric(inverse, right_side.unbind(-1)), dim=-1)
+        residual = dot(solution, light_directions) - observations
         weight = lit / (residual.abs() + 0.02)
     return solution
