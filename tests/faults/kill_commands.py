@@ -1,8 +1,13 @@
 """Kill every command while it replaces earlier output: `python tests/faults/kill_commands.py --kills 200`.
 
-A kill comes before a change of a file, or at a random time. Afterwards the folder is put in order, as the next start
-does. It must then hold the earlier files or the new ones, and nothing else. Then the same command runs again, and must
-end with the same files as an undisturbed run.
+A kill comes before a change of a file, or at a random time. After it,
+
+- every file is whole: it is that of the earlier run or of the new one;
+- the files are all of one run, or the folder is marked as unfinished, has no report, or the new one with all new files,
+  and no reader takes a file from it.
+
+Then the folder is put in order, as the next start does. It must hold the earlier files or the new ones, and nothing
+else. Then the same command runs again, and must end with the same files as an undisturbed run.
 """
 
 from __future__ import annotations
@@ -20,13 +25,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 sys.path[:0] = [str(Path(__file__).parents[1] / "fuzz"), str(Path(__file__).parents[1])]
 
 from run import prepare_process, run_warm  # noqa: E402
 
 from kills import changes_files, content  # noqa: E402
 
-_MEASURED = re.compile(rb'("(?:read|estimate|write|seconds|peak_memory_mib|minutes)": ?)[\d.]+')
+_MEASURED = re.compile(rb'("(?:read|estimate|write|seconds|peak_memory_mib|minutes)\\?": ?)[\d.e-]+')
 
 
 @dataclass(frozen=True)
@@ -37,14 +44,14 @@ class Replacement:
         target: the input, one of the fuzz corpus.
         old, new: the commands.
         folder: the folder that the command holds.
-        as_set: whether the files are replaced as a set. Those of a run are replaced one by one.
+        report: the file that describes the others. None where files are replaced one by one.
     """
 
     target: str
     old: str
     new: str
     folder: str = "out"
-    as_set: bool = True
+    report: str | None = "report.json"
 
 
 _INFER = "infer capture --method ls -o out --overwrite -q"
@@ -54,19 +61,30 @@ _EVALUATE = "evaluate capture --method ls --n-lights 4 -o out -q"
 _TRAIN = "train set -o out/run -q --config a.toml"
 REPLACEMENTS = {
     "infer": Replacement("earlier", _INFER, f"{_INFER} --format png8,tiff --maps preview", "out/capture"),
-    "calibrate": Replacement("ball", f"{_CALIBRATE} --gray-ball gray", _CALIBRATE),
-    "integrate": Replacement("normals", f"{_INTEGRATE} --format ply,npy", f"{_INTEGRATE} --format obj,npy"),
-    "evaluate": Replacement("earlier", f"{_EVALUATE} --trials 1", f"{_EVALUATE} --trials 2 --n-lights 5"),
+    "calibrate": Replacement("ball", f"{_CALIBRATE} --gray-ball gray", _CALIBRATE, report="calibration.json"),
+    "integrate": Replacement(
+        "normals", f"{_INTEGRATE} --format ply,npy", f"{_INTEGRATE} --format obj,npy", report="surface.json"
+    ),
+    "evaluate": Replacement(
+        "earlier",
+        f"{_EVALUATE} --trials 1",
+        f"{_EVALUATE} --trials 2 --n-lights 5",
+        report="results.json",
+    ),
     "prepare": Replacement(
-        "earlier", "prepare capture -o out/set -q", "prepare capture more -o out/set -q", "out/set"
+        "earlier",
+        "prepare capture -o out/set -q",
+        "prepare capture more -o out/set -q",
+        "out/set",
+        "manifest.json",
     ),
     "info": Replacement(
         "earlier",
         "info capture --plot out/p.png -q",
         "info more --plot out/p.png --overwrite -q",
-        as_set=False,
+        report=None,
     ),
-    "train": Replacement("training", _TRAIN, f"{_TRAIN} --resume --steps 3", "out/run", as_set=False),
+    "train": Replacement("training", _TRAIN, f"{_TRAIN} --resume --steps 3", "out/run", None),
 }
 
 
@@ -79,14 +97,15 @@ class KilledCommand:
 
         self.replacement = REPLACEMENTS[name]
         self.case, self.start = work / name / "case", work / name / "start"
-        self.start.mkdir(parents=True)
+        self.case.mkdir(parents=True)
         target = next(target for target in TARGETS if target.name == self.replacement.target)
-        target.write(self.start)
+        target.write(self.case)
         if target.name == "earlier":
-            shutil.copytree(self.start / "capture", self.start / "more")
-            (self.start / "more" / "filenames.txt").unlink()
-        assert run_warm(self.start, self.replacement.old) == 0
-        self._reset()
+            shutil.copytree(self.case / "capture", self.case / "more")
+            (self.case / "more" / "filenames.txt").unlink()
+        # In the place where it is replaced, because reports and checkpoints name absolute paths.
+        assert run_warm(self.case, self.replacement.old) == 0
+        shutil.copytree(self.case, self.start)
         self.seconds = self._run_again()
         if name == "evaluate":  # what was scored is kept, so that all runs have the same seconds
             shutil.copy(self.case / "out/trials.jsonl", self.start / "out/trials.jsonl")
@@ -98,21 +117,76 @@ class KilledCommand:
         from splinecli.publishing import held_folder
 
         self._reset()
-        self.ended = not self._run_killed(step, seconds)
-        if self.ended and self._state(self.case) != self.new:
+        was_killed = self._run_killed(step, seconds)
+        if not was_killed and self._state(self.case) != self.new:
             yield "a run that was not killed ends with other files"
+        yield from self._found_by_readers()
         if (self.case / self.replacement.folder).exists():
             with held_folder(self.case / self.replacement.folder):
                 pass
         after = self._state(self.case)
         self.new_count += after == self.new
-        if self.replacement.as_set and after not in (self.old, self.new) and not self._is_unfinished(after):
+        if self._is_mixture(after):
             yield f"a mixture of {sorted(after)}"
         self._run_again()
         if self._state(self.case) != self.new:
             yield "the next run ends with other files"
 
-    def _is_unfinished(self, state: dict[str, bytes]) -> bool:
+    def count_steps(self) -> int:
+        """Return the number of changes of files in an undisturbed run."""
+        self._reset()
+        reader, writer = os.pipe()
+        child = os.fork()
+        if child == 0:
+            count = 0
+
+            def counted(event: str, args: tuple[object, ...]) -> None:
+                nonlocal count
+                count += changes_files(event, args)
+
+            sys.addaudithook(counted)
+            run_warm(self.case, self.replacement.new)
+            os.write(writer, str(count).encode())
+            os._exit(0)
+        os.waitpid(child, 0)
+        os.close(writer)
+        count = int(os.read(reader, 100))
+        os.close(reader)
+        return count
+
+    def _found_by_readers(self) -> Iterator[str]:
+        """Yield what is wrong with the files before the next start puts them in order."""
+        from splinecli.capture.paths import check_file
+        from splinecli.errors import InputError
+        from splinecli.files import is_unfinished
+
+        state = {name: value for name, value in self._state(self.case).items() if "/." not in f"/{name}"}
+        for name, value in state.items():
+            if value not in (self.old.get(name), self.new.get(name)) and not self._says_unfinished(state):
+                yield f"{name} is neither the old file nor the new one"
+        if self.replacement.report is None:
+            return
+        held = self.case / self.replacement.folder
+        if not is_unfinished(held):
+            if self._is_mixture(state):
+                yield f"a mixture of {sorted(state)} for readers"
+            return
+        name = (held / self.replacement.report).relative_to(self.case / "out").as_posix()
+        if name in state and state != self.new and not self._says_unfinished(state):
+            yield "an unfinished folder has a report"
+        for path in held.glob("[!.]*"):
+            try:
+                if path.is_file():
+                    check_file(path, "a file")
+                    yield f"a reader takes {path.name}"
+            except InputError:
+                pass
+
+    def _is_mixture(self, state: dict[str, bytes]) -> bool:
+        one_by_one = self.replacement.report is None
+        return not one_by_one and state not in (self.old, self.new) and not self._says_unfinished(state)
+
+    def _says_unfinished(self, state: dict[str, bytes]) -> bool:
         """A pixel set says itself that it is not finished."""
         return b'"complete": false' in state.get("set/manifest.json", b"")
 
@@ -140,7 +214,17 @@ class KilledCommand:
     def _state(self, folder: Path) -> dict[str, bytes]:
         """Return the content of the output by name, without what differs from run to run: the log has minutes."""
         files = content(folder / "out").items()
-        return {name: _MEASURED.sub(rb"\1", value) for name, value in files if name != "run/metrics.csv"}
+        return {
+            name: _without_measurements(name, value) for name, value in files if name != "run/metrics.csv"
+        }
+
+
+def _without_measurements(name: str, value: bytes) -> bytes:
+    """Return a file without times and memory. A checkpoint states the seconds, and so the length of its header."""
+    if name.endswith("checkpoint.safetensors"):
+        end = 8 + int.from_bytes(value[:8], "little")
+        value = value[8:end].rstrip() + value[end:]
+    return _MEASURED.sub(rb"\1", value)
 
 
 def _killer(step: int):
@@ -163,6 +247,7 @@ def main() -> int:
     parser.add_argument(
         "--kills", type=int, default=200, help="kills at random times, beside those at every step"
     )
+    parser.add_argument("--steps", type=int, help="kill at so many of the steps only, evenly chosen")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--command", action="append", choices=REPLACEMENTS)
     options = parser.parse_args()
@@ -171,13 +256,16 @@ def main() -> int:
     names = options.command or list(REPLACEMENTS)
     with tempfile.TemporaryDirectory() as work:
         for name in names:
-            command, step, count = KilledCommand(name, Path(work)), 0, 0
-            command.ended = False
-            while not command.ended:
+            command, count = KilledCommand(name, Path(work)), 0
+            total = command.count_steps()
+            steps = sorted(
+                {int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))}
+            )
+            for step in steps:
                 problems = list(command.kill(step=step))
-                step, count, failures = step + 1, count + 1, failures + bool(problems)
+                count, failures = count + 1, failures + bool(problems)
                 for problem in problems:
-                    print(f"{name}, step {step - 1}: {problem}")
+                    print(f"{name}, step {step}: {problem}")
             for _ in range(options.kills // len(names)):
                 seconds = rng.uniform(0, 1.1 * command.seconds)
                 problems = list(command.kill(seconds=seconds))
@@ -186,7 +274,9 @@ def main() -> int:
                     print(f"{name}, {seconds:.3f} s: {problem}")
             kills += count
             print(
-                f"{name}: {count} kills, {step} of them at every step; {command.new_count} ended in the new files"
+                f"{name}: {count} kills, at {len(steps)} of {total} steps and at random times;"
+                f" {command.new_count} ended in the new files",
+                flush=True,
             )
     print(f"{kills} kills, {failures} failed")
     return bool(failures)

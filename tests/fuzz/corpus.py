@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +99,23 @@ def tiff_capture(folder: Path) -> None:
     (folder / "draws.txt").write_text("0 1 2 3\n1 2 3 4\n")
 
 
+def light_files(folder: Path) -> None:
+    """Light files of every form, and near lamps."""
+    for number, light in enumerate(LIGHTS):
+        cv2.imwrite(str(folder / f"{number}.png"), shaded(light))
+    azimuth = np.degrees(np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0]))
+    np.savetxt(
+        folder / "azel.txt", np.stack((azimuth, np.degrees(np.arcsin(LIGHTS[:, 2]))), axis=1), fmt="%.3f"
+    )
+    np.save(folder / "vectors.npy", LIGHTS)
+    rows = [" ".join(f"{value:.6f}" for value in light) for light in LIGHTS]
+    (folder / "utf16.txt").write_text("x y z\n" + "\n".join(rows), "utf-16")
+    (folder / "commas.txt").write_text("\n".join(rows).replace(".", ",").replace(" ", ";"))
+    (folder / "named.csv").write_text("\n".join(f"{number}.png;{row}" for number, row in enumerate(rows)))
+    np.savetxt(folder / "positions.txt", 60 * LIGHTS)
+    (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
+
+
 def normal_maps(folder: Path) -> None:
     cv2.imwrite(str(folder / "n.png"), picture_of(normals())[:, :, ::-1])
     tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
@@ -188,6 +206,20 @@ TARGETS = (
         ),
     ),
     Target(
+        "lights",
+        light_files,
+        ("*.txt", "*.npy", "*.csv"),
+        (
+            *(
+                f"infer . --method ls --lights {name} -o out --overwrite"
+                for name in ("vectors.npy", "utf16.txt", "commas.txt", "named.csv")
+            ),
+            "infer . --method ls --lights azel.txt --lights-format azel -o out --overwrite",
+            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
+            " --overwrite",
+        ),
+    ),
+    Target(
         "normals",
         normal_maps,
         ("*",),
@@ -233,23 +265,29 @@ TARGETS = (
 )
 
 
-def write_corpus(folder: Path, run: Callable[[Path, str], int], names: tuple[str, ...] = ()) -> list[Target]:
+def write_corpus(
+    folder: Path, case: Path, run: Callable[[Path, str], int], names: tuple[str, ...] = ()
+) -> list[Target]:
     """Write the files of the targets into folders of their names, each with the output of an earlier run.
 
     Every command runs once on whole input. This also imports all that it needs.
 
     Args:
         folder: where to write.
+        case: where the commands will run. They run there now, because reports and checkpoints name absolute paths.
         run: runs a command in a folder and returns its exit code.
         names: names of targets; empty for all.
     """
     targets = [target for target in TARGETS if not names or target.name in names]
     for target in targets:
-        for place in (folder / "tried" / target.name, folder / target.name):
-            place.mkdir(parents=True)
-            target.write(place)
+        for tried in (True, False):
+            case.mkdir(parents=True)
+            target.write(case)
             first = target.earlier or target.commands[0]
-            more = target.commands if place.parent.name == "tried" else target.commands[:1]
-            for command in dict.fromkeys((first, *more)):
-                assert run(place, command) == 0 or "g.ckpt" in command, command
+            for command in dict.fromkeys((first, *(target.commands if tried else target.commands[:1]))):
+                assert run(case, command) == 0 or "g.ckpt" in command, command
+            if tried:
+                shutil.rmtree(case)
+        folder.mkdir(exist_ok=True)
+        case.rename(folder / target.name)
     return targets

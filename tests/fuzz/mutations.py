@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
@@ -9,8 +10,13 @@ import re
 import struct
 import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import tifffile
+from scipy.io import savemat
 
 ODD_NUMBERS = (
     "nan", "inf", "-inf", "1e999", "-0", "1e-320", "9" * 400, "9" * 5000, "1_0", "0x10", "١", "--1", "", "-1",
@@ -69,6 +75,14 @@ def odd_word(data: bytes, rng: random.Random) -> bytes:
 def fill(data: bytes, rng: random.Random) -> bytes:
     start, end = sorted(rng.randrange(len(data) + 1) for _ in range(2))
     return data[:start] + bytes([rng.choice((0, 255, 32))]) * (end - start) + data[end:]
+
+
+def long(data: bytes, rng: random.Random) -> bytes:
+    """Repeat the file, or one of its lines, up to a length of megabytes."""
+    rows = data.split(b"\n")
+    part = rng.choice((data, rng.choice(rows) + b"\n", b"\n", b" ", b"1 ")) or b"\n"
+    length = rng.choice((500_000, 990_000, 1_100_000, 60_000_000))
+    return data[: rng.randrange(len(data) + 1)] + part * (length // len(part))
 
 
 def garbage(data: bytes, rng: random.Random) -> bytes:
@@ -137,6 +151,29 @@ def png_header(data: bytes, rng: random.Random) -> bytes:
     return data[:12] + bytes(body) + struct.pack(">I", zlib.crc32(body)) + data[33:]
 
 
+@cache
+def _bomb(suffix: str) -> bytes:
+    """Return a whole file of many zeros: a picture of 8000 x 8000 pixels, or normals of 4000 x 4000."""
+    rows = zlib.compress(bytes(8000 * 8001), 1)
+    if suffix == ".png":
+        parts = (
+            (b"IHDR", struct.pack(">IIBBBBB", 8000, 8000, 8, 0, 0, 0, 0)),
+            (b"IDAT", rows),
+            (b"IEND", b""),
+        )
+        chunks = (kind + content for kind, content in parts)
+        return b"\x89PNG\r\n\x1a\n" + b"".join(
+            struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+            for chunk in chunks
+        )
+    buffer = io.BytesIO()
+    if suffix == ".mat":
+        savemat(buffer, {"Normal_gt": np.zeros((4000, 4000, 3), np.uint8)}, do_compression=True)
+    else:
+        tifffile.imwrite(buffer, np.zeros((8000, 8000), np.uint8), compression="zlib")
+    return buffer.getvalue()
+
+
 def safetensors_header(data: bytes, rng: random.Random) -> bytes:
     """Change a value in the header of a safetensors file, or in the JSON texts of its metadata."""
     length = int.from_bytes(data[:8], "little")
@@ -166,7 +203,9 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
         return _another_kind(path, others, rng)
     choices = [*OF_BYTES]
     if path.suffix in _TEXTS:
-        choices += OF_TEXTS * 2
+        choices += OF_TEXTS * 2 + (long,)
+    if path.suffix in (".png", ".tif", ".mat"):
+        choices.append(lambda _, __: _bomb(path.suffix))
     if path.suffix == ".json":
         choices += [json_value] * 15
     if path.suffix == ".png":
@@ -177,7 +216,7 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
     data = path.read_bytes()
     path.unlink()  # it may be a link to the corpus
     path.write_bytes(change(data, rng))
-    return f"{change.__name__} {path.name}"
+    return f"{change.__name__.strip('<>')} {path.name}"
 
 
 def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:

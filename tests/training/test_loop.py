@@ -434,9 +434,9 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
         monkeypatch.setattr("splinecli.files.os.fdopen", full)
-        message = r"checkpoint\.safetensors: cannot be written \(No space left on device\)"
+        message = r"weights\.safetensors: cannot be written \(No space left on device\)"
     else:
-        message = r"checkpoint\.safetensors: cannot be written \(File too large\)"
+        message = r"weights\.safetensors: cannot be written \(File too large\)"
         resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
     try:
         with pytest.raises(OutputError, match=message):

@@ -184,7 +184,12 @@ class Trainer:
         return numbers
 
     def save(self) -> None:
-        """Write checkpoint, averaged weights and pictures. Raises OutputError."""
+        """Write averaged weights, pictures and checkpoint. Raises OutputError.
+
+        The checkpoint comes last: a run that is killed before repeats the steps, and writes the others again.
+        """
+        save_weights(self.average, self.folder / WEIGHTS)
+        self.log.draw(self.task.sample_maps(self.average))
         save_checkpoint(
             self.folder / CHECKPOINT,
             self.config,
@@ -194,8 +199,6 @@ class Trainer:
             self.counters,
             self.sets,
         )
-        save_weights(self.average, self.folder / WEIGHTS)
-        self.log.draw(self.task.sample_maps(self.average))
 
     def _check_weights(self) -> None:
         """Raise ModelError where a weight is not finite, before it is saved."""
