@@ -23,13 +23,13 @@ def small_runs(tmp_path, monkeypatch):
     import torch
 
     from splinecli.networks.config import NetworkConfig
-    from splinecli.training import config, loop
+    from splinecli.training import config, tasks
 
     tiny = config.TrainingConfig(
         network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16
     )
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
-    monkeypatch.setattr(loop, "VALIDATION_PIXELS", 32)
+    monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
     monkeypatch.chdir(tmp_path)
     # More threads only wait for each other in networks this small.
     threads = torch.get_num_threads()

@@ -43,9 +43,9 @@ def test_kills_of_every_command() -> None:
         sys.executable,
         str(Path(__file__).with_name("kill_commands.py")),
         "--steps",
-        "8",
+        "4",
         "--kills",
-        "14",
+        "7",
     ]
     done = subprocess.run(script, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

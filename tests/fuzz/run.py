@@ -110,11 +110,11 @@ def prepare_process() -> None:
     import cv2
     import torch
 
-    from splinecli.training import loop
+    from splinecli.training import tasks
 
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    loop.VALIDATION_PIXELS = 32
+    tasks.VALIDATION_PIXELS = 32
 
 
 def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> Iterator[str]:

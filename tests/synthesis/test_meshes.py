@@ -72,7 +72,7 @@ def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
 
 
 def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no such mesh file"):
+    with pytest.raises(InputError, match="the file does not exist"):
         read_mesh(tmp_path / "missing.ply")
     (tmp_path / "broken.ply").write_text("ply, but not really")
     with pytest.raises(InputError, match=r"broken\.ply: not a mesh that can be read"):

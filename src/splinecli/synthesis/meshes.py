@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.extras import import_extra
 
@@ -42,8 +43,7 @@ def read_mesh(path: str | Path) -> Mesh:
         UsageError: the extra `render` is not installed.
     """
     trimesh = import_extra("trimesh", "render")
-    if not Path(path).is_file():
-        raise InputError("there is no such mesh file", path=path)
+    check_file(Path(path), "a mesh")
     try:
         loaded = trimesh.load_mesh(path, process=True)
         # Texture coordinates split vertices, and would split the smooth normals too.
