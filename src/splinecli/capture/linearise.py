@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import to_linear
+from splinecli.capture.masks import take_pixels
 from splinecli.errors import InputError
 from splinecli.transfer import decode_transfer
 
@@ -75,4 +76,4 @@ class Lineariser:
 
     def _linear(self, path: Path) -> NDArray[np.float32]:
         stored = decode_image(path, ExpectedSize(self.mask.shape, "the other images"))
-        return decode_transfer(to_linear(stored[self.mask], path), self.radiometry.gamma)
+        return decode_transfer(to_linear(take_pixels(stored, self.mask), path), self.radiometry.gamma)

@@ -22,7 +22,7 @@ from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration
-from splinecli.capture.masks import read_capture_mask
+from splinecli.capture.masks import read_capture_mask, take_pixels
 from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
@@ -144,7 +144,7 @@ class CaptureSource:
         def read(index: int) -> NDArray[np.float32]:
             path = self.files.images[index]
             stored = decode_image(path, ExpectedSize(mask.shape, self.files.images[0].name))
-            return self._colours(linearise, stored[mask], index)
+            return self._colours(linearise, take_pixels(stored, mask), index)
 
         return read
 
@@ -210,7 +210,7 @@ class CaptureSource:
         expected = ExpectedSize(mask.shape, self.files.images[indices[0]].name)
         for index in indices:
             path = self.files.images[index]
-            pixels = decode_image(path, expected)[mask]
+            pixels = take_pixels(decode_image(path, expected), mask)
             linear, intensity = linearise(pixels, path, index), self.light_intensities[index]
             yield StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
             del pixels, linear

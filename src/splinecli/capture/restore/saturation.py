@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,12 @@ def find_saturated(pixels: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels have none."""
     if pixels.dtype.kind != "u":
         return np.zeros(len(pixels), np.bool_)
-    full: NDArray[np.bool_] = (pixels == np.iinfo(pixels.dtype).max).any(axis=1)
-    return full
+    return in_any_channel(pixels == np.iinfo(pixels.dtype).max)
+
+
+def in_any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return flags.any(axis=1) of flags (P, C), C at most 3, several times as fast."""
+    return np.asarray(reduce(np.logical_or, flags.T))
 
 
 def restore_saturated(

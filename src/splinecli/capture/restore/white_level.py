@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.saturation import find_saturated
+from splinecli.capture.restore.saturation import find_saturated, in_any_channel
 from splinecli.errors import InputError
 
 Origin = Literal["given", "file", "images", "full scale"]
@@ -219,13 +219,13 @@ class SaturationFinder:
                     path=path,
                     hint="Lower the white level, or leave it out",
                 )
-            saturated = np.asarray((pixels >= self.given).any(axis=1))
+            saturated = in_any_channel(pixels >= self.given)
             self._images[position] = _ImageValues(full_scale, stated, _indices(saturated))
             return
         image = _ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
         if pixels.dtype == np.uint16 and pixels.size:
             maximum = int(pixels.max())
-            at_maximum = _indices((pixels == maximum).any(axis=1)) if maximum else _nothing()
+            at_maximum = _indices(in_any_channel(pixels == maximum)) if maximum else _nothing()
             below, counts = _largest_values(pixels, maximum)
             image = replace(image, maximum=maximum, at_maximum=at_maximum, below=below, counts=counts)
         self._images[position] = image
