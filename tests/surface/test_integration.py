@@ -10,12 +10,20 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.normals import unit
+from splinecli.surface import integration
 from splinecli.surface.integration import integrate_normals
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 CAMERA = np.array([[210.0, 0.0, 63.0], [0.0, 200.0, 41.0], [0.0, 0.0, 1.0]])
+# Maps of more pixels than this start from coarser ones.
+COARSE_FROM = {"own scale": 10**9, "coarse to fine": 300}
 TIGHT = {"tolerance": 1e-9, "max_iterations": 400}
+
+
+@pytest.fixture(params=COARSE_FROM)
+def any_scale(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(integration, "_COARSE_FROM", COARSE_FROM[request.param])
 
 
 def grid(height: int, width: int) -> tuple[Floats, Floats]:
@@ -63,6 +71,7 @@ def error_share(found: Floats, truth: Floats, mask: Mask) -> float:
     return float(np.abs(error - np.median(error)).mean() / np.ptp(truth[mask]))
 
 
+@pytest.mark.usefixtures("any_scale")
 @pytest.mark.parametrize("stiffness", [0, 2])
 @pytest.mark.parametrize(("reach", "limit"), [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
 def test_sphere(reach: float, limit: float, stiffness: float) -> None:
@@ -82,6 +91,7 @@ def test_tent(slope: float) -> None:
     assert error_share(found, -slope * np.abs(x), np.ones(x.shape, bool)) < 1e-6
 
 
+@pytest.mark.usefixtures("any_scale")
 def test_tent_of_unequal_sides() -> None:
     # The pixels at the ridge disagree on the gap between them, truly (0.8 - 0.3) / 2: one gap of 90.
     x, _ = grid(60, 90)
@@ -145,6 +155,7 @@ def geometric_mean_1(depth: Floats) -> Floats:
     return np.asarray(depth / np.exp(np.log(depth).mean()))
 
 
+@pytest.mark.usefixtures("any_scale")
 def test_perspective_plane() -> None:
     rays = seen(CAMERA, 90, 120)
     normal = unit(np.array([0.3, -0.4, 0.8]))
@@ -157,6 +168,7 @@ def test_perspective_plane() -> None:
     np.testing.assert_allclose(found, depth, rtol=1e-3)
 
 
+@pytest.mark.usefixtures("any_scale")
 def test_perspective_sphere() -> None:
     rays = seen(CAMERA, 90, 120)
     centre, radius = np.array([0.1, -0.05, -6.0]), 1.1
@@ -173,6 +185,7 @@ def test_perspective_sphere() -> None:
     assert error_share(found * scale, depth, mask) < 5e-3
 
 
+@pytest.mark.usefixtures("any_scale")
 def test_a_camera_far_away_is_orthographic() -> None:
     normals, mask, truth = sphere(60, 80, 40, 0.8)
     focal = 1e6
@@ -236,6 +249,25 @@ def test_bilateral_is_the_dense_solution() -> None:
     np.testing.assert_allclose(found, expected, atol=5e-3)
 
 
+@pytest.mark.parametrize("joined", [30, 70])
+def test_coarse_to_fine_tears_at_the_same_places_with_fewer_solves(
+    monkeypatch: pytest.MonkeyPatch, joined: int
+) -> None:
+    normals, truth, wall = levels(100, 120, 30, 2, joined)
+    solves = []
+    for limit in COARSE_FROM.values():
+        monkeypatch.setattr(integration, "_COARSE_FROM", limit)
+        done: list[int] = []
+        found = integrate_normals(
+            normals, np.ones(wall.shape, bool), progress=lambda n, _, done=done: done.append(n)
+        )
+        # Least squares is off by more than a tenth.
+        assert error_share(found, truth, ~wall) < 1e-2
+        assert done == list(range(1, len(done) + 1))
+        solves.append(len(done))
+    assert solves[1] < solves[0] / 3
+
+
 def test_parts_are_independent() -> None:
     normals, mask = bumps(20, 31, 2), np.ones((20, 31), bool)
     mask[:, 15] = False
@@ -248,6 +280,7 @@ def test_parts_are_independent() -> None:
     assert together[left].mean() == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.usefixtures("any_scale")
 @pytest.mark.parametrize("camera", [None, CAMERA])
 def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) -> None:
     normals, mask = bumps(12, 17), holes(12, 17)
@@ -263,6 +296,7 @@ def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) ->
     np.testing.assert_allclose(found[mask], middle, atol=1e-9)
 
 
+@pytest.mark.usefixtures("any_scale")
 def test_backward_normals_are_bridged() -> None:
     normals, mask, truth = sphere(60, 80, 40, 0.8)
     wrong = np.random.default_rng(3).uniform(size=mask.shape) < 0.05

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
+from splinecli.normals import unit
 from splinecli.surface.bilateral_equations import BilateralEquations
+from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length
 from splinecli.surface.laplacian import LaplacianSolver
 
@@ -23,6 +25,8 @@ _UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and ref
 _EXACT = 1e-6  # rms residual in pixels; below it there is nothing to improve
 _FIRST_PRECISION = 1e-9
 _LATER_PRECISION = 0.03
+_STILL = 50  # times the tolerance, in pixels: the rms movement of large maps at which they are finished
+_COARSE_FROM = 100_000  # pixels; smaller maps are fast at their own scale
 
 
 def integrate_normals(
@@ -48,7 +52,8 @@ def integrate_normals(
             right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
         max_iterations: largest number of linear solves. 1 is least squares.
-        tolerance: relative change of the sum of squares at which the iteration stops.
+        tolerance: relative change of the sum of squares at which the iteration stops. Maps of more than 100,000 pixels
+            also stop when the surface moves by at most 50 times as many pixels.
         progress: called with the number of iterations done and `max_iterations`.
 
     Raises:
@@ -59,22 +64,62 @@ def integrate_normals(
     if mask is None:
         mask = _mask_of_normals(normal_map)
     _check_maps(normal_map, mask)
+    heights = _integrate(
+        normal_map, mask, camera_matrix, stiffness, max_iterations, tolerance, progress or (lambda *_: None)
+    )
+    return _depth_map(heights, mask, camera_matrix)
+
+
+def _integrate(
+    normal_map: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    camera_matrix: NDArray[np.floating] | None,
+    stiffness: float,
+    max_iterations: int,
+    tolerance: float,
+    progress: Callable[[int, int], None],
+    *,
+    is_coarse: bool = False,
+) -> Floats:
+    """Return the heights (P,) of the mask's pixels; see integrate_normals.
+
+    A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears shows at coarser scales, too.
+    Large maps and blocks are finished when the surface hardly moves.
+    """
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
-    heights = np.zeros(len(equations.facing))
-    solver = LaplacianSolver(equations.pairs, len(heights))
-    cost = np.inf
+    n_pixels = len(equations.facing)
+    heights: Floats = np.zeros(n_pixels)
+    cost, movement, still = np.inf, np.inf, 0.0
+    # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
+    # Each later solve moves the surface a little further, for which few digits suffice.
+    precision = _FIRST_PRECISION
+    if is_coarse:
+        still = _STILL * tolerance
+    if n_pixels > _COARSE_FROM and stiffness > 0 and max_iterations > 1:
+        blocks = Blocks.of_step(mask, 2)
+        coarse = np.zeros((*blocks.mask.shape, 3))
+        coarse[blocks.mask] = unit(blocks.average(normal_map[mask].astype(np.float64), mask))
+        camera = blocks.shrink_camera(camera_matrix)
+        of_blocks = np.zeros(blocks.mask.shape)
+        of_blocks[blocks.mask] = _integrate(
+            coarse, blocks.mask, camera, stiffness, max_iterations, tolerance, lambda *_: None, is_coarse=True
+        )
+        heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
+        precision, still = _LATER_PRECISION, _STILL * tolerance
+    solver = LaplacianSolver(equations.pairs, n_pixels)
     for iteration in range(max_iterations):
         weights, flows, new_cost = equations.weigh(heights, stiffness)
-        if iteration > 1 and abs(cost - new_cost) <= tolerance * new_cost + _EXACT**2 * len(heights):
+        if iteration > 1 and abs(cost - new_cost) <= tolerance * new_cost + _EXACT**2 * n_pixels:
+            break
+        if movement < still:
             break
         cost = new_cost
-        # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
-        # Each later solve moves the surface a little further, for which few digits suffice.
-        precision = _FIRST_PRECISION if iteration == 0 else _LATER_PRECISION
-        heights += solver.solve(weights, flows, precision=precision)
-        if progress is not None:
-            progress(iteration + 1, max_iterations)
-    return _depth_map(heights, mask, camera_matrix)
+        change = solver.solve(weights, flows, precision=precision)
+        heights += change
+        movement = float(np.std(change))
+        precision = _LATER_PRECISION
+        progress(iteration + 1, max_iterations)
+    return heights
 
 
 def _mask_of_normals(normal_map: NDArray[np.floating]) -> NDArray[np.bool_]:

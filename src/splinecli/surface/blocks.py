@@ -1,0 +1,78 @@
+"""Square blocks of pixels: a map at a coarser scale, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """The blocks of step x step pixels that contain a pixel of the object.
+
+    Args:
+        mask: (h, w) bool, true for these blocks; p of them.
+        step: pixels along a side of a block.
+    """
+
+    mask: NDArray[np.bool_]
+    step: int
+
+    @classmethod
+    def over(cls, mask: NDArray[np.bool_], number: int) -> Blocks:
+        """Return about `number` blocks or fewer over the pixels of a mask (H, W)."""
+        return cls.of_step(mask, max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / number)))))
+
+    @classmethod
+    def of_step(cls, mask: NDArray[np.bool_], step: int) -> Blocks:
+        """Return the blocks of step x step pixels over the pixels of a mask (H, W)."""
+        height, width = mask.shape
+        blocks = np.zeros((-(-height // step), -(-width // step)), np.bool_)
+        rows, columns = np.nonzero(mask)
+        blocks[rows // step, columns // step] = True
+        return cls(blocks, step)
+
+    def centres(self) -> tuple[Floats, Floats]:
+        """Return the rows and columns (p,) of the centres, in pixels of the capture."""
+        rows, columns = np.nonzero(self.mask)
+        return rows * self.step + self._shift, columns * self.step + self._shift
+
+    def average(self, values: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """Return the means (p, F) over the blocks of the values (P, F) of a mask's pixels."""
+        if self.step == 1:
+            return values
+        block = self._block_of(*np.nonzero(mask))
+        sums = np.stack([np.bincount(block, column) for column in values.T], axis=1)
+        return (sums / np.bincount(block)[:, None]).astype(values.dtype)
+
+    def shrink_camera(self, camera_matrix: Floats | None) -> Floats | None:
+        """Return the camera matrix in blocks from that in pixels; None for an orthographic camera."""
+        if camera_matrix is None:
+            return None
+        shrunk = np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
+        return np.asarray(shrunk @ camera_matrix)
+
+    def interpolate(self, depth: Floats, mask: NDArray[np.bool_]) -> Floats:
+        """Return the depths (P,) of the pixels of a mask (H, W) from those of the blocks (h, w)."""
+        if self.step == 1:
+            return depth[mask]
+        from scipy.ndimage import distance_transform_edt, map_coordinates
+
+        nearest = distance_transform_edt(~self.mask, return_distances=False, return_indices=True)
+        places = [(axis - self._shift) / self.step for axis in np.nonzero(mask)]
+        return np.asarray(map_coordinates(depth[tuple(nearest)], places, order=1, mode="nearest"))
+
+    def _block_of(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.integer]:
+        """Return the numbers (P,) of the blocks of some pixels."""
+        number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
+        return np.asarray(number[rows // self.step, columns // self.step])
+
+    @property
+    def _shift(self) -> float:
+        """The centre of the first block, in pixels."""
+        return (self.step - 1) / 2
