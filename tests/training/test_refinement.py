@@ -102,6 +102,7 @@ def bumpy_set(tmp_path: Path) -> PixelSet:
 def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch) -> TrainingConfig:
     for name, value in (("FIRST_EXAMPLES", 3), ("VALIDATION_SCENES", 2)):
         monkeypatch.setattr(tasks, name, value)
+    monkeypatch.setattr(refinement, "_ENGRAVED_SHARE", 0.0)
     return replace(
         tiny,
         network=replace(tiny.network, error_head=True, refines=True),

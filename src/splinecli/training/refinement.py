@@ -16,7 +16,8 @@ from splinecli.networks.refine_features import brightness, refine_features, spli
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import CaptureConfig
-from splinecli.synthesis.lights import choose_in_cone, draw_light_counts
+from splinecli.synthesis.engraved import draw_engraved
+from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
 from splinecli.synthesis.whole_capture import photograph_scene
 from splinecli.training.losses import angles
 
@@ -34,7 +35,11 @@ CROP = 128
 
 _ENLARGED_SHARE = 0.6
 _MOST_ENLARGED = 3.0
-"""A share of the captures is enlarged, by a factor from 1 to this one."""
+"""A share of the captures of scenes is enlarged, by a factor from 1 to this one."""
+
+_ENGRAVED_SHARE = 0.25
+_ENGRAVED_SIZE = 96
+"""A share of the captures show no scene, but an engraved piece of this size; see draw_engraved."""
 
 ERROR_WEIGHT = 0.05
 """Weight of the likelihood of the errors beside the angle in radians."""
@@ -94,15 +99,20 @@ class ScenePool:
         """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
         seeds = np.random.SeedSequence((self.seed, self._made)).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(seeds[0] >> np.uint64(1)))
-        weights = torch.tensor([weight for _, _, weight in self.scenes])
-        pixel_set, entries, _ = self.scenes[int(torch.multinomial(weights, 1, generator=generator))]
-        entry = entries[int(torch.randint(len(entries), (), generator=generator))]
-        example = _photograph(pixel_set, entry, self.network, self.config, generator)
+        example = self._draw_example(generator)
         if len(self.examples) < MOST_EXAMPLES:
             self.examples.append(example)
         else:
             self.examples[self._made % MOST_EXAMPLES] = example
         self._made += 1
+
+    def _draw_example(self, generator: torch.Generator) -> SceneMaps:
+        if float(torch.rand((), generator=generator)) < _ENGRAVED_SHARE:
+            return _photograph_engraved(self.network, self.config, generator)
+        weights = torch.tensor([weight for _, _, weight in self.scenes])
+        pixel_set, entries, _ = self.scenes[int(torch.multinomial(weights, 1, generator=generator))]
+        entry = entries[int(torch.randint(len(entries), (), generator=generator))]
+        return _photograph(pixel_set, entry, self.network, self.config, generator)
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
         """Draw `count` captures, turn and mirror each, and stack them as float32 (count, ...)."""
@@ -139,7 +149,28 @@ def _photograph(
     )
     maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
     radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-    observations, lights = photograph_scene(radiance, lights[chosen], config, generator)
+    return _after_network(network, radiance, lights[chosen], truth, mask, config, generator)
+
+
+def _photograph_engraved(network: SplineNet, config: CaptureConfig, generator: torch.Generator) -> SceneMaps:
+    count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
+    lights = draw_light_directions(1, int(count), generator)[0]
+    truth, radiance = draw_engraved(_ENGRAVED_SIZE, lights, generator)
+    mask = torch.ones(_ENGRAVED_SIZE, _ENGRAVED_SIZE, dtype=torch.bool)
+    return _after_network(network, radiance, lights, truth, mask, config, generator)
+
+
+def _after_network(
+    network: SplineNet,
+    radiance: Tensor,
+    lights: Tensor,
+    truth: Tensor,
+    mask: Tensor,
+    config: CaptureConfig,
+    generator: torch.Generator,
+) -> SceneMaps:
+    """Return the maps of radiance (P, F) and true normals (P, 3) that were photographed and estimated."""
+    observations, lights = photograph_scene(radiance, lights, config, generator)
     features = pixel_features(network, observations, lights)
     return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 

@@ -1,0 +1,88 @@
+"""The shipped refinement net invents nothing: analytic scenes whose normals are known everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture
+from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.methods import make_estimator
+from splinecli.normals import angle_between_deg, unit
+
+SIZE = 64
+AZIMUTH = np.arange(10) * np.radians(36)
+ZENITH = np.radians(np.where(np.arange(10) % 2, 25, 50))
+LIGHTS = np.stack(
+    (np.sin(ZENITH) * np.cos(AZIMUTH), np.sin(ZENITH) * np.sin(AZIMUTH), np.cos(ZENITH)), axis=1
+)
+ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
+PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
+
+
+def refined_and_not(
+    normals: NDArray[np.floating], albedo: NDArray[np.floating] | float, *, noise: float, gloss: float = 0.0
+) -> tuple[NormalEstimate, NormalEstimate]:
+    """Estimate a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale."""
+    rng = np.random.default_rng(0)
+    flat = normals.reshape(-1, 3)
+    half = unit(LIGHTS + np.array((0, 0, 1)))
+    observations = np.broadcast_to(albedo, (SIZE, SIZE)).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
+    observations = observations + gloss * (flat @ half.T).clip(0) ** 60
+    observations += noise * observations.max() * rng.normal(size=observations.shape)
+    mask = np.ones((SIZE, SIZE), np.bool_)
+    capture = Capture(
+        "scene",
+        observations.clip(0).astype(np.float32),
+        LIGHTS,
+        tuple(range(10)),
+        mask,
+        normals.astype(np.float32),
+    )
+    refined, pixelwise = (
+        estimate_normals(capture, make_estimator(name)) for name in ("spline-net", "spline-net-pixelwise")
+    )
+    return refined, pixelwise
+
+
+def mean_error_deg(estimate: NormalEstimate) -> float:
+    assert estimate.errors is not None
+    return estimate.errors.mean
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_a_noisy_plate_becomes_flatter_and_stays_where_it_is(noise: float) -> None:
+    refined, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
+    assert mean_error_deg(refined) < 0.8 * mean_error_deg(pixelwise)
+    mean = unit(refined.normal_map.mean(axis=(0, 1)))
+    assert float(angle_between_deg(mean, PLATE[0, 0])) < 0.6
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss: float) -> None:
+    bright = (ROWS // 8 + COLUMNS // 8) % 2 == 1
+
+    def step_deg(estimate: NormalEstimate) -> float:
+        """The angle between the mean normals of the dark and of the bright squares."""
+        dark_mean, bright_mean = (unit(estimate.normal_map[part].mean(axis=0)) for part in (~bright, bright))
+        return float(angle_between_deg(dark_mean, bright_mean))
+
+    refined, pixelwise = refined_and_not(PLATE, np.where(bright, 0.8, 0.2), noise=0.005, gloss=gloss)
+    assert step_deg(refined) < step_deg(pixelwise) + 0.1
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+@pytest.mark.parametrize("width", [2, 4])
+def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
+    """Slopes of 17 degrees, `width` pixels to either side."""
+    slope = np.where((COLUMNS // width) % 2 == 1, 0.3, -0.3)
+    normals = unit(np.stack((-slope, np.zeros_like(slope), np.ones_like(slope)), axis=-1))
+
+    def depth(estimate: NormalEstimate) -> float:
+        """The mean slope along the grooves' own, of which 1 is true."""
+        found = -estimate.normal_map[..., 0] / estimate.normal_map[..., 2]
+        return float((found / slope).mean())
+
+    refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
+    assert depth(refined) == pytest.approx(depth(pixelwise), rel=0.1)
