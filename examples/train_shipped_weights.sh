@@ -10,22 +10,25 @@ folder=${1:?name a folder for the scenes and the runs}
 
 splinecli=${SPLINECLI:-splinecli}
 "$splinecli" prepare --scenes 15 --size 96 --n-lights 200 --seed 21 -o "$folder/scenes"
+"$splinecli" prepare --scenes 60 --size 128 --n-lights 100 --seed 101 -o "$folder/whole-scenes"
 
 # Resume a run that was interrupted; skip a run that is finished.
 run() {
   name=$1
-  shift
+  set=$2
+  shift 2
   if [ -e "$folder/$name/finished" ]; then return; fi
   if [ -e "$folder/$name/checkpoint.safetensors" ]; then set -- "$@" --resume; fi
-  "$splinecli" train "$folder/scenes" "$@" -o "$folder/$name"
+  "$splinecli" train "$folder/$set" "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-run spline-net-1 --preset compact --generator-weight 2 --steps 6280
-run spline-net-2 --preset compact --generator-weight 2 --steps 2340 --param learning_rate=1e-3 \
+run spline-net-1 scenes --preset compact --generator-weight 2 --steps 6280
+run spline-net-2 scenes --preset compact --generator-weight 2 --steps 2340 --param learning_rate=1e-3 \
   --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
-run cnn-ps-1 --preset cnn-ps --generator-weight 3 --steps 8136
-run cnn-ps-2 --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
+run spline-net-3 whole-scenes --preset refine --steps 3300 --start-from "$folder/spline-net-2/weights.safetensors"
+run cnn-ps-1 scenes --preset cnn-ps --generator-weight 3 --steps 8136
+run cnn-ps-2 scenes --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
   --start-from "$folder/cnn-ps-1/weights.safetensors"
 
-echo "$folder/spline-net-2/weights.safetensors"
+echo "$folder/spline-net-3/weights.safetensors"
 echo "$folder/cnn-ps-2/weights.safetensors"
