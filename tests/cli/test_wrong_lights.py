@@ -154,7 +154,9 @@ def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     assert few.code == 0
     (warning,) = json.loads(few.out)[0]["warnings"]
     assert warning["code"] == "lights_unchecked"
-    assert warning["text"].endswith("their order (fewer than 6 lights, or too few lit pixels).")
+    assert warning["text"].endswith(
+        "their order (fewer than 6 lights, too few lit pixels, or a flat object)."
+    )
     mask = np.zeros((128, 128), np.uint8)
     mask[40:90, 40:90] = 255
     cv2.imwrite(str(medallion / "mask.png"), mask)

@@ -140,6 +140,45 @@ def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
     assert flipped.best.frame.signs[0] != flipped.best.frame.signs[1]
 
 
+def metal(normals: Array, lights: Array) -> Array:
+    """A highlight, whose brightness varies from image to image, and hardly any matte reflection."""
+    half = lights + np.array((0.0, 0.0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    lit = np.clip(normals @ lights.T, 0, None)
+    return 0.02 * lit + np.clip(normals @ half.T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (np.arange(14), None),
+        (np.r_[0, 1, 9, 3:9, 2, 10:14], "with those of 3 and 10 exchanged"),
+        (np.random.default_rng(1).permutation(14), UNKNOWN_ORDER),
+    ],
+    ids=["right", "swapped", "shuffled"],
+)
+def test_the_order_of_metal_is_judged(order: NDArray[np.int64], words: str | None) -> None:
+    normals, mask = vase()
+    assert check_lights(metal(normals, scattered()), mask, scattered()[order]).order == words
+
+
+def test_on_a_flat_relief_only_known_intensities_tell_the_order() -> None:
+    y, x = np.mgrid[0 : 3 : SIZE * 1j, 0 : 3 : SIZE * 1j]
+    normals = np.stack((-0.03 * np.cos(3 * x), 0.03 * np.sin(2 * y), np.ones_like(x)), axis=2).reshape(-1, 3)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mask, lights = np.ones((SIZE, SIZE), np.bool_), scattered()
+    observations = shade(normals, lights)
+    for given, known, order in (
+        (lights, True, None),
+        (lights, False, None),
+        (np.roll(lights, 1, axis=0), True, "if image 1 belongs to light 2, image 2 to the next, and so on"),
+    ):
+        factors = find_factors(observations, intensities_known=known)
+        check = check_lights(observations, mask, given, factors=factors)
+        assert check.order == order
+        assert (check.given_misfit is None) == (not known)
+
+
 def test_few_lights_abstain_about_the_order() -> None:
     lights = scattered(5)
     check = check_vase(lights, lights[::-1])

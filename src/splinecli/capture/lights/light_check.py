@@ -35,9 +35,6 @@ NEAR = 0.1
 LOWEST_CURL = 0.1
 """Curls below this are noise. On a cap of a sphere, other frames give little more."""
 
-MAX_MISFIT_OF_RIM = 0.5
-"""With a larger misfit, normals of metal say little about the outline."""
-
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.8
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
 
@@ -98,7 +95,9 @@ class LightCheck:
         """What the images do not tell about the lights, in words."""
         missing = []
         if self.given_misfit is None:
-            missing.append(f"their order (fewer than {MIN_LIGHTS} lights, or too few lit pixels)")
+            missing.append(
+                f"their order (fewer than {MIN_LIGHTS} lights, too few lit pixels, or a flat object)"
+            )
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
@@ -132,7 +131,7 @@ def check_lights(
     found = check_order(observations, factors, light_directions, chosen, names)
     normals = rough_normals(observations / found.intensities, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
-    if found.misfit is not None and found.misfit > MAX_MISFIT_OF_RIM:
+    if not found.plausible:
         weight = 0.0
     weight = float(np.clip(weight, 0, 1))
     first, *others = (

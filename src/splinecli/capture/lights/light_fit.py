@@ -3,12 +3,12 @@
 The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
 (Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
 factors are found without the lights. Right lights are linear combinations of these factors, whatever their frame.
-Lights in a wrong order are not. Where nobody measured the light intensities, each light may have any length.
+Lights in a wrong order are not.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ INTENSITY_PRIOR = 0.01
 
 INTENSITY_LIMITS = (0.1, 10.0)
 
-_ROUNDS, _INTENSITY_ROUNDS = 25, 12
+_ROUNDS, _INTENSITY_ROUNDS = 8, 12  # more rounds fit the highlights of metals
 _PRIOR = 1e-9
 _FITS = 5
 
@@ -50,6 +50,10 @@ class Factors:
     matrix: Array
     residual: float
     intensities_known: bool = True
+
+    def with_free_intensities(self) -> Factors:
+        """Return the factors of the same observations, to be compared with lights of any intensities."""
+        return replace(self, intensities_known=False)
 
     def misfits(self, light_directions: Array) -> Array:
         """Return the root mean square distances (N,) from the images that lights (N, F, 3) can explain."""
@@ -140,12 +144,15 @@ def swapped_orders(n_lights: int) -> NDArray[np.int64]:
 
 
 def fit_residual(values: Array, light_directions: Array) -> float:
-    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3)."""
+    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations under lights (F, 3).
+
+    It is a share of the mean of the lit values.
+    """
     lit = weights = (values > LIT_SHARE).astype(np.float64)
     for _ in range(_FITS):
         residuals = values - predict(values, weights, light_directions)
         weights = lit * absolute_weights(residuals)
-    return float((np.abs(residuals) * lit).sum() / lit.sum())
+    return float((np.abs(residuals) * lit).sum() / (values * lit).sum())
 
 
 def sample_pixels(observations: NDArray[np.floating]) -> Array:

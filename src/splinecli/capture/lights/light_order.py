@@ -1,5 +1,9 @@
 """Tell lights in a wrong order from right ones, by how well the images fit them.
 
+Each light may have any intensity, even if intensities are known: highlights brighten some images of a metal more than
+others, as a stronger lamp would. This tells its right lights from wrong ones far better than known intensities do. On
+flat objects, however, free intensities explain any order.
+
 The thresholds were chosen on the same captures as those of light_check.py.
 """
 
@@ -29,6 +33,9 @@ MIN_LIGHTS = 6
 BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
 """Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
 
+MAX_MENDED = 0.35
+"""Largest misfit of a better order, as a share of random orders'. Right lights of most metals have less."""
+
 MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
 """Smallest misfit of a wrong order, as a share of the median of random orders: of all lights, of two exchanged ones."""
 
@@ -36,10 +43,15 @@ CHANCE = 0.02
 """An order is wrong if more than this share of random orders fits as well."""
 
 MIN_LIGHTS_FOR_CHANCE = 8
+"""Fewer lights fit in too many random orders by chance. They are compared under known intensities, if there are any."""
 
-MAX_RESIDUAL = 0.2
-"""Above this residual of the factors, images of metal and of shiny hollows do not tell whether an order fits at all:
-their right lights may fit like a random order. Another order that fits much better is still named."""
+MIN_RANDOM_MISFIT = 0.05
+"""Smallest median misfit of random orders, as a share of the brightness, with which free intensities tell an order."""
+
+MAX_RESIDUAL, MIN_LIGHTS_OF_METAL = 0.2, 12
+"""With a larger residual of the factors and fewer lights, images of metal and of shiny hollows do not tell whether an
+order fits at all: their right lights may fit like a random order. Another order that fits much better is still named.
+"""
 
 UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
 """An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
@@ -51,8 +63,11 @@ UNKNOWN_ORDER = "unknown"
 ZENITH = "if their elevations count from the camera axis"
 """The reading of lights whose file has zenith angles in place of elevations, in words."""
 
-RANDOM_FIT = 0.85
+RANDOM_FIT = 0.7
 """Lights whose residual is below this share of that in random orders are not said to be in a wrong order."""
+
+MAX_PLAIN_MISFIT, MAX_FREE_MISFIT = 0.5, 0.35
+"""Above these misfits under known and free intensities, as shares of random orders', normals are not plausible."""
 
 _FITTED_PIXELS, _FITTED_ORDERS = 800, 9
 
@@ -67,6 +82,7 @@ class LightOrder:
         intensities: (F,), those that fit these lights best; ones where they are known.
         given_misfit, misfit: of the given order and of this one, as shares of random orders'; None where there are too
             few lights.
+        plausible: whether the lights fit well enough for the normals to tell an outline.
         tried: readings in words, each with its misfit as a share of random orders'.
         turns: rows of shifted_orders that fit as well, with the matrices (3, 3) that take the lights there. They turn a
             regular ring of lights.
@@ -77,6 +93,7 @@ class LightOrder:
     intensities: Array
     given_misfit: float | None = None
     misfit: float | None = None
+    plausible: bool = True
     tried: tuple[tuple[str, float], ...] = ()
     turns: tuple[tuple[int, Array], ...] = ()
 
@@ -99,9 +116,10 @@ def check_order(
     lights, n_all = light_directions[chosen], len(light_directions)
     if factors is None or len(lights) < MIN_LIGHTS:
         return LightOrder(None, lights, np.ones(len(lights)))
-
-    random = random_misfits(factors, lights)
+    fitted, factors, random = factors, *_free_if_possible(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
+    if usual < MIN_RANDOM_MISFIT and not fitted.intensities_known:
+        return LightOrder(None, lights, np.ones(len(lights)))
     given = float(factors.misfits(lights[None])[0])
     share, limit = given / usual, given * (BETTER_ORDER if len(lights) > FEW else BETTER_ORDER_OF_FEW)
     shifted = light_directions[shifted_orders(n_all)[:, chosen]]
@@ -124,24 +142,38 @@ def check_order(
     def found(
         order: str | None, lights: Array, misfit: float, turns: tuple[tuple[int, Array], ...] = ()
     ) -> LightOrder:
-        intensities = factors.intensities(lights[None])[0]
-        return LightOrder(order, lights, intensities, share, misfit / usual, tried, turns)
+        plain, limit = misfit / usual, MAX_FREE_MISFIT
+        if fitted.intensities_known:
+            random, limit = random_misfits(fitted, lights), MAX_PLAIN_MISFIT
+            plain = float(fitted.misfits(lights[None])[0] / max(np.median(random), 1e-9))
+        intensities = fitted.intensities(lights[None])[0]
+        return LightOrder(order, lights, intensities, share, misfit / usual, plain <= limit, tried, turns)
 
     *of_all, exchanged, of_angles = candidates
     words, better, mended = min((*of_all, of_angles), key=lambda candidate: candidate[2])
-    if share > MIN_MISFIT and mended < limit:
+    if share > MIN_MISFIT and mended < min(limit, MAX_MENDED * usual):
         fits = shift_misfits <= max(1.3 * mended, 0.05 * usual)
         return found(words, better, mended, () if words == ZENITH else _turns(better, shifted, fits))
-    if share > MIN_SWAP_MISFIT and exchanged[2] < limit:
+    if share > MIN_SWAP_MISFIT and exchanged[2] < min(limit, MAX_MENDED * usual):
         return found(*exchanged)
-    judged = factors.residual < MAX_RESIDUAL
     by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
     suspected = by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)
+    judged = factors.residual < MAX_RESIDUAL or len(lights) >= MIN_LIGHTS_OF_METAL
     if judged and suspected and _fits_like_random(observations, factors, lights):
         return found(UNKNOWN_ORDER, lights, given)
     fitting = shift_misfits <= max(1.3 * given, 0.05 * usual)
     turns = _turns(lights, shifted, fitting) if share < MIN_MISFIT else ()
     return found(None, lights, given, turns)
+
+
+def _free_if_possible(factors: Factors, lights: Array) -> tuple[Factors, Array]:
+    """Return factors that are compared with lights of any intensities, if these tell orders, and random misfits."""
+    free = factors.with_free_intensities()
+    random = random_misfits(free, lights)
+    few = factors.intensities_known and len(lights) < MIN_LIGHTS_FOR_CHANCE
+    if few or np.median(random) < MIN_RANDOM_MISFIT:
+        return factors, random_misfits(factors, lights) if factors.intensities_known else random
+    return free, random
 
 
 def _fits_like_random(observations: NDArray[np.floating], factors: Factors, lights: Array) -> bool:
