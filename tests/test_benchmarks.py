@@ -102,6 +102,13 @@ def test_near_lamps(run: Run) -> None:
     assert distant < 1 > distant_range
 
 
+def test_large_captures(run: Run) -> None:
+    header, row = run("large_captures", "--megapixels", "0.001", "--method", "ls").splitlines()
+    assert header.split()[0] == "megapixels"
+    assert numbers(row)[0] == pytest.approx(0.001, abs=2e-4)
+    assert row.endswith("exact")
+
+
 def test_busy_machine(run: Run) -> None:
     """The quiet machine alone: each figure takes a process that loads PyTorch."""
     header, row = run("busy_machine", "--busy", "0", "--pixels", "100", "--repeats", "1").splitlines()

@@ -1,0 +1,101 @@
+"""Measure time and memory of `infer` against the size of the capture.
+
+python benchmarks/large_captures.py [--megapixels 0.05 0.5 2 6 24] [--method spline-net] [--formats png,npy]
+
+Each capture is a smooth bumpy relief with a glossy half: ten 16-bit RGB images in PNG files under ten lights, with
+noise, all pixels in the mask. Each run is a process of its own. The table has the seconds of the report (reading,
+estimating, writing), those of all processor cores together, and the largest memory. On a busy machine, only the
+processor's seconds mean something, and they only beside others of the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+LIGHTS = 10
+COLOUR = np.array((0.8, 1.0, 0.7), np.float32)
+
+
+def directions() -> NDArray[np.float32]:
+    """Return lights (10, 3) on a spiral, 10 to 50 degrees from the view axis."""
+    azimuth, zenith = 2.4 * np.arange(LIGHTS), np.radians(np.linspace(10, 50, LIGHTS))
+    xy = np.sin(zenith) * (np.cos(azimuth), np.sin(azimuth))
+    return np.stack((*xy, np.cos(zenith)), axis=1).astype(np.float32)
+
+
+def relief(height: int, width: int) -> NDArray[np.float32]:
+    """Return the unit normals (H, W, 3) of a bumpy relief, the same bumps at each size."""
+    rng = np.random.default_rng(0)
+    slopes = [
+        cv2.resize(
+            rng.normal(scale=0.7, size=(12, 18)).astype(np.float32),
+            (width, height),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        for _ in range(2)
+    ]
+    length = np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
+    return np.stack((slopes[0] / length, slopes[1] / length, 1 / length), axis=-1)
+
+
+def write_capture(folder: Path, megapixels: float) -> tuple[int, int]:
+    """Write a capture of about this size, and return its width and height."""
+    height = max(8, round((megapixels * 1e6 / 1.5) ** 0.5))
+    width = round(1.5 * height)
+    normals, rng = relief(height, width), np.random.default_rng(1)
+    glossy = np.arange(width) > width / 2
+    for number, light in enumerate(directions()):
+        half = light + np.array((0, 0, 1), np.float32)
+        half /= np.linalg.norm(half)
+        shade = np.clip(normals @ light, 0, None)
+        shade += glossy * 0.5 * np.clip(normals @ half, 0, None) ** 40
+        shade += 0.003 * rng.standard_normal(shade.shape, np.float32)
+        stored = (np.clip(shade[..., None] / 1.6 * COLOUR, 0, 1) * 65535).astype(np.uint16)
+        cv2.imwrite(str(folder / f"{number:02d}.png"), stored)
+    np.savetxt(folder / "light_directions.txt", directions())
+    np.savetxt(folder / "light_intensities.txt", np.ones((LIGHTS, 3)))
+    return width, height
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--megapixels", type=float, nargs="+", default=[0.05, 0.5, 2, 6, 24])
+    parser.add_argument("--method", default="spline-net")
+    parser.add_argument("--formats", default="png,npy")
+    options = parser.parse_args(arguments)
+    print("megapixels      read  estimate     write   processor    memory  unlike")
+    for megapixels in options.megapixels:
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / "relief"
+            folder.mkdir()
+            width, height = write_capture(folder, megapixels)
+            before = os.times()
+            command = [sys.executable, "-m", "splinecli", "infer", str(folder), "-o", place, "--json"]
+            command += ["--method", options.method, "--format", options.formats]
+            (report,) = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+            after = os.times()
+        processor = (
+            after.children_user + after.children_system - before.children_user - before.children_system
+        )
+        seconds, distilled = report["seconds"], report["distillation"]
+        unlike = "exact" if distilled is None else distilled["unlike_pixels"]
+        stages = " ".join(f"{seconds[stage]:7.1f} s" for stage in ("read", "estimate", "write"))
+        print(
+            f"{width * height / 1e6:10.3f} {stages} {processor:9.1f} s {report['peak_memory_mib']:5d} MiB  {unlike}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
