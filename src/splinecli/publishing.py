@@ -3,8 +3,8 @@
 New files are first written into a hidden folder inside the output folder and synced to disk. One rename then marks them
 as complete. After that they are moved to their places, the report last. A process that is killed before this rename
 leaves the earlier files as they were. If it is killed later, the next process that holds the folder moves the rest. In
-between the folder has no report, or only the new one when all is in its place, so nothing describes a mixture of old
-and new files. No reader of splinecli takes a file from such a folder (see is_unfinished).
+between the folder has no report while it has files of both runs, so nothing describes a mixture. No reader of splinecli
+takes a file from such a folder (see is_unfinished).
 """
 
 from __future__ import annotations

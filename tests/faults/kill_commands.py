@@ -3,8 +3,8 @@
 A kill comes before a change of a file, or at a random time. After it,
 
 - every file is whole: it is that of the earlier run or of the new one;
-- the files are all of one run, or the folder is marked as unfinished, has no report, or the new one with all new files,
-  and no reader takes a file from it.
+- the files are all of one run, or the folder has no report;
+- no reader takes a file from a folder in which new files are being moved to their places.
 
 Then the folder is put in order, as the next start does. It must hold the earlier files or the new ones, and nothing
 else. Then the same command runs again, and must end with the same files as an undisturbed run.
@@ -172,8 +172,8 @@ class KilledCommand:
                 yield f"a mixture of {sorted(state)} for readers"
             return
         name = (held / self.replacement.report).relative_to(self.case / "out").as_posix()
-        if name in state and state != self.new and not self._says_unfinished(state):
-            yield "an unfinished folder has a report"
+        if name in state and self._is_mixture(state):
+            yield "an unfinished folder has a report of a mixture"
         for path in held.glob("[!.]*"):
             try:
                 if path.is_file():
