@@ -84,5 +84,5 @@ def test_presets_by_name() -> None:
     assert (paper.eta, paper.lambda_c) == (1.0, 50.0)
     assert (paper.pixels.min_lights, paper.pixels.max_lights, paper.pixels.usual_lights) == (10, 10, 10)
     assert paper.network.size == "paper"
-    with pytest.raises(UsageError, match="no preset named 'tiny'; expected one of compact, paper"):
+    with pytest.raises(UsageError, match="no preset named 'tiny'; expected one of compact, refine, paper"):
         preset("tiny")

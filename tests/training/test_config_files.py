@@ -29,7 +29,7 @@ def write(path: Path, text: str) -> Path:
 def test_without_anything_it_is_compact() -> None:
     assert configure() == preset("compact")
     assert configure("paper") == preset("paper")
-    with pytest.raises(UsageError, match="no preset named 'huge'; expected one of compact, paper"):
+    with pytest.raises(UsageError, match="no preset named 'huge'; expected one of compact, refine, paper"):
         configure("huge")
 
 

@@ -121,7 +121,11 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
                 line=line,
                 hint="Add --images-elsewhere if you trust this file",
             )
-        if find_mode(image) is None:
+        try:
+            exists = find_mode(image) is not None
+        except InputError:  # the system refuses, for example because the name is too long
+            exists = False
+        if not exists:
             raise InputError(
                 f'the image "{name}" does not exist',
                 path=path,
