@@ -7,6 +7,8 @@ capture.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
@@ -57,6 +59,7 @@ def estimate_normals(
     *,
     tile_pixels: int | None = None,
     progress: Progress | None = None,
+    refining: Callable[[], AbstractContextManager[Progress]] | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
 
@@ -66,6 +69,7 @@ def estimate_normals(
         tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
         progress: called with the number of pixels just finished: after each batch of the estimator, and up to 128 times
             a batch of a network, not only after each tile.
+        refining: called where the refinement begins; its function is called with the number of pixels just refined.
 
     Raises:
         SplinecliError: the estimator gave normals that are not unit vectors.
@@ -89,7 +93,8 @@ def estimate_normals(
     refiner = refiner_of(estimator)
     if refiner is not None and errors is not None:
         light_of = partial(_light_on, capture)
-        normals, errors = refiner.refine(capture.mask, capture.observations, light_of, normals, errors)
+        with nullcontext() if refining is None else refining() as advance:
+            refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
     normal_map = np.zeros((*capture.mask.shape, 3), np.float32)

@@ -26,6 +26,10 @@ def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
         "cat: estimating: 60 %, calm",
         "cat: estimating: 90 %, calm",
     ]
+    with Messages(quiet=False).progress("cat: refining", 100_000, unit="pixels") as advance:
+        now += 40
+        advance(25_000)
+    assert capsys.readouterr().err == "cat: refining: 25 %, 625 pixels/s, 120 s left\n"
     with Messages(quiet=True).progress("cat: estimating", 1) as advance:
         now += 100
         advance(0.5)

@@ -449,7 +449,7 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
         def __init__(self) -> None:
             self.stages: list[tuple[str, float]] = []
 
-        def progress(self, label, total, *, start=0.0):
+        def progress(self, label, total, *, start=0.0, unit=""):
             self.stages.append((label, total))
             return super().progress(label, total, start=start)
 

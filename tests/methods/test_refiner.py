@@ -50,17 +50,25 @@ def refine(
         observations[dark], errors[dark] = 0, UNKNOWN_ERROR
     net = lively(RefineNet())
     assert isinstance(net, RefineNet)
-    found = Refiner(net, "float32", tile=tile).refine(
-        mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals, errors
+    refined = normals.copy()
+    done: list[int] = []
+    Refiner(net, "float32", tile=tile).refine(
+        mask,
+        observations,
+        lambda rows: LampLight(observations[rows], LIGHTS),
+        refined,
+        errors,
+        progress=done.append,
     )
-    return normals, *found
+    assert sum(done) == count
+    return normals, refined, errors
 
 
 def test_tiles_change_nothing() -> None:
-    mask = np.random.default_rng(0).random((REACH + 70, 2 * REACH + 50)) < 0.95
+    mask = np.random.default_rng(0).random((2 * REACH + 70, 2 * REACH + 50)) < 0.95
     mask[30:60, 40:90] = False
     _, normals, errors = refine(mask, 512)
-    _, tiled, tiled_errors = refine(mask, 32)
+    _, tiled, tiled_errors = refine(mask, REACH)
     np.testing.assert_allclose(tiled, normals, atol=1e-4)
     np.testing.assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)

@@ -23,7 +23,7 @@ class Counter(Observer):
         self.steps: list[float] = []
 
     @contextmanager
-    def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Advance]:
+    def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
         yield lambda amount, note="": self.steps.append(amount)
 
 

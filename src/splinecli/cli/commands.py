@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from splinecli.cli.choices import fill_in
 from splinecli.cli.failures import ParserError, print_error_document
 from splinecli.cli.panels import sort_into_panels
-from splinecli.memory import check_address_space
+from splinecli.memory import check_address_space, keep_freed_memory
 
 TERM_WIDTH = 30
 """Columns of the names of options in the help; a longer name has a line of its own."""
@@ -53,6 +53,7 @@ class Command(TyperCommand):
         ctx.params = {name: _expand(value) for name, value in ctx.params.items()}
         try:
             check_address_space()
+            keep_freed_memory()
             return _without_end_of_file(super().invoke, ctx)
         except Exception as error:
             # infer prints its list itself, with what it has done until then.

@@ -69,18 +69,19 @@ class Messages(Observer):
         Console(stderr=True, markup=False, highlight=False).print(table)
 
     @contextmanager
-    def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Advance]:
+    def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
         """Show the progress of a stage; yields `advance(amount, note="")`, which moves it."""
         if self.quiet:
             yield lambda amount, note="": None
         elif sys.stderr.isatty():
-            with _bar(label, total, start) as advance:
+            with _bar(label, total, start, unit) as advance:
                 yield advance
         else:
-            yield self._lines(label, total, start)
+            yield self._lines(label, total, start, unit)
 
-    def _lines(self, label: str, total: float, start: float) -> Advance:
-        done, shown = start, time.monotonic()
+    def _lines(self, label: str, total: float, start: float, unit: str) -> Advance:
+        done = start
+        began = shown = time.monotonic()
 
         def advance(amount: float, note: str = "") -> None:
             nonlocal done, shown
@@ -88,13 +89,15 @@ class Messages(Observer):
             now = time.monotonic()
             if now - shown >= LINE_SECONDS and done < total:
                 shown = now
-                self.say(f"{label}: {100 * done / total:.0f} %" + (f", {note}" if note else ""))
+                speed = (done - start) / (now - began)
+                notes = [f"{speed:,.0f} {unit}/s", f"{(total - done) / speed:.0f} s left"] if unit else []
+                self.say(", ".join((f"{label}: {100 * done / total:.0f} %", *notes, *filter(None, [note]))))
 
         return advance
 
 
 @contextmanager
-def _bar(label: str, total: float, start: float) -> Iterator[Advance]:
+def _bar(label: str, total: float, start: float, unit: str) -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -103,14 +106,17 @@ def _bar(label: str, total: float, start: float) -> Iterator[Advance]:
         BarColumn(),
         TextColumn("{task.percentage:3.0f}%"),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[speed]}", markup=False),
         TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(printable(label), total=total, note="")
+        task = bar.add_task(printable(label), total=total, note="", speed="")
         bar.update(task, completed=start)
 
         def advance(amount: float, note: str = "") -> None:
             bar.update(task, advance=amount)
+            if unit and (speed := bar.tasks[0].speed):
+                bar.update(task, speed=f"{speed:,.0f} {unit}/s")
             if note:
                 bar.update(task, note=note)
 

@@ -34,10 +34,10 @@ def fit_lambertian(observations: Tensor, light_directions: Tensor, valid: Tensor
     lit = torch.where(observations < SHADOW_SHARE, 1e-3, 1.0) * counts
     solution = observations.new_tensor((0.0, 0.0, 1e-3)).expand(len(observations), 3)
     weight = lit
-    for _ in range(ITERATIONS):
+    for iteration in range(ITERATIONS):
+        if iteration:
+            weight = lit / ((dot(solution, light_directions) - observations).abs() + 0.02)
         inverse = inverse_3x3((weighted_sum(weight, products) + prior).unbind(-1), SMALLEST_PIVOT)
         right_side = weighted_sum(weight * observations, light_directions) + _PRIOR * solution
         solution = torch.stack(multiply_symmetric(inverse, right_side.unbind(-1)), dim=-1)
-        residual = dot(solution, light_directions) - observations
-        weight = lit / (residual.abs() + 0.02)
     return solution

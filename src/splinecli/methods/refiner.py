@@ -2,23 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splinecli.methods.estimator import Progress
 from splinecli.methods.lamp_light import LampLight
-from splinecli.networks.refine_features import brightness, refine_features
-from splinecli.networks.refine_net import COARSEST, REACH, RefineNet
+from splinecli.networks.refine_features import CHANNELS, brightness, refine_features
+from splinecli.networks.refine_net import COARSEST, REACH, Part, RefineNet
 
-TILE = 512
-"""Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin of REACH comes on top."""
+TILE = 768
+"""Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin of REACH comes on top.
+
+Larger tiles take less time, because their margins are smaller in all, and more memory.
+"""
+
+_BLOCK = 1 << 16  # pixels whose features are computed at once
 
 LightOf = Callable[[NDArray[np.integer]], LampLight]
 """From rows of a capture's pixels to their observations and light directions."""
 
 Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """A part of the map with a margin.
+
+    Args:
+        mask: (h, w), with the margin.
+        rows: (h, w), the rows of its pixels in the capture.
+        inner: the part without the margin.
+    """
+
+    mask: NDArray[np.bool_]
+    rows: NDArray[np.integer]
+    inner: Part
 
 
 class Refiner:
@@ -32,6 +54,7 @@ class Refiner:
 
     def __init__(self, network: RefineNet, precision: str, *, tile: int = TILE) -> None:
         assert tile % COARSEST == 0 == REACH % COARSEST
+        assert tile >= REACH, "the margin of a tile must be within its neighbours"
         self.network = network
         self.precision = precision
         self.tile = tile
@@ -44,65 +67,87 @@ class Refiner:
         light_of: LightOf,
         normals: Floats,
         errors: Floats,
-    ) -> tuple[Floats, Floats]:
-        """Return refined normals (P, 3) and distributions of their errors (P, 2); see networks/error_head.py.
+        *,
+        progress: Progress | None = None,
+    ) -> None:
+        """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
-        A pixel that is dark under every light stays as it is.
+        A pixel that is dark under every light stays as it is. See networks/error_head.py for the distributions.
 
         Args:
             mask: (H, W), with P true pixels.
             observations: (P, F); only their brightness counts here.
             light_of: gives the observations and the light directions of some pixels.
             normals, errors: of the estimator, in the capture's frame.
+            progress: called after each tile with the number of its pixels.
         """
-        row_of_pixel = np.cumsum(mask.reshape(-1), dtype=np.int32).reshape(mask.shape) - 1
         reference = brightness(torch.from_numpy(observations))
-        refined, refined_errors = np.empty_like(normals), np.empty_like(errors)
+        above: list[tuple[NDArray[np.integer], Floats, Floats]] = []
+        for tiles in self._rows_of_tiles(mask):
+            found = []
+            for tile in tiles:
+                own = tile.rows[tile.inner][tile.mask[tile.inner]]
+                refined, refined_errors = self._refine(tile, light_of, normals, errors, reference)
+                # Nothing is known of a pixel that is dark under every light.
+                lit = observations[own].max(axis=1) > 0
+                found.append((own[lit], refined[lit], refined_errors[lit]))
+                if progress is not None:
+                    progress(len(own))
+            # These tiles needed the pixels above as they were. The tiles below need these tiles' pixels.
+            _replace(above, normals, errors)
+            above = found
+        _replace(above, normals, errors)
+
+    def _rows_of_tiles(self, mask: NDArray[np.bool_]) -> Iterator[Iterator[_Tile]]:
+        """Yield the tiles that have pixels, by their rows."""
+        pixels_before = np.concatenate(([0], np.count_nonzero(mask, axis=1).cumsum()))
         for top in range(0, mask.shape[0], self.tile):
-            for left in range(0, mask.shape[1], self.tile):
-                inner = slice(top, top + self.tile), slice(left, left + self.tile)
-                if not mask[inner].any():
-                    continue
-                outer = tuple(slice(max(0, side.start - REACH), side.stop + REACH) for side in inner)
-                seen = mask[outer]
-                rows = row_of_pixel[outer][seen]
-                found, found_errors = self._refine(
-                    seen, light_of(rows), normals[rows], errors[rows], reference
-                )
-                # The margin belongs to other tiles.
-                own = np.zeros_like(mask[outer])
-                own[
-                    tuple(
-                        slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer, strict=True)
-                    )
-                ] = True
-                kept = own[seen]
-                refined[rows[kept]], refined_errors[rows[kept]] = found[kept], found_errors[kept]
-        # Nothing is known of a pixel that is dark under every light.
-        dark = observations.max(axis=1) <= 0
-        refined[dark], refined_errors[dark] = normals[dark], errors[dark]
-        return refined, refined_errors
+            band = slice(max(0, top - REACH), top + self.tile + REACH)
+            rows = mask[band].cumsum().reshape(mask[band].shape) + (pixels_before[band.start] - 1)
+            yield self._tiles_of_band(mask[band], rows, top - band.start)
+
+    def _tiles_of_band(self, mask: NDArray[np.bool_], rows: NDArray[np.integer], top: int) -> Iterator[_Tile]:
+        """Yield the tiles of a part of the map with a margin, of which they begin at the row `top`."""
+        for left in range(0, mask.shape[1], self.tile):
+            outer = slice(max(0, left - REACH), left + self.tile + REACH)
+            seen = mask[:, outer]
+            start = left - outer.start
+            inner = slice(top, top + self.tile), slice(start, start + self.tile)
+            if seen[inner].any():
+                yield _Tile(seen, rows[:, outer], inner)
 
     def _refine(
-        self, mask: NDArray[np.bool_], light: LampLight, normals: Floats, errors: Floats, reference: float
+        self, tile: _Tile, light_of: LightOf, normals: Floats, errors: Floats, reference: float
     ) -> tuple[Floats, Floats]:
-        """Refine the pixels of one tile (h, w)."""
+        """Return the refined normals and errors of a tile without its margin."""
         device = self.network.enter.weight.device
 
         def tensor(values: NDArray[np.floating]) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        found = refine_features(
-            tensor(light.observations),
-            tensor(light.directions),
-            tensor(light.in_frame_of_pixels(normals)),
-            tensor(errors),
-            reference,
-        )
-        inside = torch.from_numpy(mask).to(device)
-        features = found.new_zeros(found.shape[1], *mask.shape)
-        features[:, inside] = found.T
+        features = torch.zeros(*tile.mask.shape, CHANNELS, device=device)
+        rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(device)
+        for start in range(0, len(rows), _BLOCK):
+            block = rows[start : start + _BLOCK]
+            light = light_of(block)
+            features.view(-1, CHANNELS)[places[start : start + _BLOCK]] = refine_features(
+                tensor(light.observations),
+                tensor(light.directions),
+                tensor(light.in_frame_of_pixels(normals[block])),
+                tensor(errors[block]),
+                reference,
+            )
+        mask = torch.from_numpy(tile.mask).to(device, torch.float32)
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            maps = self.network(features[None], inside.float()[None, None])
-        refined, refined_errors = (values[0][:, inside].T.cpu().numpy() for values in maps)
-        return np.asarray(light.in_frame_of_capture(refined), np.float32), refined_errors
+            maps = self.network(features.permute(2, 0, 1)[None], mask[None, None], tile.inner)
+        inside = tile.mask[tile.inner]
+        refined, refined_errors = (values[0].permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
+        own = tile.rows[tile.inner][inside]
+        return np.asarray(light_of(own).in_frame_of_capture(refined), np.float32), refined_errors
+
+
+def _replace(
+    found: Iterable[tuple[NDArray[np.integer], Floats, Floats]], normals: Floats, errors: Floats
+) -> None:
+    for rows, refined, refined_errors in found:
+        normals[rows], errors[rows] = refined, refined_errors

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
-from splinecli.fits.weighted_least_squares import weighted_least_squares
-from splinecli.observation_map import map_scale
+from splinecli.fits.weighted_least_squares import weighted_least_squares, weighted_sum
+from splinecli.observation_map import dot, map_scale
 
 VECTORS = ((0, 1), (3, 4), (6, 7), (9, 10), (11, 12))
 """Channels that hold the x and y of vectors, and turn with the image."""
@@ -46,39 +46,34 @@ def refine_features(
     """
     scale = map_scale(observations)
     observed = observations / scale
-    pixels, count = observed.shape
-    lights = light_directions.expand(pixels, count, 3)
+    count = observed.shape[1]
     robust = torch.nn.functional.normalize(fit_lambertian(observed, light_directions), dim=-1)
     wide = observed.double()
-    plain = weighted_least_squares(wide, light_directions.double(), torch.ones_like(wide))[0]
+    plain = weighted_least_squares(wide, light_directions.double(), torch.ones_like(wide[:1]))[0]
     plain = torch.nn.functional.normalize(plain, dim=-1).to(observed)
-    cosine = (lights @ normals[..., None])[..., 0].clamp(min=0)
-    albedo = (observed * cosine).sum(1, keepdim=True) / cosine.square().sum(1, keepdim=True).clamp(min=1e-4)
+    cosine = dot(normals, light_directions).clamp_(min=0)
+    # Products with ones are faster than sums over so few columns.
+    mean = observed.new_full((count, 1), 1 / count)
+    albedo = (observed * cosine) @ mean / (cosine.square() @ mean).clamp(min=1e-4 / count)
     unexplained = observed - albedo.clamp(0, 4) * cosine
-    x, y = lights[..., 0], lights[..., 1]
-
-    def mean(values: Tensor) -> Tensor:
-        return values.mean(dim=1, keepdim=True)
-
+    across = light_directions[..., :2]
+    x, y = across.unbind(-1)
+    moments = torch.stack((x, y, x * x, y * y, x * y), dim=-1).mean(dim=-2)
+    level = observed @ mean
     return torch.cat(
         (
             normals,
             robust - normals,
             plain - normals,
-            4 * mean(unexplained * x),
-            4 * mean(unexplained * y),
-            mean(x),
-            mean(y),
-            mean(x * x),
-            mean(y * y),
-            mean(x * y),
+            4 / count * weighted_sum(unexplained, across),
+            moments.expand(len(observed), -1),
             error[:, :1] + _MEDIAN_OFFSET,
             error[:, 1:] - 1,
             (scale / reference).log().clamp(-_LARGEST_LOG, _LARGEST_LOG) / 2,
-            mean(observed),
-            observed.std(dim=1, keepdim=True),
-            3 * mean(unexplained.square()).sqrt(),
-            mean((observed < SHADOW_SHARE).to(observed.dtype)),
+            level,
+            ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
+            3 * (unexplained.square() @ mean).sqrt(),
+            (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
             torch.full_like(scale, math.log(count / 10)),
         ),
         dim=1,

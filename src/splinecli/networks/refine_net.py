@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from types import EllipsisType
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, interpolate, max_pool2d, normalize, pad
+from torch.nn.functional import conv2d, interpolate, max_pool2d, pad
 
 from splinecli.networks.refine_features import CHANNELS, split_features
 
@@ -31,6 +32,12 @@ COARSEST = 2 ** (len(WIDTHS) - 1)
 
 REACH = 96
 """No pixel further away than this changes a result."""
+
+_DECODED = 4
+"""Pixels of each scale that the decoder needs around a part of the map, at least."""
+
+Part = tuple[slice, slice]
+"""Rows and columns of a map."""
 
 
 class RefineNet(nn.Module):
@@ -59,19 +66,23 @@ class RefineNet(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
 
-    def forward(self, features: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Return unit normals (B, 3, H, W) and errors (B, 2, H, W), zero outside the mask.
+    def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
+        """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside the mask.
 
         Args:
             features: (B, CHANNELS, H, W), see refine_features; zero outside the mask.
             mask: (B, 1, H, W), 1 inside, else 0.
+            inner: the part of the map that is wanted, whose bounds are multiples of COARSEST or the end; None for all.
+                The decoder leaves the rest out.
         """
         height, width = mask.shape[-2:]
+        rows, columns = (slice(None), slice(None)) if inner is None else inner
+        inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
         border = (0, -width % COARSEST, 0, -height % COARSEST)
         masks = [pad(mask, border)]
         for _ in self.down:
             masks.append(max_pool2d(masks[-1], 2))
-        normals, error = split_features(features)
+        normals, error = (part.contiguous() for part in split_features(features))
         towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
         joined = torch.cat((pad(torch.cat((features, *towards), dim=1), border), masks[0]), dim=1)
         x = self.enter(joined.contiguous(memory_format=torch.channels_last)) * masks[0]
@@ -82,16 +93,46 @@ class RefineNet(nn.Module):
                 x = self.down[scale - 1](x) * masks[scale]
             for block in blocks:  # type: ignore[attr-defined]
                 x = block(x, masks[scale])
+        origin = (0, 0)
         for scale in reversed(range(len(passed))):
-            x = passed[scale] + interpolate(self.up[scale](x), scale_factor=2, mode="nearest")
-            x = x * masks[scale]
+            wanted = _grown(inner, _DECODED << scale)
+            within = masks[scale][_cells(wanted, (0, 0), scale)]
+            x = self.up[scale](x[_cells(wanted, origin, scale + 1)])
+            x = passed.pop()[_cells(wanted, (0, 0), scale)] + interpolate(x, scale_factor=2, mode="nearest")
+            x.mul_(within)
+            origin = wanted[0].start, wanted[1].start
             for block in self.decode[scale]:  # type: ignore[attr-defined]
-                x = block(x, masks[scale])
-        change = self.out(torch.relu(x))[..., :height, :width].to(normals.dtype)
+                x = block(x, within)
+        change = self.out(torch.relu(x))[_cells(inner, origin, 0)].to(normals.dtype).contiguous()
+        mask, normals, error = (maps[..., *inner] for maps in (mask, normals, error))
         corrected = normals + change[:, :3]
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
-            corrected = corrected + weight * difference
-        return normalize(corrected, dim=1) * mask, (error + change[:, 3:5]) * mask
+            corrected = corrected + weight * difference[..., *inner]
+        return _unit(corrected) * mask, (error + change[:, 3:5]) * mask
+
+
+def _grown(part: Part, margin: int) -> Part:
+    """Return a part with a margin, up to whole pixels of the coarsest scale. It may end behind the map."""
+    rows, columns = (
+        slice(max(0, side.start - margin), side.stop + -side.stop % COARSEST + margin) for side in part
+    )
+    return rows, columns
+
+
+def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
+    """Return the index of a part in a map of a scale that begins at the pixel `origin`."""
+    rows, columns = (
+        slice(side.start - start >> scale, side.stop - start >> scale)
+        for side, start in zip(part, origin, strict=True)
+    )
+    return ..., rows, columns
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Scale vectors (B, 3, H, W) to unit length: faster than a norm over the channels. Zero vectors stay zero."""
+    x, y, z = vectors[:, :1], vectors[:, 1:2], vectors[:, 2:]
+    length = (x * x + y * y + z * z).clamp(min=1e-24).sqrt()
+    return vectors / length
 
 
 def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
@@ -109,7 +150,7 @@ def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
             kernel = (-0.5 * (place / sigma).square()).exp().expand(3, 1, 1, -1)
             across = conv2d(normals * weight, kernel, padding=(0, reach), groups=3)
             both = conv2d(across, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
-            found.append(normalize(both, dim=1) * mask)
+            found.append(_unit(both) * mask)
     return found
 
 
@@ -124,6 +165,6 @@ class _MaskedBlock(nn.Module):
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        hidden = torch.relu(self.first(torch.relu(x)) * mask)
-        out: Tensor = (x + self.second(hidden)) * mask
+        hidden = self.first(torch.relu(x)).mul_(mask).relu_()
+        out: Tensor = (x + self.second(hidden)).mul_(mask)
         return out

@@ -57,7 +57,7 @@ def distil_for(
     if wanted is None and not _is_faster(capture, estimator, sizes[0]):
         return None, []
     for size in sizes:
-        with observer.progress(f"{capture.name}: learning", 2 * size.sample) as advance:
+        with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
             distilled = distil(
                 estimator, capture.observations, capture.light_directions, size, progress=advance
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from splinecli.errors import UsageError
 from splinecli.pipeline.finished import inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.pipeline.observer import SILENT, Advance, Observer
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,7 +61,6 @@ def _infer_into(
 ) -> dict[str, Any]:
     """Do the work of infer_capture in the folder of results, which the caller holds."""
     from splinecli.capture.capture_warnings import low_confidence
-    from splinecli.inference import estimate_normals
     from splinecli.pipeline.distillation import distil_for
     from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
     from splinecli.results.files import write_estimate
@@ -81,8 +81,7 @@ def _infer_into(
         estimator = make_method(options)
     distilled, found = distil_for(capture, estimator, options.distil, observer)
     warnings += found
-    with observer.progress(f"{capture.name}: estimating", capture.n_pixels) as advance:
-        estimate = estimate_normals(capture, distilled or estimator, progress=advance)
+    estimate = _estimate(capture, distilled or estimator, observer)
     warnings += _method_warnings(estimator, capture)
     expected = estimate.expected_under_5
     if expected is not None and expected < LEAST_EXPECTED:
@@ -151,6 +150,22 @@ def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int
     from splinecli.capture.lights.draws import draw_lights
 
     return draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
+
+
+def _estimate(capture: Capture, estimator: Estimator, observer: Observer) -> NormalEstimate:
+    from splinecli.inference import estimate_normals
+
+    def stage(name: str) -> AbstractContextManager[Advance]:
+        return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
+
+    with ExitStack() as stages:
+
+        def refining() -> AbstractContextManager[Advance]:
+            stages.close()
+            return stage("refining")
+
+        advance = stages.enter_context(stage("estimating"))
+        return estimate_normals(capture, estimator, progress=advance, refining=refining)
 
 
 def _method_warnings(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:

@@ -29,8 +29,11 @@ class Observer:
         """Receive an error: one of several inputs cannot be used, and the work goes on without it."""
 
     @contextmanager
-    def progress(self, label: str, total: float, *, start: float = 0.0) -> Iterator[Advance]:
-        """Begin a stage of `total` steps, of which `start` are done. Yields the function that counts steps."""
+    def progress(self, label: str, total: float, *, start: float = 0.0, unit: str = "") -> Iterator[Advance]:
+        """Begin a stage of `total` steps, of which `start` are done. Yields the function that counts steps.
+
+        `unit` is what the steps are, such as pixels, where their number in a second tells something.
+        """
         yield lambda amount, note="": None
 
 
