@@ -39,6 +39,7 @@ FEW_LIGHTS = "few_lights"
 GROUND_TRUTH_Z = "ground_truth_z"
 GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
+IMAGE_ODD = "image_odd"
 IMAGES_LEFT_OUT = "images_left_out"
 LIGHTS_CROWDED = "lights_crowded"
 KEPT_LIGHTS = "kept_lights"
@@ -52,6 +53,7 @@ LOW_CONFIDENCE = "low_confidence"
 NOT_DISTILLED = "not_distilled"
 REPEATED_IMAGES = "repeated_images"
 REFINED_LIGHTS = "refined_lights"
+ROUGH_LIGHTS = "rough_lights"
 SATURATED = "saturated"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
@@ -60,6 +62,7 @@ PROBABLY_WRONG = frozenset(
     {
         ENCODED_VALUES,
         GROUND_TRUTH_Z,
+        IMAGE_ODD,
         LAMP_DISTANCE,
         LIGHT_FRAME,
         LIGHT_ORDER,
@@ -211,6 +214,17 @@ def repeated_images(first: str, second: str, n_pairs: int) -> CaptureWarning:
     )
 
 
+def image_odd(name: str, left: float, brightness: float | None) -> CaptureWarning:
+    """Warn of an image that contradicts the others."""
+    how = "" if brightness is None else f" and is {brightness:.2f} times as bright as they predict"
+    return CaptureWarning(
+        IMAGE_ODD,
+        f"{name} contradicts the other images{how}: without it, {100 * left:.0f} % of what the lights cannot explain is"
+        " left. Its lamp was moved or failed, its exposure differs, or a shadow fell on the object. Photograph it"
+        " again, or leave it out.",
+    )
+
+
 def different_sizes(n_sizes: int) -> CaptureWarning:
     return CaptureWarning(
         DIFFERENT_SIZES, f"The images have {n_sizes} different sizes; all images need the same size."
@@ -241,6 +255,15 @@ def refined_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureW
         REFINED_LIGHTS,
         f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
         f" {moved_deg.max():.1f}. The images fit them better: {100 * fit_ratio:.0f} % of the misfit is left.",
+    )
+
+
+def rough_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureWarning:
+    """Warn of light directions (F,) that refinement would move by these angles."""
+    return CaptureWarning(
+        ROUGH_LIGHTS,
+        f"The light directions are probably rough: others, {moved_deg.mean():.1f} degrees away on average, leave"
+        f" {100 * fit_ratio:.0f} % of the misfit. Try --refine-lights.",
     )
 
 

@@ -60,7 +60,7 @@ def _infer_into(
     folder: Path, target: Path, options: InferOptions, observer: Observer, estimator: Estimator | None
 ) -> dict[str, Any]:
     """Do the work of infer_capture in the folder of results, which the caller holds."""
-    from splinecli.capture.capture_warnings import low_confidence
+    from splinecli.capture.capture_warnings import ROUGH_LIGHTS, low_confidence
     from splinecli.pipeline.distillation import distil_for
     from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
     from splinecli.results.files import write_estimate
@@ -72,6 +72,7 @@ def _infer_into(
     if options.refine_lights:
         from splinecli.capture.restore.light_refinement import refine_capture
 
+        warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
         before = len(capture.warnings)
         capture = refine_capture(
             capture, error_deg=options.light_error_deg, intensities_known=source.intensities_known

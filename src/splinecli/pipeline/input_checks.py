@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from splinecli.capture import Capture, CaptureSource
     from splinecli.capture.lights.light_check import LightCheck
+    from splinecli.capture.lights.light_fit import Factors
     from splinecli.capture.sample import Sample
 
 
@@ -56,6 +57,9 @@ def check_sample(
     check = check_lights(observations, sample.mask, source.light_directions, indices, names, factors)
     light_file = source.files.light_directions
     warnings = light_warnings(check, source.light_frame, light_file, strict=strict)
+    odd = check.odd_image
+    if odd is not None:
+        warnings.insert(0, capture_warnings.image_odd(names[odd.place], odd.left, odd.brightness))
     spread, in_cone = light_spread(lights)
     if spread < SMALLEST_SPREAD:
         warnings.append(capture_warnings.lights_crowded(max(spread, 1e-3), in_cone=in_cone))
@@ -63,12 +67,30 @@ def check_sample(
     if pairs:
         first, second = (names[place] for place in pairs[0])
         warnings.append(capture_warnings.repeated_images(first, second, len(pairs)))
-    if check.order is not None or spread < SMALLEST_SPREAD or source.radiometry.gamma != 1:
-        return check, warnings  # the last check relies on the lights
-    ratio = image_checks.decoding_ratio(observations, factors, lights)
-    if ratio is not None and ratio < image_checks.DISPLAY_RATIO:
-        warnings.append(capture_warnings.encoded_values(ratio))
+    doubted = check.order is not None or odd is not None or spread < SMALLEST_SPREAD
+    if doubted:
+        return check, warnings  # the other checks rely on the lights
+    if source.radiometry.gamma == 1:
+        ratio = image_checks.decoding_ratio(observations, factors, lights)
+        if ratio is not None and ratio < image_checks.DISPLAY_RATIO:
+            return check, [*warnings, capture_warnings.encoded_values(ratio)]
+    if check.best is None and source.lamps is None:
+        warnings += _rough_lights(observations, factors, lights)
     return check, warnings
+
+
+def _rough_lights(
+    observations: NDArray[np.floating], factors: Factors | None, lights: NDArray[np.float64]
+) -> list[CaptureWarning]:
+    """Suggest to refine the lights (F, 3) where this makes them fit observations (P, F) much better."""
+    from splinecli.capture.capture_warnings import rough_lights
+    from splinecli.capture.restore.light_refinement import would_refine
+    from splinecli.normals import angle_between_deg
+
+    refined = would_refine(observations, factors, lights)
+    if refined is None:
+        return []
+    return [rough_lights(angle_between_deg(refined.directions, lights), refined.fit_ratio)]
 
 
 def _as_distant(source: CaptureSource, sample: Sample, indices: Sequence[int]) -> NDArray[np.floating]:

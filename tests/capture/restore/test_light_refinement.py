@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
+from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.restore.light_refinement import refine_capture, refine_lights
+from splinecli.capture.restore.light_refinement import refine_capture, refine_lights, would_refine
 from splinecli.errors import UsageError
 from splinecli.normals import angle_between_deg, unit
 
@@ -64,6 +65,17 @@ def test_exact_lights_stay(glossy_pixels: Pixels) -> None:
     assert refine_lights(np.tile(matte, (3, 1)), given) is not None
     assert refine_lights(matte[:50], given) is None
     assert refine_lights(np.tile(matte, (3, 1))[:, :5], given[:5]) is None
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_refinement_is_suggested_for_rough_lights_alone(known: bool, glossy_pixels: Pixels) -> None:
+    _, lights, observations = glossy_pixels
+    strengths = 1.0 if known else np.linspace(0.6, 1.4, len(lights))
+    observations = np.tile(observations, (3, 1)) * strengths
+    factors = find_factors(observations, intensities_known=known)
+    assert would_refine(observations, factors, lights) is None
+    assert would_refine(observations, factors, rough(lights, 6.0)) is not None
+    assert would_refine(observations, None, rough(lights, 6.0)) is None
 
 
 def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:

@@ -9,10 +9,8 @@ import numpy as np
 
 from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, LIGHTS_UNCHECKED, CaptureWarning
 from splinecli.capture.lights.light_check import Candidate, LightCheck
-from splinecli.capture.lights.light_frames import LightFrame
+from splinecli.capture.lights.light_frames import BOTH_NEGATED, LightFrame
 from splinecli.capture.lights.light_order import UNKNOWN_ORDER, ZENITH
-
-BOTH_NEGATED = LightFrame((-1, -1, 1))
 
 TOLD_APART = 0.5
 """Smallest difference of advantages that tells two frames apart."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.lights.frame_evidence import RoughNormals, rough_normals
 from splinecli.capture.lights.light_fit import Factors, find_factors
-from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
+from splinecli.capture.lights.light_frames import BOTH_NEGATED, PLANE_FRAMES, LightFrame
 from splinecli.capture.lights.light_order import (
     MIN_LIGHTS,
     UNKNOWN_ORDER,
@@ -23,10 +23,11 @@ from splinecli.capture.lights.light_order import (
     shift_steps,
     shift_words,
 )
+from splinecli.capture.lights.odd_image import OddImage, find_odd_image
 
 Array = NDArray[np.float64]
 
-CURL_WEIGHT, RIM_WEIGHT = 3.0, 1.0
+CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
 
 NEAR = 0.1
@@ -76,6 +77,7 @@ class LightCheck:
         best: the reading that gives better normals; None if there is none. Its frame is relative to the given one.
         tried: readings of the order in words, each with its misfit.
         outline_counts: how much the normals at the mask's edge count, from 0 to 1.
+        odd_image: an image that contradicts the others, without which all this was found; None if there is none.
     """
 
     candidates: tuple[Candidate, ...]
@@ -85,10 +87,17 @@ class LightCheck:
     best: Candidate | None = None
     tried: tuple[tuple[str, float], ...] = ()
     outline_counts: float = 0.0
+    odd_image: OddImage | None = None
 
     @property
     def given(self) -> Candidate:
         return self.candidates[0]
+
+    def order_fits_better_by(self, share: float) -> bool:
+        """Return whether another order leaves less than this share of the given one's misfit."""
+        if self.order in (None, UNKNOWN_ORDER) or self.order_misfit is None or self.given_misfit is None:
+            return False
+        return self.order_misfit <= share * self.given_misfit
 
     @property
     def unchecked(self) -> list[str]:
@@ -128,18 +137,42 @@ def check_lights(
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
     factors = find_factors(observations) if factors is None else factors
+    check = _check_frame_and_order(observations, mask, light_directions, chosen, names, factors)
+    odd = None if factors is None else find_odd_image(factors, light_directions[chosen])
+    if factors is None or odd is None or check.order_fits_better_by(odd.left):
+        return check
+    kept = np.delete(np.arange(len(chosen)), odd.place)
+    others = observations[:, kept]
+    factors = find_factors(others, intensities_known=factors.intensities_known)
+    check = _check_frame_and_order(
+        others, mask, light_directions, chosen[kept], [names[int(place)] for place in kept], factors
+    )
+    return replace(check, odd_image=odd)
+
+
+def _check_frame_and_order(
+    observations: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    light_directions: Array,
+    chosen: NDArray[np.integer],
+    names: Sequence[str],
+    factors: Factors | None,
+) -> LightCheck:
+    """Return what check_lights does, for images that do not contradict each other."""
     found = check_order(observations, factors, light_directions, chosen, names)
     normals = rough_normals(observations / found.intensities, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
     if not found.plausible:
         weight = 0.0
     weight = float(np.clip(weight, 0, 1))
-    first, *others = (
+    frames = [
         _candidate(
             frame.describe() or _AS_GIVEN, frame, normals.transformed(frame.matrix), found.misfit, weight
         )
         for frame in PLANE_FRAMES
-    )
+        if frame.signs[0] > 0
+    ]
+    first, *others = (*frames, *map(_negated, frames))
     for row, matrix in found.turns:
         words, steps = shift_words(row, len(light_directions)), shift_steps(row, len(light_directions))
         turned = _candidate(words, None, normals.transformed(matrix), found.misfit, weight)
@@ -178,6 +211,14 @@ def _candidate(
     name: str, frame: LightFrame | None, normals: RoughNormals, misfit: float | None, weight: float
 ) -> Candidate:
     return Candidate(name, frame, misfit, normals.curl(), normals.rim() if weight > 0 else None)
+
+
+def _negated(candidate: Candidate) -> Candidate:
+    """Return a candidate with x and y negated in addition: all slopes change sign, and so does the rim."""
+    assert candidate.frame is not None
+    frame = BOTH_NEGATED.after(candidate.frame)
+    rim = None if candidate.rim is None else -candidate.rim
+    return replace(candidate, name=frame.describe(), frame=frame, rim=rim)
 
 
 def _judge(other: Candidate, given: Candidate, weight: float) -> Candidate:

@@ -70,6 +70,8 @@ class LightFrame:
 USUAL_FRAME = LightFrame()
 """x right, y up, z to the camera, as in docs/files-and-frames.md."""
 
+BOTH_NEGATED = LightFrame((-1, -1, 1))
+
 PLANE_FRAMES = tuple(
     LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1))
 )

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,8 @@ class LightOrder:
     Args:
         order: in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found.
         lights: (F, 3), in this order.
-        intensities: (F,), those that fit these lights best; ones where they are known.
+        intensities: (F,), those that fit these lights best; ones where only known ones tell the order. They make the
+            normals of metals better.
         given_misfit, misfit: of the given order and of this one, as shares of random orders'; None where there are too
             few lights.
         plausible: whether the lights fit well enough for the normals to tell an outline.
@@ -113,57 +115,90 @@ def check_order(
         chosen: (F,) the lights of the observations.
         names: of the F images.
     """
-    lights, n_all = light_directions[chosen], len(light_directions)
+    lights = light_directions[chosen]
     if factors is None or len(lights) < MIN_LIGHTS:
         return LightOrder(None, lights, np.ones(len(lights)))
-    fitted, factors, random = factors, *_free_if_possible(factors, lights)
+    compared, random = _free_if_possible(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
-    if usual < MIN_RANDOM_MISFIT and not fitted.intensities_known:
+    if usual < MIN_RANDOM_MISFIT and not factors.intensities_known:
         return LightOrder(None, lights, np.ones(len(lights)))
-    given = float(factors.misfits(lights[None])[0])
-    share, limit = given / usual, given * (BETTER_ORDER if len(lights) > FEW else BETTER_ORDER_OF_FEW)
-    shifted = light_directions[shifted_orders(n_all)[:, chosen]]
-    shift_misfits = factors.misfits(shifted)
-    swaps = swapped_orders(len(lights))
-    swap_misfits = factors.misfits(lights[swaps])
-    swap = int(swap_misfits.argmin())
-    one, other = (names[int(i)] for i in np.flatnonzero(swaps[swap] != np.arange(len(lights))))
-    zenith = zenith_as_elevation(lights)
-    # The best shift, the best shift of the reversed order, the best exchange, and angles from the camera axis.
-    forward, backward = 1 + int(shift_misfits[1:n_all].argmin()), n_all + int(shift_misfits[n_all:].argmin())
-    candidates = (
-        (shift_words(forward, n_all), shifted[forward], float(shift_misfits[forward])),
-        (shift_words(backward, n_all), shifted[backward], float(shift_misfits[backward])),
-        (f"with those of {one} and {other} exchanged", lights[swaps[swap]], float(swap_misfits[swap])),
-        (ZENITH, zenith, float(factors.misfits(zenith[None])[0])),
+    given = _Reading(None, lights, float(compared.misfits(lights[None])[0]))
+    shifted = light_directions[shifted_orders(len(light_directions))[:, chosen]]
+    shift_misfits = compared.misfits(shifted)
+    shifts, others = _best_shifts(shifted, shift_misfits), _other_readings(compared, lights, names)
+    found = _better_reading(given, (*shifts, *others), usual)
+    if found is given and _is_wrong(observations, compared, given, random):
+        found = given._replace(words=UNKNOWN_ORDER)
+    turns: tuple[tuple[int, Array], ...] = ()
+    is_shift = any(found is shift for shift in shifts)
+    if is_shift or (found is given and given.misfit < MIN_MISFIT * usual):
+        turns = _turns(found.lights, shifted, shift_misfits <= max(1.3 * found.misfit, 0.05 * usual))
+    return LightOrder(
+        found.words,
+        found.lights,
+        compared.intensities(found.lights[None])[0],
+        given.misfit / usual,
+        found.misfit / usual,
+        _is_plausible(factors, found, usual),
+        tuple((str(reading.words), reading.misfit / usual) for reading in (*shifts, *others)),
+        turns,
     )
-    tried = tuple((words, misfit / usual) for words, _, misfit in candidates)
 
-    def found(
-        order: str | None, lights: Array, misfit: float, turns: tuple[tuple[int, Array], ...] = ()
-    ) -> LightOrder:
-        plain, limit = misfit / usual, MAX_FREE_MISFIT
-        if fitted.intensities_known:
-            random, limit = random_misfits(fitted, lights), MAX_PLAIN_MISFIT
-            plain = float(fitted.misfits(lights[None])[0] / max(np.median(random), 1e-9))
-        intensities = fitted.intensities(lights[None])[0]
-        return LightOrder(order, lights, intensities, share, misfit / usual, plain <= limit, tried, turns)
 
-    *of_all, exchanged, of_angles = candidates
-    words, better, mended = min((*of_all, of_angles), key=lambda candidate: candidate[2])
-    if share > MIN_MISFIT and mended < min(limit, MAX_MENDED * usual):
-        fits = shift_misfits <= max(1.3 * mended, 0.05 * usual)
-        return found(words, better, mended, () if words == ZENITH else _turns(better, shifted, fits))
-    if share > MIN_SWAP_MISFIT and exchanged[2] < min(limit, MAX_MENDED * usual):
-        return found(*exchanged)
-    by_chance = len(lights) >= MIN_LIGHTS_FOR_CHANCE and (random <= given).mean() > CHANCE
-    suspected = by_chance or (share > UNFIT_MISFIT and given > UNFIT_RATIO * factors.residual)
-    judged = factors.residual < MAX_RESIDUAL or len(lights) >= MIN_LIGHTS_OF_METAL
-    if judged and suspected and _fits_like_random(observations, factors, lights):
-        return found(UNKNOWN_ORDER, lights, given)
-    fitting = shift_misfits <= max(1.3 * given, 0.05 * usual)
-    turns = _turns(lights, shifted, fitting) if share < MIN_MISFIT else ()
-    return found(None, lights, given, turns)
+class _Reading(NamedTuple):
+    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their misfit."""
+
+    words: str | None
+    lights: Array
+    misfit: float
+
+
+def _best_shifts(shifted: Array, misfits: Array) -> list[_Reading]:
+    """Return the best of shifted orders (2 F, f, 3), and the best shift of the reversed order."""
+    n_all = len(shifted) // 2
+    places = 1 + int(misfits[1:n_all].argmin()), n_all + int(misfits[n_all:].argmin())
+    return [_Reading(shift_words(k, n_all), shifted[k], float(misfits[k])) for k in places]
+
+
+def _other_readings(factors: Factors, lights: Array, names: Sequence[str]) -> list[_Reading]:
+    """Return the best exchange of two lights, and the reading of elevations as angles from the camera axis."""
+    swaps = swapped_orders(len(lights))
+    misfits, zenith = factors.misfits(lights[swaps]), zenith_as_elevation(lights)
+    swap = int(misfits.argmin())
+    one, other = (names[int(i)] for i in np.flatnonzero(swaps[swap] != np.arange(len(lights))))
+    words = f"with those of {one} and {other} exchanged"
+    return [
+        _Reading(words, lights[swaps[swap]], float(misfits[swap])),
+        _Reading(ZENITH, zenith, float(factors.misfits(zenith[None])[0])),
+    ]
+
+
+def _better_reading(given: _Reading, others: Sequence[_Reading], usual: float) -> _Reading:
+    """Return the reading that fits much better than the given one, or the given one."""
+    forward, backward, exchanged, of_angles = others
+    share, few = given.misfit / usual, len(given.lights) <= FEW
+    limit = min(given.misfit * (BETTER_ORDER_OF_FEW if few else BETTER_ORDER), MAX_MENDED * usual)
+    best = min((forward, backward, of_angles), key=lambda reading: reading.misfit)
+    if share > MIN_MISFIT and best.misfit < limit:
+        return best
+    return exchanged if share > MIN_SWAP_MISFIT and exchanged.misfit < limit else given
+
+
+def _is_wrong(observations: NDArray[np.floating], factors: Factors, given: _Reading, random: Array) -> bool:
+    """Return whether lights fit no better than those in random orders do, whose misfits are given."""
+    n_lights = len(given.lights)
+    by_chance = n_lights >= MIN_LIGHTS_FOR_CHANCE and (random <= given.misfit).mean() > CHANCE
+    unfit = given.misfit > UNFIT_MISFIT * np.median(random) and given.misfit > UNFIT_RATIO * factors.residual
+    judged = factors.residual < MAX_RESIDUAL or n_lights >= MIN_LIGHTS_OF_METAL
+    return judged and bool(by_chance or unfit) and _fits_like_random(observations, factors, given.lights)
+
+
+def _is_plausible(fitted: Factors, found: _Reading, usual: float) -> bool:
+    """Return whether lights fit well enough for the normals to tell an outline."""
+    if not fitted.intensities_known:
+        return found.misfit <= MAX_FREE_MISFIT * usual
+    random, misfit = random_misfits(fitted, found.lights), fitted.misfits(found.lights[None])[0]
+    return bool(misfit <= MAX_PLAIN_MISFIT * max(float(np.median(random)), 1e-9))
 
 
 def _free_if_possible(factors: Factors, lights: Array) -> tuple[Factors, Array]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
+from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.robust_fit import absolute_weights, fit_scaled_normals
 from splinecli.errors import UsageError
@@ -37,6 +38,10 @@ captures with exact lights, it seldom does; docs/measurements.md has the figures
 MAX_MISFIT = 0.018
 """Largest median residual, as a share of a pixel's brightest observation, with which refined lights are taken. Metals
 have more, and a matte model would move their lights wrongly."""
+
+ROUGH_MISFIT = 0.04
+"""Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to be
+suggested. Few matte or shiny captures with exact lights have more."""
 
 INTENSITY_ERROR = 0.15
 """Standard deviation of intensities that nobody measured, in the prior."""
@@ -111,6 +116,23 @@ def refine_capture(
         estimated_intensities=intensities,
         warnings=(*capture.warnings, warning),
     )
+
+
+def would_refine(
+    observations: NDArray[np.floating], factors: Factors | None, light_directions: Array
+) -> RefinedLights | None:
+    """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
+
+    It is cheap where the given lights (F, 3) fit well.
+
+    Args:
+        factors: of the observations; see find_factors.
+    """
+    if factors is None or factors.misfits(light_directions[None])[0] < ROUGH_MISFIT:
+        return None
+    # Intensities that nobody measured are not the fault of the directions.
+    intensities = factors.intensities(light_directions[None])[0]
+    return refine_lights(np.asarray(observations / intensities, np.float32), light_directions)
 
 
 def _why_kept(capture: Capture) -> str:

@@ -1,0 +1,126 @@
+"""An image that contradicts the others is found, on rendered shapes of which one image was spoilt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splinecli.capture import read_capture
+from splinecli.capture.lights.light_check import check_lights
+from splinecli.capture.lights.light_fit import find_factors
+from splinecli.capture.lights.light_frames import parse_light_frame
+from splinecli.capture.lights.odd_image import OddImage, find_odd_image
+
+Array = NDArray[np.float64]
+SIZE, ODD = 64, 4
+
+
+def lights(count: int = 10) -> Array:
+    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(12, 55, count))
+    return np.stack(
+        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+    )
+
+
+def sphere() -> tuple[Array, NDArray[np.bool_]]:
+    """Normals (P, 3) and mask of a sphere."""
+    x, y = np.meshgrid(np.linspace(-1, 1, SIZE), np.linspace(1, -1, SIZE))
+    inside = np.hypot(x, y) < 0.97
+    return np.stack((x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=2)[inside], inside
+
+
+def shade(normals: Array, light_directions: Array, shine: float = 0.3) -> Array:
+    """Lambert's cosine with attached shadows, a highlight and one part in a hundred of noise."""
+    half = light_directions + np.array((0.0, 0.0, 1.0))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    cosine = np.clip(normals @ light_directions.T, 0, None)
+    highlight = shine * np.clip(normals @ half.T, 0, None) ** 30 * (cosine > 0)
+    return np.clip(cosine + highlight + np.random.default_rng(5).normal(0, 0.01, cosine.shape), 0, None)
+
+
+def find(observations: Array, *, intensities_known: bool = True) -> OddImage | None:
+    factors = find_factors(observations, intensities_known=intensities_known)
+    assert factors is not None
+    return find_odd_image(factors, lights())
+
+
+def tilted(direction: Array, degrees: float) -> Array:
+    """Return a unit vector at this angle to the direction, nearer to the camera."""
+    across = np.array((0.0, 0.0, 1.0)) - direction[2] * direction
+    across /= np.linalg.norm(across)
+    return np.asarray(np.cos(np.radians(degrees)) * direction + np.sin(np.radians(degrees)) * across)
+
+
+@pytest.mark.parametrize("shine", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("known", [True, False])
+def test_right_images_are_not_odd(shine: float, known: bool) -> None:
+    assert find(shade(sphere()[0], lights(), shine), intensities_known=known) is None
+
+
+def test_a_dimmed_image_is_odd_where_intensities_are_known() -> None:
+    observations = shade(sphere()[0], lights())
+    observations[:, ODD] *= 0.5
+    odd = find(observations)
+    assert odd is not None and odd.place == ODD
+    # The highlights are no part of the matte prediction, so the factor is not exact.
+    assert odd.brightness == pytest.approx(0.5, abs=0.03)
+    assert odd.left < 0.2
+    assert find(observations, intensities_known=False) is None, "lamps may differ"
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_moved_light_is_odd(known: bool) -> None:
+    true = lights()
+    true[ODD] = tilted(true[ODD], -40)
+    odd = find(shade(sphere()[0], true), intensities_known=known)
+    assert odd is not None and odd.place == ODD
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_image_of_another_object_is_odd(known: bool) -> None:
+    normals, _ = sphere()
+    observations = shade(normals, lights())
+    other = np.stack((-0.8 * normals[:, 1], 0.6 * normals[:, 0], np.ones(len(normals))), axis=1)
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    observations[:, ODD] = shade(other, lights())[:, ODD]
+    odd = find(observations, intensities_known=known)
+    assert odd is not None and odd.place == ODD
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_image_half_in_shadow_is_odd(known: bool) -> None:
+    normals, _ = sphere()
+    observations = shade(normals, lights())
+    observations[normals[:, 1] > 0.1, ODD] *= 0.2
+    odd = find(observations, intensities_known=known)
+    assert odd is not None and odd.place == ODD
+
+
+def test_exchanged_images_are_not_odd() -> None:
+    observations = shade(sphere()[0], lights())
+    observations[:, [2, 7]] = observations[:, [7, 2]]
+    assert find(observations) is None
+
+
+def test_the_other_images_are_judged_without_the_odd_one() -> None:
+    normals, mask = sphere()
+    observations = shade(normals, lights())
+    observations[:, ODD] *= 0.2
+    check = check_lights(observations, mask, lights())
+    assert check.odd_image is not None and check.odd_image.place == ODD
+    assert (check.order, check.best) == (None, None)
+    check = check_lights(observations, mask, lights() * (1, -1, 1))
+    assert check.odd_image is not None and check.odd_image.place == ODD
+    assert check.best is not None and check.best.frame == parse_light_frame("y-down")
+
+
+@pytest.mark.parametrize("name", ["DiLiGenT/pmsData/ballPNG", "uw/gray", "uw/horse"])
+def test_real_captures_have_no_odd_image(shared_data: Path, name: str) -> None:
+    chosen = list(range(3, 96, 9)) if "PNG" in name else None
+    capture = read_capture(shared_data / name, light_indices=chosen)
+    factors = find_factors(capture.observations)
+    assert factors is not None
+    assert find_odd_image(factors, capture.light_directions) is None
