@@ -16,6 +16,7 @@ from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.normal_files import read_ground_truth
+from splinecli.capture.formats.read_ahead import read_ahead
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
@@ -133,11 +134,13 @@ class CaptureSource:
         )
         return StoredCapture(capture, found.saturation, self.intensities_known)
 
-    def colours(self, mask: NDArray[np.bool_]) -> Callable[[int], NDArray[np.float32]]:
-        """Return a function that reads the mask's (H, W) pixels (P, 3) RGB of an image by its index.
+    def colours(self, mask: NDArray[np.bool_], indices: Sequence[int]) -> Iterator[NDArray[np.float32]]:
+        """Yield the mask's (H, W) pixels (P, 3) RGB of some images.
 
-        The values are linear, each channel divided by its light's intensity. The function raises InputError where the
-        image cannot be read or does not have the size of the mask.
+        The values are linear, each channel divided by its light's intensity.
+
+        Raises:
+            InputError: an image cannot be read or does not have the size of the mask.
         """
         linearise = Lineariser(self.radiometry, mask, len(self.files.images))
 
@@ -146,7 +149,7 @@ class CaptureSource:
             stored = decode_image(path, ExpectedSize(mask.shape, self.files.images[0].name))
             return self._colours(linearise, take_pixels(stored, mask), index)
 
-        return read
+        return read_ahead(read, indices)
 
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
@@ -160,9 +163,13 @@ class CaptureSource:
         expected = ExpectedSize(shape, self.files.images[0].name)
         linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
         total = np.zeros(shape[0] * shape[1], np.float32)
-        for index, path in enumerate(self.files.images):
-            stored = decode_image(path, expected)
-            total += self._colours(linearise, stored.reshape(-1, stored.shape[2]), index).mean(axis=1)
+
+        def read(index: int) -> NDArray[np.float32]:
+            stored = decode_image(self.files.images[index], expected)
+            return self._colours(linearise, stored.reshape(-1, stored.shape[2]), index)
+
+        for colours in read_ahead(read, range(self.n_lights)):
+            total += colours.mean(axis=1)
             if progress is not None:
                 progress()
         try:
@@ -208,12 +215,14 @@ class CaptureSource:
         """Yield the mask's pixels under these lights."""
         linearise = Lineariser(self.radiometry, mask, len(self.files.images))
         expected = ExpectedSize(mask.shape, self.files.images[indices[0]].name)
-        for index in indices:
+
+        def read(index: int) -> StoredPixels:
             path = self.files.images[index]
             pixels = take_pixels(decode_image(path, expected), mask)
             linear, intensity = linearise(pixels, path, index), self.light_intensities[index]
-            yield StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
-            del pixels, linear
+            return StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
+
+        return read_ahead(read, indices)
 
     def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
         linear = linearise(pixels, self.files.images[index], index)

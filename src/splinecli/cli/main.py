@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import TextIO
 
 import typer
 
@@ -24,7 +25,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
     _repair_streams()
     _let_threads_sleep()
-    out, err = UntilClosed(sys.stdout), UntilClosed(sys.stderr)
+    out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         code = _run_command(args)
         out.flush()
@@ -62,6 +63,19 @@ def _repair_streams() -> None:
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - for the process
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def _apart(stream: TextIO) -> TextIO:
+    """Return the stream stderr with a file descriptor of its own.
+
+    Descriptor 2 is redirected while an image is decoded, because the C libraries print there (see native_stderr). Other
+    threads can print meanwhile.
+    """
+    if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != 2:
+        return stream
+    stream.flush()
+    own = os.fdopen(os.dup(2), "wb", buffering=0)
+    return io.TextIOWrapper(own, stream.encoding, stream.errors, line_buffering=True, write_through=True)
 
 
 def _let_threads_sleep() -> None:

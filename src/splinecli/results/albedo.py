@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource
+from splinecli.capture.masks import take_pixels
 
 LIT = 0.15
 """A light counts for a pixel if n.l is above this."""
@@ -45,18 +46,17 @@ def albedo_map(
     Raises:
         InputError: an image can no longer be read.
     """
-    normals = normal_map[capture.mask]
+    normals = take_pixels(normal_map, capture.mask)
     counts = np.empty(capture.observations.shape, np.bool_)
     for start in range(0, len(normals), _TILE_PIXELS):
         tile = slice(start, start + _TILE_PIXELS)
         cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
         counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
-    read = source.colours(capture.mask)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
-    for position, index in enumerate(capture.light_indices):
+    for position, colours in enumerate(source.colours(capture.mask, capture.light_indices)):
         cosines, strengths = _shading(capture, normals, slice(None), [position])
         cosine = cosines[:, 0] * counts[:, position]
-        colours = read(index) / strengths
+        colours /= strengths
         if capture.estimated_intensities is not None:
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine
@@ -64,14 +64,14 @@ def albedo_map(
             weight = cosine * np.where(
                 capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1)
             )
-        total += weight[:, None] * colours
+        colours *= weight[:, None]  # in place, because large captures need the memory
+        total += colours
         squares += weight * cosine
+        del colours
         if progress is not None:
             progress()
     albedo = np.zeros((*capture.mask.shape, 3), np.float32)
-    albedo[capture.mask] = np.divide(
-        total, squares[:, None], out=np.zeros_like(total), where=squares[:, None] > 0
-    )
+    albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
     return albedo
 
 

@@ -172,11 +172,19 @@ def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
             pixels = None
     if pixels is None or _DAMAGE.search("".join(messages)):
         raise damaged(path)
-    if pixels.ndim == 3 and pixels.shape[2] == 3:
-        return pixels[:, :, ::-1]  # BGR becomes RGB; a view, because copying a large image takes long
-    if pixels.ndim == 3 and pixels.shape[2] == 4:
-        return pixels[:, :, [2, 1, 0, 3]]
-    return pixels
+    return _rgb(pixels)
+
+
+def _rgb(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Return OpenCV's BGR or BGRA pixels in RGB or RGBA order; gray ones as they are."""
+    if pixels.ndim == 2 or pixels.shape[2] not in (3, 4):
+        return pixels
+    if pixels.dtype in (np.uint8, np.uint16, np.float32):
+        import cv2
+
+        code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
+        return np.asarray(cv2.cvtColor(pixels, code, dst=pixels))  # in place, and far faster than an index
+    return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 
 
 def _check_png(data: bytes, path: Path) -> None:
@@ -221,7 +229,7 @@ def native_stderr() -> Iterator[list[str]]:
     """Catch what C libraries print to stderr; after the block, the list contains it.
 
     This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
-    around decoding.
+    around decoding. What other threads print meanwhile is lost, unless they print elsewhere: see stderr_is_apart.
     """
     messages: list[str] = []
     with _STDERR_LOCK, tempfile.TemporaryFile() as store:
@@ -240,3 +248,11 @@ def native_stderr() -> Iterator[list[str]]:
             os.close(original)
             store.seek(0)
             messages.append(store.read(1 << 16).decode(errors="replace"))
+
+
+def stderr_is_apart() -> bool:
+    """Return whether Python's stderr is not file descriptor 2, so that nothing is lost while native_stderr catches."""
+    try:
+        return sys.stderr is None or sys.stderr.fileno() != 2
+    except (OSError, ValueError):  # a stream without a descriptor
+        return True

@@ -40,7 +40,7 @@ LOWEST_COMPARED = 0.5
 SPIKE = 5
 """The maximum occurs at least this many times as often as any of the compared values."""
 
-_BLOCK = 1 << 20
+_BLOCK, _NEAR = 1 << 20, 1 << 10
 _FULL_SCALE_16_BIT = 65_535
 
 
@@ -219,16 +219,19 @@ class SaturationFinder:
                     path=path,
                     hint="Lower the white level, or leave it out",
                 )
-            saturated = in_any_channel(pixels >= self.given)
-            self._images[position] = _ImageValues(full_scale, stated, _indices(saturated))
+            above = in_any_channel(pixels >= self.given)
+            self._images[position] = _ImageValues(full_scale, stated, _indices(above))
             return
-        image = _ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
-        if pixels.dtype == np.uint16 and pixels.size:
-            maximum = int(pixels.max())
-            at_maximum = _indices(in_any_channel(pixels == maximum)) if maximum else _nothing()
-            below, counts = _largest_values(pixels, maximum)
-            image = replace(image, maximum=maximum, at_maximum=at_maximum, below=below, counts=counts)
-        self._images[position] = image
+        if pixels.dtype != np.uint16 or not pixels.size:
+            self._images[position] = _ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
+            return
+        maximum = int(pixels.max())
+        at_maximum = _indices(in_any_channel(pixels == maximum)) if maximum else _nothing()
+        saturated = at_maximum if maximum == full_scale else _nothing()
+        below, counts = _largest_values(pixels, maximum)
+        self._images[position] = _ImageValues(
+            full_scale, stated, saturated, maximum, at_maximum, below, counts
+        )
 
     def finish(self) -> Saturation:
         """Return the white level and the saturated observations. Images that were not added have none."""
@@ -243,14 +246,18 @@ def _indices(flags: NDArray[np.bool_]) -> NDArray[np.integer]:
 
 def _largest_values(pixels: NDArray[np.uint16], maximum: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the values of an image that are compared with its maximum, in rising order, and their counts."""
-    lowest = math.ceil(LOWEST_COMPARED * maximum)
+    lowest_compared = math.ceil(LOWEST_COMPARED * maximum)
     values = pixels.reshape(-1)
-    counts = np.zeros(maximum + 1, np.int64)
-    for start in range(0, len(values), _BLOCK):
-        block = values[start : start + _BLOCK]
-        counts += np.bincount(block[block >= lowest], minlength=len(counts))
-    below = np.flatnonzero(counts[:maximum])[-COMPARED_VALUES:].copy()
-    return below, counts[below]
+    # Few values are near the maximum. The others are counted only where these are not enough.
+    for lowest in (max(lowest_compared, maximum - _NEAR), lowest_compared):
+        counts = np.zeros(maximum + 1 - lowest, np.int64)
+        for start in range(0, len(values), _BLOCK):
+            block = values[start : start + _BLOCK]
+            counts += np.bincount(block[block >= lowest] - np.uint16(lowest), minlength=len(counts))
+        below = np.flatnonzero(counts[:-1])[-COMPARED_VALUES:]
+        if len(below) == COMPARED_VALUES:
+            break
+    return below + lowest, counts[below]
 
 
 def _is_bits(level: int) -> bool:
