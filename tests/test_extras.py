@@ -22,8 +22,14 @@ def test_an_installed_module_is_returned() -> None:
         (
             "embreex.rtcore_scene",
             "render",
-            "rendering needs embreex, scikit-image and trimesh, which are not all installed."
+            "rendering needs embreex and scikit-image, which are not all installed."
             " Run pip install 'splinecli[render]'.",
+        ),
+        (
+            "fast_simplification",
+            "mesh",
+            "--decimate needs the package fast-simplification, which is not installed."
+            " Run pip install 'splinecli[mesh]'.",
         ),
         (
             "torch.utils.tensorboard",

@@ -9,8 +9,9 @@ from types import ModuleType
 from splinecli.errors import SplinecliError, UsageError
 
 _PROBLEMS = {
+    "mesh": "--decimate needs the package fast-simplification, which is not installed",
     "raw": "camera RAW files need rawpy, which is not installed",
-    "render": "rendering needs embreex, scikit-image and trimesh, which are not all installed",
+    "render": "rendering needs embreex and scikit-image, which are not all installed",
     "tensorboard": "--tensorboard needs the package tensorboard, which is not installed",
 }
 """The message for each extra."""
@@ -28,7 +29,7 @@ def import_extra(
 
     Args:
         module: full name of the module.
-        extra: "raw", "render" or "tensorboard".
+        extra: a key of _PROBLEMS.
         error: the exception to raise.
         path: the file that cannot be read without the module, for the message.
         otherwise: another way out, for the message.

@@ -91,7 +91,9 @@ def test_a_surface_in_the_albedo_s_colours(capture, run):
     trimesh = pytest.importorskip("trimesh")
     assert run("infer", capture, "--method", "ls", "--surface", "--maps", "albedo").code == 0
     out = Path("out/sphere")
-    assert {"mesh.ply", "depth.npy", "depth.tiff"} <= set(read_report(out)["files"])
+    report = read_report(out)
+    assert {"mesh.glb", "mesh.ply", "depth.npy", "depth.tiff"} <= set(report["files"])
+    assert (report["surface"]["unit"], report["surface"]["n_vertices"]) == ("pixel", 448)
     # The normals are those of z = 2.5 sqrt(..), a sphere of radius 1 over 12 pixels, stretched.
     mesh = trimesh.load(out / "mesh.ply", process=False)
     assert len(mesh.vertices) == 448
@@ -102,6 +104,39 @@ def test_a_surface_in_the_albedo_s_colours(capture, run):
     # What integrate makes of the files is the same.
     assert run("integrate", out, "-o", "again", "--format", "npy").code == 0
     np.testing.assert_array_equal(np.load("again/depth.npy"), depth)
+
+
+def test_a_decimated_surface_in_millimetres(capture, run):
+    arguments = ["--surface", "--mesh-format", "stl", "--decimate", 50, "--pixel-size", 0.1]
+    assert run("infer", capture, "--method", "ls", *arguments).code == 0
+    surface = read_report(Path("out/sphere"))["surface"]
+    assert (surface["unit"], surface["pixel_size_mm"], surface["normal_texture"]) == ("millimetre", 0.1, True)
+    assert surface["n_triangles"] <= 50
+    assert sorted(path.suffix for path in Path("out/sphere").glob("mesh.*")) == [".stl"]
+    middle, rim = np.load("out/sphere/depth.npy")[11:13, 11:13].mean(), surface["range"][0]
+    assert middle - rim == pytest.approx(0.1 * 12 / (2 * 2.5), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--decimate", 50], "--decimate concerns the mesh. Add --surface, or leave it out"),
+        (["--mesh-format", "stl"], "--mesh-format concerns the mesh"),
+        (["--pixel-size", 1], "--pixel-size concerns near lamps"),
+        (["--surface", "--decimate", 0], "--decimate is 0, expected"),
+        (["--surface", "--pixel-size", 1e9], "the pixel size is 1e+09 mm, expected"),
+    ],
+)
+def test_options_of_the_surface_that_are_refused(capture, run, arguments, message):
+    result = run("infer", capture, "--method", "ls", *arguments)
+    assert (result.code, message in result.err) == (2, True), result.err
+
+
+def test_a_missing_library_is_named_before_the_work(capture, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    result = run("infer", capture, "--method", "ls", "--surface", "--decimate", 50)
+    assert (result.code, "pip install 'splinecli[mesh]'" in result.err) == (2, True), result.err
+    assert not Path("out").exists()
 
 
 def test_a_page_to_look_at(capture, run):

@@ -47,7 +47,7 @@ def test_heights_and_mesh_of_a_sphere(run):
     np.testing.assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
     report = json.loads(Path("out/surface.json").read_text())
     assert report["n_pixels"] == inside.sum()
-    assert report["files"] == ["mesh.ply", "mesh.obj", "depth.npy", "depth.tiff", "surface.json"]
+    assert report["files"] == ["mesh.ply", "mesh.obj", "mesh.mtl", "depth.npy", "depth.tiff", "surface.json"]
     assert sorted(path.name for path in Path("out").iterdir()) == sorted(report["files"])
     assert f"out: {inside.sum()} pixels, from " in result.out
 
@@ -123,10 +123,68 @@ def test_a_part_in_colour_by_perspective(run):
     mesh = trimesh.load("out/mesh.ply", process=False)
     assert (mesh.visual.vertex_colors[:, :3] == (200, 0, 0)).all()
     assert (mesh.vertices[:, 2] < 0).all()  # before the camera, which looks along -z
+    # A pixel without a size counts as a millimetre. Columns 7 to 24 are on the object.
+    assert trimesh.load("out/mesh.glb").extents[0] == pytest.approx(0.017, rel=0.05)
+    sized = json.loads(
+        run("integrate", "normals.npy", *options, "-o", "sized", "--pixel-size", 2, "--json").out
+    )
+    assert (sized["unit"], sized["pixel_size_mm"]) == ("millimetre", 2)
+    assert sized["range"] == pytest.approx(np.multiply(report["range"], 200 * 2), rel=1e-6)
+
+
+def test_millimetres_in_the_files(run):
+    import trimesh
+
+    report = json.loads(
+        run(
+            "integrate",
+            "normals.npy",
+            "-o",
+            "out",
+            "--pixel-size",
+            0.5,
+            "--format",
+            "glb,ply,stl,npy",
+            "--json",
+        ).out
+    )
+    _, heights, inside = sphere()
+    columns = np.flatnonzero(inside.any(axis=0))
+    width_mm, depth = 0.5 * float(np.ptp(columns)), np.load("out/depth.npy")
+    assert np.nanmax(depth) - np.nanmin(depth) == pytest.approx(0.5 * np.ptp(heights[inside]), rel=0.02)
+    assert report["range"] == pytest.approx([np.nanmin(depth), np.nanmax(depth)], rel=1e-6)
+    for name, unit_mm in (("mesh.ply", 1), ("mesh.stl", 1), ("mesh.glb", 1000)):
+        extents = trimesh.load(Path("out", name)).extents * unit_mm
+        assert extents[[0, 2]] == pytest.approx([width_mm, np.ptp(report["range"])], rel=1e-4), name
+    assert b"\ncomment unit: millimetre\n" in Path("out/mesh.ply").read_bytes()
+
+
+def test_a_decimated_mesh_and_its_textures(run):
+    import trimesh
+
+    green = np.zeros((*SHAPE, 3), np.uint8)
+    green[..., 1] = 180
+    cv2.imwrite("albedo.png", green)  # beside the normal map, as infer writes it
+    arguments = ["--decimate", 100, "--format", "glb,ply,obj", "--json"]
+    report = json.loads(run("integrate", ".", "-o", "out", *arguments).out)
+    assert (report["normal_texture"], report["colours"]) == (True, "albedo.png")
+    assert 80 <= report["n_triangles"] <= 100
+    assert report["files"] == ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "surface.json"]
+    [mesh] = trimesh.load("out/mesh.glb").geometry.values()
+    assert len(mesh.faces) == report["n_triangles"]
+    assert (
+        mesh.visual.material.normalTexture.size == mesh.visual.material.baseColorTexture.size == SHAPE[::-1]
+    )
+    assert (trimesh.load("out/mesh.ply").visual.vertex_colors[:, :3] == (0, 180, 0)).all()
+    obj = trimesh.load("out/mesh.obj", process=False)
+    assert obj.visual.material.image.getpixel((5, 5))[:3] == (0, 180, 0)
 
 
 def test_refusals(run, golden):
     np.save("flat.npy", np.ones(SHAPE))
+    dot = np.zeros((*SHAPE, 3), np.float32)
+    dot[3, 3, 2] = 1
+    np.save("dot.npy", dot)
     cv2.imwrite("small.png", np.full((10, 10), 255, np.uint8))
     corner = np.zeros(SHAPE, np.uint8)
     corner[0, 0] = 255
@@ -138,8 +196,11 @@ def test_refusals(run, golden):
     messages = []
     for code, arguments in (
         (2, []),
-        (2, ["normals.npy", "--format", "stl"]),
+        (2, ["normals.npy", "--format", "fbx"]),
         (2, ["normals.npy", "--stiffness", -1]),
+        (2, ["normals.npy", "--pixel-size", 0]),
+        (2, ["normals.npy", "--decimate", 0]),
+        (3, ["dot.npy"]),
         (3, ["missing.npy"]),
         (3, ["done"]),
         (3, ["flat.npy"]),

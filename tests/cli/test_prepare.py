@@ -191,7 +191,7 @@ def test_a_white_level_is_used_and_named(run, capture):
 
 
 def test_a_missing_extra_is_named_before_captures_are_read(run, capture, monkeypatch):
-    monkeypatch.setitem(sys.modules, "trimesh", None)
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
     result = run("prepare", capture, "--scenes", 1, "-o", "set")
     assert (result.code, result.out) == (2, "")
     assert "splinecli[render]" in result.err

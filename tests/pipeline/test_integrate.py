@@ -36,11 +36,21 @@ def tilted(tmp_path: Path) -> Path:
 
 def test_options() -> None:
     options = IntegrateOptions(normals=Path("a/normals.npy"), formats=("obj",))
-    assert (options.folder, options.files) == (Path("a"), ("mesh.obj", "surface.json"))
+    assert (options.folder, options.files) == (
+        Path("a"),
+        ("mesh.obj", "mesh.mtl", "mesh.png", "surface.json"),
+    )
     with pytest.raises(FrozenInstanceError):
         options.stiffness = 1.0  # type: ignore[misc]
-    with pytest.raises(UsageError, match="no format named 'stl'; expected one of ply, obj, npy, tiff"):
-        IntegrateOptions(normals=Path("a"), formats=("stl",))
+    with pytest.raises(
+        UsageError, match="no format named 'fbx'; expected one of glb, ply, obj, stl, npy, tiff"
+    ):
+        IntegrateOptions(normals=Path("a"), formats=("fbx",))
+    with pytest.raises(UsageError, match="--decimate is 0, expected a number of triangles of at least 1"):
+        IntegrateOptions(normals=Path("a"), decimate=0)
+    for size in (0, -1, float("nan"), 1e30):
+        with pytest.raises(UsageError, match="expected 1e-06 to 1e\\+06"):
+            IntegrateOptions(normals=Path("a"), pixel_size=size)
 
 
 def test_a_plane(tilted: Path, tmp_path: Path) -> None:

@@ -1,17 +1,15 @@
-"""Meshes of height maps, and their files as trimesh reads them."""
+"""Meshes of height maps."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import NDArray
 
-from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
-from splinecli.surface.mesh import SurfaceMesh, surface_mesh, write_mesh
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
 
@@ -105,53 +103,35 @@ def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
 
 
 @pytest.mark.parametrize("mask", [np.eye(4, dtype=bool), np.ones((1, 5), bool)], ids=["apart", "row"])
-def test_pixels_without_triangles(mask: NDArray[np.bool_], tmp_path: Path) -> None:
+def test_pixels_without_triangles(mask: NDArray[np.bool_]) -> None:
     mesh = surface_mesh(np.zeros(mask.shape), mask)
     assert mesh.triangles.shape == (0, 3)
-    for name in ("mesh.ply", "mesh.obj"):
-        write_mesh(mesh, tmp_path / name)
-    assert (tmp_path / "mesh.obj").read_text("utf-8").count("v ") == len(mesh.vertices)
+    np.testing.assert_array_equal(mesh.normals, np.tile((0, 0, 1), (len(mesh.vertices), 1)))
 
 
-@pytest.mark.parametrize("coloured", [False, True])
-@pytest.mark.parametrize("name", ["mesh.ply", "MESH.OBJ"])
-def test_files_are_read_back(name: str, coloured: bool, tmp_path: Path) -> None:
-    colours = colourful() if coloured else None
-    mesh = surface_mesh(wave(), np.ones((15, 20), bool), colours=colours)
-    write_mesh(mesh, tmp_path / name)
-    read: Any = trimesh.load_mesh(tmp_path / name, process=False, maintain_order=True)
-    np.testing.assert_allclose(read.vertices, mesh.vertices, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(read.faces, mesh.triangles)
-    assert read.visual.kind == ("vertex" if coloured else None)
-    if colours is not None:
-        np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], colours.reshape(-1, 3))
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
+    colours, normal_map, mask = colourful(), np.zeros((15, 20, 3)), ragged()
+    normal_map[..., 2] = 1
+    normal_map[3, 4] = (0.6, 0, 0.8)
+    mask[3, 4] = True
+    mesh = surface_mesh(50 + wave(), mask, camera, colours, normal_map=normal_map)
+    np.testing.assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
+    assert mesh.colours is not None
+    np.testing.assert_array_equal(mesh.colours, colours[mask])
+    rows, columns = np.nonzero(mask)
+    expected = np.stack(((columns + 0.5) / 20, (rows + 0.5) / 15), axis=1)
+    np.testing.assert_allclose(mesh.uvs, expected, atol=1e-6)
+    # Outside the mask, the texture goes on with the colours of the border.
+    assert mesh.texture is not None
+    assert {tuple(colour) for colour in mesh.texture.reshape(-1, 3)} == {tuple(c) for c in colours[mask]}
 
 
-def test_obj_as_text(tmp_path: Path) -> None:
-    mesh = SurfaceMesh(
-        np.array([[0, 0, 0], [1.5, 0, -2], [0, 1, 0.25]], np.float32),
-        np.array([[0, 1, 2]], np.int32),
-        np.array([[255, 0, 0], [0, 51, 0], [0, 0, 1]], np.uint8),
-    )
-    write_mesh(mesh, tmp_path / "mesh.obj")
-    assert (tmp_path / "mesh.obj").read_text("utf-8") == (
-        "v 0 0 0 1 0 0\nv 1.5 0 -2 0 0.2 0\nv 0 1 0.25 0 0 0.003922\nf 1 2 3\n"
-    )
-
-
-def test_unknown_kind_of_file(tmp_path: Path) -> None:
-    mesh = surface_mesh(wave(), ragged())
-    with pytest.raises(UsageError) as caught:
-        write_mesh(mesh, tmp_path / "mesh.stl")
-    expected = f"{tmp_path / 'mesh.stl'}: unknown mesh format. Give it a name that ends in .ply or .obj."
-    assert str(caught.value) == expected
-    assert not list(tmp_path.iterdir())
-
-
-def test_place_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError):
-        write_mesh(surface_mesh(wave(), ragged()), tmp_path / "file" / "mesh.ply")
+def test_normals_of_the_triangles() -> None:
+    rows, columns = np.mgrid[:8, :11]
+    mesh = surface_mesh(0.5 * columns - 2.0 * rows, np.ones((8, 11), bool))
+    slope = np.array((-0.5, -2, 1))
+    np.testing.assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (88, 1)), atol=1e-6)
 
 
 @pytest.mark.parametrize(

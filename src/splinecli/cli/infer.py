@@ -23,6 +23,7 @@ from splinecli.cli.options.values import (
 )
 from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import UsageError, printable
+from splinecli.surface.surface_files import MESH_FILES
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome, Redo
@@ -47,7 +48,7 @@ def infer(
     light_error_deg: float | None = inputs.LIGHT_ERROR,
     light_positions: Path | None = inputs.LIGHT_POSITIONS,
     light_distance: float | None = inputs.LIGHT_DISTANCE,
-    pixel_size: float | None = inputs.PIXEL_SIZE,
+    pixel_size: float | None = inputs.PIXEL_SIZE_OF_SURFACE,
     object_width: float | None = inputs.OBJECT_WIDTH,
     camera_matrix: Path | None = inputs.LAMP_CAMERA_MATRIX,
     mask: Path | None = inputs.MASK,
@@ -77,6 +78,8 @@ def infer(
     maps: str | None = outputs.MAPS,
     html: bool = outputs.HTML,
     surface: bool = outputs.SURFACE,
+    mesh_formats: str = outputs.MESH_FORMATS,
+    decimate: int | None = outputs.DECIMATE,
     convention: NormalConvention = outputs.CONVENTION,
     overwrite: bool = outputs.OVERWRITE,
     update: bool = outputs.UPDATE,
@@ -133,6 +136,8 @@ def infer(
             maps=() if maps is None else tuple(split_commas(maps, "--maps", choices.maps())),
             html=html,
             surface=surface,
+            mesh_formats=tuple(split_commas(mesh_formats, "--mesh-format", list(MESH_FILES))),
+            decimate=decimate,
             convention=convention.value,
             light_frame=light_frame,
             lights_format=lights_format.value,

@@ -21,8 +21,10 @@ def integrate(
     max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
     stiffness: float = computing.STIFFNESS,
     largest_step: float | None = computing.LARGEST_STEP,
+    pixel_size: float | None = inputs.PIXEL_SIZE_MM,
     output: Path | None = outputs.SURFACE_FOLDER,
     formats: str = outputs.SURFACE_FORMATS,
+    decimate: int | None = outputs.DECIMATE,
     overwrite: bool = outputs.OVERWRITE,
     as_json: bool = outputs.JSON,
     quiet: bool = outputs.QUIET,
@@ -33,7 +35,8 @@ def integrate(
     camera matrix, the depth map has heights towards the camera in pixels, with mean zero. With one, it has depths
     along the viewing axis, of unknown scale.
 
-    Writes OUT/mesh.ply (or .obj), depth.npy and depth.tiff, which are NaN outside the object, and surface.json.
+    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object, and
+    surface.json.
     """
     limit_reading(max_pixels_per_image)
     options = IntegrateOptions(
@@ -43,6 +46,8 @@ def integrate(
         camera_matrix=camera_matrix,
         stiffness=stiffness,
         largest_step=largest_step,
+        pixel_size=pixel_size,
+        decimate=decimate,
         colours=colours,
         formats=tuple(split_commas(formats, "--format", list(SURFACE_FILES))),
         convention=convention.value,

@@ -64,8 +64,9 @@ FILES = (
     ),
     ("OUT/NAME/preview.png", "With --maps preview: the surface in matte white under a raking light."),
     (
-        "OUT/NAME/mesh.ply, depth.npy, depth.tiff",
-        "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json and can write mesh.obj.",
+        "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff",
+        "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json. Both can write mesh.obj"
+        " (with mesh.mtl and mesh.png) and mesh.stl.",
     ),
     (
         "OUT/NAME/page.html",

@@ -30,6 +30,8 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--maps",
             "--html",
             "--surface",
+            "--mesh-format",
+            "--decimate",
             "--convention",
             "--strict",
             "--update",
@@ -55,9 +57,16 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Output": ("--output", "--compare", *REPEAT),
     },
     "integrate": {
-        "Input": ("--mask", "--camera-matrix", "--convention", "--colours", "--max-pixels-per-image"),
+        "Input": (
+            "--mask",
+            "--camera-matrix",
+            "--pixel-size",
+            "--convention",
+            "--colours",
+            "--max-pixels-per-image",
+        ),
         "Method": ("--stiffness", "--largest-step"),
-        "Output": ("--output", "--format", *REPEAT),
+        "Output": ("--output", "--format", "--decimate", *REPEAT),
     },
     "evaluate": {
         "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level", *LIMITS),

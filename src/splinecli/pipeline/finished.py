@@ -14,7 +14,7 @@ from splinecli.pipeline.infer_options import InferOptions
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
 
-_SINGULAR = {"formats": "format"}
+_SINGULAR = {"formats": "format", "mesh_formats": "mesh-format"}
 """Fields of InferOptions whose option has another name."""
 
 

@@ -208,25 +208,33 @@ def _further_files(
     if source.automatic_mask is not None:
         writers.append(partial(files.write_mask, capture.mask))
     if options.surface:
-        writers.append(_surface(estimate, colours, observer))
+        writers.append(_surface(estimate, colours, report, options, observer))
     if options.html:
         writers.append(_page(estimate, albedo, report))
     return writers
 
 
 def _surface(
-    estimate: NormalEstimate, colours: NDArray[np.uint8] | None, observer: Observer
+    estimate: NormalEstimate,
+    colours: NDArray[np.uint8] | None,
+    report: dict[str, Any],
+    options: InferOptions,
+    observer: Observer,
 ) -> Callable[[Path], None]:
-    from splinecli.pipeline.integrate import share_of_iterations
-    from splinecli.surface.integration import integrate_normals
-    from splinecli.surface.mesh import surface_mesh
-    from splinecli.surface.surface_files import write_surface
+    """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
+    from splinecli.pipeline.surface import make_surface, share_of_iterations
+    from splinecli.surface.surface_files import DEPTH_FORMATS, write_surface
 
-    mask = estimate.capture.mask
     with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
-        depth = integrate_normals(estimate.normal_map, mask, progress=share_of_iterations(advance))
-    mesh = surface_mesh(depth, mask, colours=colours)
-    return partial(write_surface, depth=depth, mesh=mesh)
+        surface, report["surface"] = make_surface(
+            estimate.normal_map,
+            estimate.capture.mask,
+            colours=colours,
+            n_triangles=options.decimate,
+            pixel_size_mm=options.pixel_size,
+            progress=share_of_iterations(advance),
+        )
+    return partial(write_surface, surface=surface, formats=(*options.mesh_formats, *DEPTH_FORMATS))
 
 
 def _page(

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from splinecli.errors import UsageError
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.normals import Convention
+from splinecli.pipeline.surface import check_decimation, check_surface_options
+from splinecli.surface.surface_files import DEFAULT_MESHES, MESH_FILES
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
@@ -34,6 +36,7 @@ class InferOptions:
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
         strict: fail where a warning says that the lights or images are probably wrong.
         light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.
+            With `surface`, pixel_size is in millimetres and scales the surface, too.
         refine_lights: refine rough light directions. light_error_deg: their usual error; None for the default.
         auto_mask: find the object where the capture has no mask.
         transfer: the curve of the images: linear, srgb or gamma:G.
@@ -52,6 +55,8 @@ class InferOptions:
         formats: names of `splinecli.results.files.NORMALS`.
         maps: names of `splinecli.results.files.MAPS`.
         html: also write page.html. surface: also write the depth map and the mesh.
+        mesh_formats: of the surface: keys of `splinecli.surface.surface_files.MESH_FILES`.
+        decimate: the number of triangles that the mesh is reduced to. None keeps all.
         convention: direction of the green channel in PNG files.
 
     Raises:
@@ -92,6 +97,8 @@ class InferOptions:
     maps: tuple[str, ...] = ()
     html: bool = False
     surface: bool = False
+    mesh_formats: tuple[str, ...] = DEFAULT_MESHES
+    decimate: int | None = None
     convention: Convention = "opengl"
     strict: bool = False
 
@@ -111,6 +118,13 @@ class InferOptions:
         if self.light_error_deg is not None:
             check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
         check_method(self.method)
+        check_surface_options(self.decimate, self.pixel_size if self.surface else None)
+        for option, given in (
+            ("decimate", self.decimate),
+            ("mesh-format", self.mesh_formats != DEFAULT_MESHES),
+        ):
+            if given and not self.surface:
+                raise UsageError(f"--{option} concerns the mesh", hint="Add --surface, or leave it out")
         if self.n_lights is not None:
             check_draw_settings(self.n_lights, 1, self.seed)
         if self.light_indices is not None:
@@ -127,6 +141,8 @@ class InferOptions:
             _check_one_of("format", name, NORMALS)
         for name in self.maps:
             _check_one_of("map", name, MAPS)
+        for name in self.mesh_formats:
+            _check_one_of("mesh format", name, MESH_FILES)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as JSON values."""
@@ -156,12 +172,16 @@ class InferOptions:
             positions=self.light_positions,
             distance=self.light_distance,
             pixel_size=self.pixel_size,
+            scales_surface=self.surface,
             object_width=self.object_width,
             camera_matrix=self.camera_matrix,
         )
 
     def check_files(self) -> None:
-        """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
+        """Raise InputError if a file that the options name does not exist, or --flat-field contains no images.
+
+        Raise UsageError if a package that the options need is not installed.
+        """
         from splinecli.capture.paths import check_file
         from splinecli.capture.reader import EQUAL
 
@@ -171,6 +191,7 @@ class InferOptions:
             if name is not None:
                 check_file(Path(name), "a file", pipe=name == self.lights)
         self.radiometric_calibration()
+        check_decimation(self.decimate)
 
     def radiometric_calibration(self) -> RadiometricCalibration:
         """Return how the images' values become linear light. Raises InputError."""

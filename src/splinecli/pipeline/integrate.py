@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +11,26 @@ from typing import TYPE_CHECKING, Any
 from splinecli.errors import InputError, UsageError
 from splinecli.files import is_unfinished, read_json
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, write_surface
+from splinecli.pipeline.surface import (
+    STIFFNESS,
+    check_decimation,
+    check_surface_options,
+    make_surface,
+    share_of_iterations,
+)
+from splinecli.surface.surface_files import (
+    DEFAULT_FORMATS,
+    SURFACE_FILES,
+    SURFACE_REPORT,
+    file_names,
+    write_surface,
+)
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from splinecli.normals import Convention
-    from splinecli.surface.mesh import SurfaceMesh
 
 INPUT_FORMATS = ("npy", "tiff", "png", "png8")
 """The formats in which `integrate` looks for a normal map in a folder, exact ones first."""
@@ -36,27 +47,32 @@ class IntegrateOptions:
         camera_matrix: a text file of 3 x 3 numbers, for a perspective camera. None for an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 never tears it.
         largest_step: leaves out triangles that are higher, in pixels. None keeps all.
-        colours: an image that gives the colours of the vertices.
+        pixel_size: the width of a pixel on the object in millimetres. None for a surface without this unit.
+        decimate: the number of triangles that the mesh is reduced to. None keeps all.
+        colours: an image of the colours of the object. None for the albedo in the folder of the normal map, if any.
         formats: keys of `splinecli.surface.surface_files.SURFACE_FILES`.
         convention: direction of the green channel of normal maps that are images.
         overwrite: replace earlier results.
 
     Raises:
-        UsageError: a format is unknown.
+        UsageError: a format is unknown, or a number is out of range.
     """
 
     normals: Path
     output: Path | None = None
     mask: Path | None = None
     camera_matrix: Path | None = None
-    stiffness: float = 2.0
+    stiffness: float = STIFFNESS
     largest_step: float | None = None
+    pixel_size: float | None = None
+    decimate: int | None = None
     colours: Path | None = None
     formats: tuple[str, ...] = DEFAULT_FORMATS
     convention: Convention = "opengl"
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        check_surface_options(self.decimate, self.pixel_size)
         for name in self.formats:
             if name not in SURFACE_FILES:
                 raise UsageError(f"no format named {name!r}; expected one of {', '.join(SURFACE_FILES)}")
@@ -68,8 +84,8 @@ class IntegrateOptions:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The names of the files that are written."""
-        return (*(SURFACE_FILES[name] for name in self.formats), SURFACE_REPORT)
+        """The names of the files that may be written."""
+        return (*file_names(self.formats), SURFACE_REPORT)
 
 
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
@@ -83,6 +99,7 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
     from splinecli.files import check_free
     from splinecli.publishing import held_folder
 
+    check_decimation(options.decimate)
     with held_folder(options.folder, observer.warn):
         check_free(options.folder, options.files, overwrite=options.overwrite)
         return _integrate_into(options, observer)
@@ -94,35 +111,45 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 
     from splinecli.capture.lights.lamp_files import read_camera_matrix
     from splinecli.publishing import new_files
-    from splinecli.surface.integration import integrate_normals
-    from splinecli.surface.mesh import surface_mesh
 
     normal_map = _read_normal_map(options)
     mask = np.asarray(normal_map.any(axis=2))
     camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
-    colours = None if options.colours is None else _read_colours(options.colours, mask.shape)
+    picture = options.colours or _find_albedo(options.normals)
+    colours = None if picture is None else _read_colours(picture, mask.shape)
     started = time.perf_counter()
     with observer.progress("integrating", 1.0) as advance:
-        depth = integrate_normals(
+        surface, found = make_surface(
             normal_map,
             mask,
             camera_matrix,
+            colours,
             stiffness=options.stiffness,
+            largest_step=options.largest_step,
+            n_triangles=options.decimate,
+            pixel_size_mm=options.pixel_size,
             progress=share_of_iterations(advance),
         )
-    mesh = surface_mesh(depth, mask, camera_matrix, colours, largest_step=options.largest_step)
-    report = _report(options, depth, mesh, perspective=camera_matrix is not None)
-    report["seconds"] = round(time.perf_counter() - started, 3)
-    report["files"] = list(options.files)
+    report = {
+        "normals": str(options.normals),
+        "colours": None if picture is None else str(picture),
+        "n_pixels": int(np.count_nonzero(mask)),
+        "image_size": [mask.shape[1], mask.shape[0]],
+        **found,
+        "seconds": round(time.perf_counter() - started, 3),
+    }
     with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as stage:
-        write_surface(stage, depth, mesh, options.formats)
+        write_surface(stage, surface, options.formats)
+        report["files"] = [
+            name for name in options.files if (stage / name).exists() or name == SURFACE_REPORT
+        ]
         (stage / SURFACE_REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     return report
 
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     """Return the line that tells people what was written."""
-    unit = "pixels" if report["camera"] == "orthographic" else "times the mean depth"
+    unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[report["unit"]]
     low, high = report["range"]
     return (
         f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit},"
@@ -130,45 +157,13 @@ def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     )
 
 
-def _report(
-    options: IntegrateOptions, depth: NDArray[np.float64], mesh: SurfaceMesh, *, perspective: bool
-) -> dict[str, Any]:
-    import numpy as np
-
-    return {
-        "normals": str(options.normals),
-        "camera": "perspective" if perspective else "orthographic",
-        "n_pixels": len(mesh.vertices),
-        "image_size": [depth.shape[1], depth.shape[0]],
-        "range": [round(float(np.nanmin(depth)), 4), round(float(np.nanmax(depth)), 4)],
-        "n_triangles": len(mesh.triangles),
-        "stiffness": options.stiffness,
-    }
-
-
 def _earlier_files(folder: Path) -> list[str]:
     """Return the files of a surface that an earlier `integrate` wrote into the folder. Those of `infer` stay."""
     try:
         named = read_json(folder / SURFACE_REPORT)["files"]
-        return [name for name in SURFACE_FILES.values() if name in named]
+        return [name for name in file_names(tuple(SURFACE_FILES)) if name in named]
     except (OSError, ValueError, KeyError, TypeError):
         return []
-
-
-def share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
-    """Return the progress function of integrate_normals that moves `advance` from 0 to 1.
-
-    Integration usually converges long before the largest number of iterations, so the share grows fast at first.
-    """
-    shown = 0.0
-
-    def progress(iteration: int, max_iterations: int) -> None:
-        nonlocal shown
-        share = 1 - 0.5 ** (8 * iteration / max_iterations)
-        advance(share - shown)
-        shown = share
-
-    return progress
 
 
 def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
@@ -212,6 +207,13 @@ def _was_written_as_directx(path: Path) -> bool:
         return path.suffix == ".png" and report["options"]["convention"] == "directx"
     except (OSError, ValueError, KeyError, TypeError):
         return False
+
+
+def _find_albedo(folder: Path) -> Path | None:
+    from splinecli.results.files import ALBEDO_PICTURE
+
+    path = folder / ALBEDO_PICTURE
+    return path if path.is_file() else None
 
 
 def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:

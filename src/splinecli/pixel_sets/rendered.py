@@ -85,7 +85,7 @@ class ScenePlan:
             UsageError: there are scenes and the packages of the extra `render` are not installed.
         """
         if self.names:
-            for package in ("embreex.rtcore_scene", "trimesh", "skimage.measure"):
+            for package in ("embreex.rtcore_scene", "skimage.measure"):
                 import_extra(package, "render")
         for path in self.meshes:
             read_mesh(path)

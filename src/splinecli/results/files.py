@@ -16,7 +16,7 @@ from splinecli.normals import Convention, encode_picture
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
 from splinecli.publishing import new_files
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 
 NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
 """The file of the normal map in each format."""
@@ -36,7 +36,7 @@ OWN_FILES = (
     *NORMALS.values(),
     ERROR_MAP,
     *(name for names in MAPS.values() for name in names),
-    *SURFACE_FILES.values(),
+    *file_names(tuple(SURFACE_FILES)),
     SURFACE_REPORT,
     FOUND_MASK,
     PAGE,

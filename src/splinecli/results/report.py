@@ -28,7 +28,9 @@ def report_of(
     warnings: Sequence[CaptureWarning],
     distillation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the report of an estimate (docs/infer.md), all but `seconds.write` and `files`, which write_estimate adds.
+    """Return the report of an estimate (docs/infer.md), without the surface.
+
+    write_estimate adds `seconds.write` and `files`.
 
     Args:
         estimate: the result.
@@ -70,6 +72,7 @@ def report_of(
         "version": __version__,
         "reading": name_reading(as_stored=as_stored),
         "white_level": None if capture.white_level is None else asdict(capture.white_level),
+        "surface": None,
     }
 
 

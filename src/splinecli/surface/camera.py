@@ -27,6 +27,22 @@ def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> 
     return image @ ray_basis(camera_matrix)
 
 
+def image_points(
+    points: NDArray[np.floating], shape: tuple[int, ...], camera_matrix: NDArray[np.floating] | None
+) -> Floats:
+    """Return the columns and rows (P, 2) at which a camera sees points (P, 3).
+
+    Args:
+        points: from the camera, or, without a camera matrix, in pixels from the centre of the image.
+        shape: height and width of the image.
+        camera_matrix: (3, 3), or None for an orthographic camera.
+    """
+    if camera_matrix is None:
+        return np.asarray(points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64)
+    image = points.astype(np.float64) * (1, -1, -1) @ np.asarray(camera_matrix, np.float64).T
+    return np.asarray(image[:, :2] / image[:, 2:])
+
+
 def focal_length(camera_matrix: NDArray[np.floating]) -> float:
     """Return the focal length in pixels: the geometric mean of both axes."""
     return float(np.sqrt(np.linalg.det(np.asarray(camera_matrix, np.float64)[:2, :2])))

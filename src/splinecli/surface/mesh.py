@@ -1,4 +1,4 @@
-"""Triangle meshes of height and depth maps, and their files.
+"""Triangle meshes of height and depth maps.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera, coordinates are in
 pixels and the origin is the centre of the image. For a pinhole camera, they are in the unit of the depth and the
@@ -8,29 +8,47 @@ origin is the camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.files import write_bytes
-from splinecli.surface.camera import focal_length, pixel_rays
+from splinecli.normals import unit
+from splinecli.surface.camera import focal_length, image_points, pixel_rays
 
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """A triangle mesh.
+    """A triangle mesh with the textures of its image.
 
     Args:
         vertices: (V, 3) float32.
         triangles: (T, 3) int32, the numbers of three vertices each, counter-clockwise as the camera sees them.
-        colours: (V, 3) uint8, RGB of the vertices, or None.
+        normals: (V, 3) float32, unit.
+        uvs: (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from
+            0 at the top to 1 at the bottom, as in glTF.
+        texture: (H, W, 3) uint8, sRGB colours, or None.
+        normal_texture: (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where
+            `normals` are exact. See normal_texture.py.
+        tangents: (V, 3) float32, unit, where there is a normal texture.
     """
 
     vertices: NDArray[np.float32]
     triangles: NDArray[np.int32]
-    colours: NDArray[np.uint8] | None = None
+    normals: NDArray[np.float32]
+    uvs: NDArray[np.float32]
+    texture: NDArray[np.uint8] | None = None
+    normal_texture: NDArray[np.uint8] | None = None
+    tangents: NDArray[np.float32] | None = None
+
+    @property
+    def colours(self) -> NDArray[np.uint8] | None:
+        """The colours of the vertices in the texture, (V, 3) uint8."""
+        if self.texture is None:
+            return None
+        height, width = self.texture.shape[:2]
+        columns, rows = np.floor(self.uvs * (width, height)).astype(np.intp).T
+        return np.asarray(self.texture[rows.clip(0, height - 1), columns.clip(0, width - 1)])
 
 
 def surface_mesh(
@@ -39,6 +57,7 @@ def surface_mesh(
     camera_matrix: NDArray[np.floating] | None = None,
     colours: NDArray[np.uint8] | None = None,
     *,
+    normal_map: NDArray[np.floating] | None = None,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
     """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by row.
@@ -51,7 +70,8 @@ def surface_mesh(
             integrate_normals returns them.
         mask: (H, W), True on the object.
         camera_matrix: (3, 3), the one that integrate_normals had, or None.
-        colours: (H, W, 3) uint8 RGB, or None.
+        colours: (H, W, 3) uint8 sRGB, or None.
+        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None for those of the triangles.
         largest_step: leaves out triangles whose corners differ by more than this in height, in pixels (for a pinhole
             camera, in pixels at the depth of the triangle). They are the walls where the surface is torn. None keeps
             all triangles.
@@ -78,25 +98,45 @@ def surface_mesh(
     triangles = _triangles(heights, mask)
     if largest_step is not None:
         triangles = triangles[np.ptp(heights[triangles], axis=1) <= largest_step]
+    normals = vertex_normals(vertices, triangles) if normal_map is None else normal_map[mask]
     return SurfaceMesh(
         vertices.astype(np.float32),
         triangles,
-        None if colours is None else np.ascontiguousarray(colours[mask]),
+        normals.astype(np.float32),
+        texture_coordinates(image_points(vertices, mask.shape, camera_matrix), mask.shape),
+        None if colours is None else fill_outside(colours, mask),
     )
 
 
-def write_mesh(mesh: SurfaceMesh, path: str | Path) -> None:
-    """Write a mesh as binary .ply, or as .obj with the colours (0 to 1) after the coordinates of each vertex.
+def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return the unit normals (V, 3) of vertices: means over their triangles, weighted by area.
 
-    Raises:
-        UsageError: the name ends in neither .ply nor .obj.
-        OutputError: the file cannot be written.
+    A vertex without triangles has the normal (0, 0, 1).
     """
-    path = Path(path)
-    encoders = {".ply": _ply, ".obj": _obj}
-    if path.suffix.lower() not in encoders:
-        raise UsageError(f"{path}: unknown mesh format", hint="Give it a name that ends in .ply or .obj")
-    write_bytes(path, encoders[path.suffix.lower()](mesh))
+    first, second, third = np.moveaxis(vertices[triangles].astype(np.float64), 1, 0)
+    faces = np.cross(second - first, third - first).repeat(3, axis=0)
+    sums = [np.bincount(triangles.ravel(), faces[:, axis], len(vertices)) for axis in range(3)]
+    normals: NDArray[np.float64] = unit(np.stack(sums, axis=1).astype(np.float64))
+    normals[~normals.any(axis=1)] = (0, 0, 1)
+    return normals
+
+
+def texture_coordinates(points: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see SurfaceMesh.uvs."""
+    return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
+
+
+def fill_outside(texture: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return a texture (H, W, 3) in which every pixel that is not known (H, W) has the value of the nearest known one.
+
+    Viewers interpolate between pixels and reduce textures, which would bring in the background at the border.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    if known.all() or not known.any():
+        return texture
+    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(texture[rows, columns])
 
 
 def _triangles(heights: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -119,42 +159,6 @@ def _triangles(heights: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray
     three = inside.sum(axis=1) == 3
     parts.append(squares[three][inside[three]].reshape(-1, 3))
     return np.concatenate(parts)
-
-
-def _ply(mesh: SurfaceMesh) -> bytes:
-    fields: list[tuple[str, str, tuple[int, ...]]] = [("position", "<f4", (3,))]
-    properties = [f"property float {axis}" for axis in "xyz"]
-    if mesh.colours is not None:
-        fields.append(("colour", "u1", (3,)))
-        properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    vertices = np.empty(len(mesh.vertices), fields)
-    vertices["position"] = mesh.vertices
-    if mesh.colours is not None:
-        vertices["colour"] = mesh.colours
-    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("vertices", "<i4", (3,))])
-    faces["count"], faces["vertices"] = 3, mesh.triangles
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *properties,
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
-
-
-def _obj(mesh: SurfaceMesh) -> bytes:
-    vertices, line = mesh.vertices.astype(np.float64), "v %.7g %.7g %.7g"
-    if mesh.colours is not None:
-        vertices, line = np.concatenate((vertices, mesh.colours / 255), axis=1), line + " %.4g %.4g %.4g"
-    return (_lines(line, vertices) + _lines("f %d %d %d", mesh.triangles + 1)).encode()
-
-
-def _lines(line: str, rows: NDArray[np.generic]) -> str:
-    # A single format operation is several times as fast as one for each line.
-    return f"{line}\n" * len(rows) % tuple(rows.ravel().tolist())
 
 
 def _check(

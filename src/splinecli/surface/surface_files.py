@@ -1,9 +1,10 @@
-"""The files of a surface: meshes, and the depth map as float32 NPY and TIFF."""
+"""The files of a surface: meshes, the depth map as float32 NPY and TIFF, and a picture of it."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,44 +16,82 @@ if TYPE_CHECKING:
 
     from splinecli.surface.mesh import SurfaceMesh
 
-SURFACE_FILES = {"ply": "mesh.ply", "obj": "mesh.obj", "npy": "depth.npy", "tiff": "depth.tiff"}
-"""The file name of each format."""
+MESH_FILES = {
+    "glb": ("mesh.glb",),
+    "ply": ("mesh.ply",),
+    "obj": ("mesh.obj", "mesh.mtl", "mesh.png"),
+    "stl": ("mesh.stl",),
+}
+"""The file names of each format of a mesh; mesh.png is the texture of an OBJ file, if there are colours."""
+
+SURFACE_FILES = {**MESH_FILES, "npy": ("depth.npy",), "tiff": ("depth.tiff",)}
+"""The file names of each format."""
 
 SURFACE_REPORT = "surface.json"
 """The report that `integrate` writes beside them."""
 
-DEFAULT_FORMATS = ("ply", "npy", "tiff")
+DEFAULT_MESHES = ("glb", "ply")
+DEPTH_FORMATS = ("npy", "tiff")
+DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
 
 
-def write_surface(
-    folder: Path, depth: NDArray[np.floating], mesh: SurfaceMesh, formats: Sequence[str] = DEFAULT_FORMATS
-) -> None:
+@dataclass(frozen=True)
+class Surface:
+    """A depth map and its mesh.
+
+    Args:
+        depth: (H, W), NaN outside the object.
+        mesh: the mesh of the same surface.
+        unit: the name of the unit of both.
+        millimetres: the length of this unit in a file of glTF.
+    """
+
+    depth: NDArray[np.floating]
+    mesh: SurfaceMesh
+    unit: str
+    millimetres: float
+
+
+def file_names(formats: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of all files that write_surface may write."""
+    return tuple(name for form in formats for name in SURFACE_FILES[form])
+
+
+def write_surface(folder: Path, surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> None:
     """Write a surface to the files that SURFACE_FILES names, each complete or not at all.
 
     Args:
         folder: the folder of the files; it is made where it does not exist.
-        depth: (H, W), NaN outside the object.
-        mesh: the mesh of the same surface.
+        surface: the surface.
         formats: keys of SURFACE_FILES.
 
     Raises:
+        InputError: a mesh without triangles cannot be written as GLB.
         OutputError: a file cannot be written.
     """
+    for form in formats:
+        for name, content in _encode(surface, form).items():
+            write_bytes(folder / name, content)
+
+
+def _encode(surface: Surface, form: str) -> dict[str, bytes]:
     import numpy as np
 
-    from splinecli.surface.mesh import write_mesh
+    from splinecli.surface import mesh_files
 
-    depth = depth.astype(np.float32)
-    for name in formats:
-        path = folder / SURFACE_FILES[name]
-        if name in ("ply", "obj"):
-            write_mesh(mesh, path)
-            continue
-        buffer = io.BytesIO()
-        if name == "npy":
-            np.save(buffer, depth, allow_pickle=False)
-        else:
-            import tifffile
+    if form == "obj":
+        return mesh_files.encode_obj(surface.mesh, name="mesh", unit=surface.unit)
+    buffer = io.BytesIO()
+    if form == "glb":
+        buffer.write(mesh_files.encode_glb(surface.mesh, metres=surface.millimetres / 1000))
+    elif form == "ply":
+        buffer.write(mesh_files.encode_ply(surface.mesh, unit=surface.unit))
+    elif form == "stl":
+        buffer.write(mesh_files.encode_stl(surface.mesh))
+    elif form == "npy":
+        np.save(buffer, surface.depth.astype(np.float32), allow_pickle=False)
+    else:
+        import tifffile
 
-            tifffile.imwrite(buffer, depth)
-        write_bytes(path, buffer.getvalue())
+        tifffile.imwrite(buffer, surface.depth.astype(np.float32))
+    return {SURFACE_FILES[form][0]: buffer.getvalue()}

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
-from splinecli.extras import import_extra
 
 Floats = NDArray[np.floating]
 
@@ -40,9 +39,9 @@ def read_mesh(path: str | Path) -> Mesh:
 
     Raises:
         InputError: the file is missing, not a mesh, or has no faces.
-        UsageError: the extra `render` is not installed.
     """
-    trimesh = import_extra("trimesh", "render")
+    import trimesh
+
     check_file(Path(path), "a mesh")
     try:
         loaded = trimesh.load_mesh(path, process=True)

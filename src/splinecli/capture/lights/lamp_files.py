@@ -30,6 +30,7 @@ class LampOptions:
         positions: a file of lamp positions, which replaces the light file.
         distance: the distance of all lamps from the middle of the object, in their directions.
         pixel_size: the width of a pixel on the object's mean plane.
+        scales_surface: whether the pixel size is given for the surface, so that it needs no lamps.
         object_width: the width of the object, from the first to the last column of the mask.
         camera_matrix: a file of the 3 x 3 camera matrix in pixels.
 
@@ -40,6 +41,7 @@ class LampOptions:
     positions: str | None = None
     distance: float | None = None
     pixel_size: float | None = None
+    scales_surface: bool = False
     object_width: float | None = None
     camera_matrix: str | None = None
 
@@ -60,8 +62,9 @@ class LampOptions:
 
     @property
     def given(self) -> str | None:
-        """The first option that is given, as the user writes it; None for none."""
-        return next((option for name, option in _OPTIONS.items() if getattr(self, name) is not None), None)
+        """The first option for lamps alone that is given, as the user writes it; None for none."""
+        names = [name for name in _OPTIONS if not (name == "pixel_size" and self.scales_surface)]
+        return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
 
 
 _OPTIONS = {

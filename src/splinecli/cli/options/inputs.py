@@ -54,10 +54,19 @@ LIGHT_POSITIONS = Option(
 LIGHT_DISTANCE = Option(
     None, metavar="D", help="Near lamps: the distance of all lamps from the middle of the object."
 )
-PIXEL_SIZE = Option(
+_PIXEL_SIZE = "Near lamps: the width of a pixel on the object. [default: pixel_size.txt in CAPTURE]"
+PIXEL_SIZE = Option(None, metavar="S", help=_PIXEL_SIZE)
+PIXEL_SIZE_OF_SURFACE = Option(
     None,
+    "--pixel-size",
     metavar="S",
-    help="Near lamps: the width of a pixel on the object. [default: pixel_size.txt in CAPTURE]",
+    help=f"{_PIXEL_SIZE} With --surface: in millimetres, for a surface in millimetres.",
+)
+PIXEL_SIZE_MM = Option(
+    None,
+    "--pixel-size",
+    metavar="MM",
+    help="Width of a pixel on the object in millimetres, for a surface in millimetres. [default: in pixels]",
 )
 OBJECT_WIDTH = Option(
     None, metavar="W", help="Near lamps: the width of the object in its mask, in place of --pixel-size."
@@ -190,4 +199,8 @@ NORMALS_CONVENTION = Option(
     NormalConvention.opengl,
     help="Green channel of a normal map that is an image: opengl is y up, directx is y down.",
 )
-COLOURS = Option(None, metavar="FILE", help="Image that gives the colors of the mesh, such as an albedo map.")
+COLOURS = Option(
+    None,
+    metavar="FILE",
+    help="Image of the object's colours, for the mesh. [default: albedo.png beside NORMALS, if NORMALS is a folder]",
+)

@@ -8,7 +8,7 @@ from typer import Option
 
 from splinecli.cli import choices
 from splinecli.cli.options.values import NormalConvention, complete_list
-from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
+from splinecli.surface.surface_files import DEFAULT_FORMATS, DEFAULT_MESHES, MESH_FILES, SURFACE_FILES
 from splinecli.training.defaults import CHECKPOINT_SECONDS
 
 # The place of the results.
@@ -60,7 +60,22 @@ HTML = Option(
     "--html",
     help="Also write page.html: the maps, and a view of the surface under a light that you move.",
 )
-SURFACE = Option(False, "--surface", help="Also write mesh.ply, depth.npy and depth.tiff, as integrate does.")
+SURFACE = Option(
+    False, "--surface", help="Also write mesh.glb, mesh.ply, depth.npy and depth.tiff, as integrate does."
+)
+MESH_FORMATS = Option(
+    ",".join(DEFAULT_MESHES),
+    "--mesh-format",
+    metavar="LIST",
+    help=f"With --surface: files of the mesh, any of {', '.join(MESH_FILES)}.",
+    autocompletion=complete_list(*MESH_FILES),
+)
+DECIMATE = Option(
+    None,
+    metavar="N",
+    help="Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB (needs the extra 'mesh')."
+    " [default: all]",
+)
 CONVENTION = Option(
     NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
 )

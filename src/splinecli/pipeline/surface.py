@@ -1,0 +1,119 @@
+"""The surface of a normal map: integrated, as a mesh, in its unit, with its report. `integrate` and `infer` make it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from splinecli.errors import UsageError
+from splinecli.extras import import_extra
+from splinecli.surface.surface_files import Surface
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+STIFFNESS = 2.0
+"""How easily the surface tears at edges, without --stiffness."""
+
+SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
+
+
+def make_surface(
+    normal_map: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    camera_matrix: NDArray[np.floating] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+    *,
+    stiffness: float = STIFFNESS,
+    largest_step: float | None = None,
+    n_triangles: int | None = None,
+    pixel_size_mm: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Surface, dict[str, Any]]:
+    """Return the surface of a normal map, and what the reports say of it.
+
+    Args:
+        normal_map, mask, camera_matrix, stiffness, progress: see integrate_normals.
+        colours, largest_step: see surface_mesh.
+        n_triangles: see decimate. None keeps all triangles.
+        pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a surface in pixels,
+            or, with a camera matrix, in mean depths.
+
+    Raises:
+        InputError, UsageError: see integrate_normals, surface_mesh and decimate.
+    """
+    import numpy as np
+
+    from splinecli.surface.camera import focal_length
+    from splinecli.surface.decimation import decimate
+    from splinecli.surface.integration import integrate_normals
+    from splinecli.surface.mesh import surface_mesh
+
+    depth = integrate_normals(normal_map, mask, camera_matrix, stiffness=stiffness, progress=progress)
+    mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+    if n_triangles is not None:
+        mesh = decimate(mesh, n_triangles, normal_map, camera_matrix)
+    pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
+    unit, millimetres = "pixel" if camera_matrix is None else "mean depth", 1 / pixel
+    if pixel_size_mm is not None:
+        unit, millimetres, scale = "millimetre", 1.0, pixel_size_mm / pixel
+        depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
+    surface = Surface(depth, mesh, unit, millimetres)
+    return surface, _report(surface, camera_matrix is not None, stiffness, pixel_size_mm)
+
+
+def check_decimation(n_triangles: int | None) -> None:
+    """Raise UsageError, before the work, if meshes are to be decimated and the library for it is not installed."""
+    if n_triangles is not None:
+        import_extra("fast_simplification", "mesh")
+
+
+def check_surface_options(decimate: int | None, pixel_size: float | None) -> None:
+    """Raise UsageError for a number of triangles or a pixel size (mm) out of range."""
+    if decimate is not None and decimate < 1:
+        raise UsageError(f"--decimate is {decimate}, expected a number of triangles of at least 1")
+    if pixel_size is not None and not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
+        raise UsageError(
+            f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"
+        )
+
+
+def _report(
+    surface: Surface, perspective: bool, stiffness: float, pixel_size_mm: float | None
+) -> dict[str, Any]:
+    import numpy as np
+
+    return {
+        "camera": "perspective" if perspective else "orthographic",
+        "unit": surface.unit,
+        "pixel_size_mm": pixel_size_mm,
+        "range": [_round(float(end(surface.depth))) for end in (np.nanmin, np.nanmax)],
+        "n_vertices": len(surface.mesh.vertices),
+        "n_triangles": len(surface.mesh.triangles),
+        "normal_texture": surface.mesh.normal_texture is not None,
+        "stiffness": stiffness,
+    }
+
+
+def _round(value: float, digits: int = 7) -> float:
+    """Round a number to as many significant digits as float32 has."""
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else value
+
+
+def share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
+    """Return the progress function of integrate_normals that moves `advance` from 0 to 1.
+
+    Integration usually converges long before the largest number of iterations, so the share grows fast at first.
+    """
+    shown = 0.0
+
+    def progress(iteration: int, max_iterations: int) -> None:
+        nonlocal shown
+        share = 1 - 0.5 ** (8 * iteration / max_iterations)
+        advance(share - shown)
+        shown = share
+
+    return progress

@@ -1,0 +1,145 @@
+"""Decimated meshes in GLB: relit from the file as viewers do, they have the measured normals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from glb_file import read_glb
+from splinecli.errors import InputError
+from splinecli.normals import angle_between_deg, unit
+from splinecli.surface.camera import pixel_rays
+from splinecli.surface.decimation import decimate
+from splinecli.surface.mesh import SurfaceMesh, surface_mesh
+from splinecli.surface.mesh_files import encode_glb
+
+SIDE = 90
+CAMERA = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
+
+Floats = NDArray[np.float64]
+
+
+def measured(columns: Floats, rows: Floats) -> Floats:
+    """Return the normals (..., 3) of a dome with relief that is finer than the triangles will be."""
+    across, up = (columns - 44.5) / 60, (44.5 - rows) / 60
+    x = across + 0.35 * np.sin(columns / 2.5) * np.cos(rows / 4)
+    y = up + 0.35 * np.cos(columns / 3) * np.sin(rows / 2)
+    return unit(np.stack((x, y, np.ones_like(x)), axis=-1))
+
+
+def height_of_dome(columns: Floats, rows: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.maximum(60.0**2 - (columns - 44.5) ** 2 - (rows - 44.5) ** 2, 0)))
+
+
+def dome(camera: NDArray[np.float64] | None) -> tuple[SurfaceMesh, NDArray[np.float64]]:
+    """Return a mesh with the shape of the dome alone, and the normal map with the relief."""
+    rows, columns = np.mgrid[:SIDE, :SIDE].astype(float)
+    mask = np.hypot(columns - 44.5, rows - 44.5) < 42
+    height = height_of_dome(columns, rows)
+    normal_map = measured(columns, rows) * mask[..., None]
+    depth = height if camera is None else 3 - height / 125
+    colours = np.full((SIDE, SIDE, 3), 90, np.uint8)
+    return surface_mesh(depth, mask, camera, colours, normal_map=normal_map), normal_map
+
+
+@pytest.fixture(scope="module", params=[None, CAMERA], ids=["orthographic", "perspective"])
+def camera(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
+    mesh, normal_map = dome(camera)
+    return decimate(mesh, len(mesh.triangles) // 20, normal_map, camera)
+
+
+def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
+    full, _ = dome(None)
+    assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
+    _, arrays = read_glb(encode_glb(decimated, metres=0.001))
+    assert (arrays["TANGENT"][:, 3] == 1).all()
+    # Ten points in each triangle.
+    weights = np.random.default_rng(0).dirichlet((1, 1, 1), (10, len(arrays["indices"])))
+    uv, smooth, tangent = (
+        np.einsum("ktc,tcx->ktx", weights, arrays[name][arrays["indices"]]).reshape(-1, arrays[name].shape[1])
+        for name in ("TEXCOORD_0", "NORMAL", "TANGENT")
+    )
+    columns, rows = (uv * SIDE - 0.5).T
+    inside = np.hypot(columns - 44.5, rows - 44.5) < 41
+    # The nearest texel, read at its own place. A viewer interpolates between texels.
+    columns, rows = np.rint(columns), np.rint(rows)
+    texels = arrays["normal"][rows.astype(int), columns.astype(int)] / 255 * 2 - 1
+    smooth, side = unit(smooth), unit(tangent[:, :3])
+    lit = unit(np.einsum("px,pxy->py", texels, np.stack((side, np.cross(smooth, side), smooth), axis=1)))
+    errors, without = (angle_between_deg(found, measured(columns, rows))[inside] for found in (lit, smooth))
+    # 8 bits are accurate to 0.3 degrees; half a texel is up to 4 degrees on the dome, and less on average.
+    assert errors.mean() < 1.0
+    assert without.mean() > 10
+
+
+def test_tangents_are_those_that_viewers_compute(
+    decimated: SurfaceMesh, camera: NDArray[np.float64] | None
+) -> None:
+    """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a vertex."""
+    corners = decimated.vertices[decimated.triangles].astype(float)
+    uvs = decimated.uvs[decimated.triangles].astype(float)
+    edges, steps = corners[:, 1:] - corners[:, :1], uvs[:, 1:] - uvs[:, :1]
+    along_u, along_v = np.moveaxis(np.linalg.solve(steps, edges), 1, 0)
+    total = np.zeros_like(decimated.vertices, dtype=float)
+    np.add.at(total, decimated.triangles, unit(along_u)[:, None])
+    normals, tangents = decimated.normals.astype(float), decimated.tangents
+    assert tangents is not None
+    expected = unit(total - (total * normals).sum(axis=1, keepdims=True) * normals)
+    counts = np.bincount(decimated.triangles.ravel())
+    error = angle_between_deg(tangents, expected)[counts >= 5]  # away from the border
+    assert error.mean() < 1.5
+    # Green points up in the image, against v.
+    bitangents = np.cross(normals, tangents)[decimated.triangles]
+    assert (np.einsum("tcx,tx->tc", bitangents, along_v) < 0).all()
+
+
+def test_vertices_stay_on_the_dome_and_in_their_places(
+    decimated: SurfaceMesh, camera: NDArray[np.float64] | None
+) -> None:
+    columns, rows = (decimated.uvs * SIDE - 0.5).T
+    if camera is None:
+        x, y = decimated.vertices[:, 0] + 44.5, 44.5 - decimated.vertices[:, 1]
+    else:
+        x, y, _ = (decimated.vertices / -decimated.vertices[:, 2:] * (1, -1, -1) @ camera.T).T
+    np.testing.assert_allclose(np.stack((columns, rows)), np.stack((x, y)), atol=1e-3)
+    height = height_of_dome(columns, rows)
+    depth = height if camera is None else -(3 - height / 125)
+    scale = 1 if camera is None else 125
+    assert np.abs(decimated.vertices[:, 2] - depth).mean() * scale < 0.2  # pixels
+
+
+def test_a_mesh_that_is_small_enough_stays(camera: NDArray[np.float64] | None) -> None:
+    mesh, normal_map = dome(camera)
+    assert decimate(mesh, len(mesh.triangles), normal_map, camera) is mesh
+
+
+def test_rays_of_a_row_lie_in_the_plane_of_its_tangents() -> None:
+    """The tangents of a plane that faces a perspective camera point along its rows."""
+    mask = np.ones((20, 20), bool)
+    normal_map = np.zeros((20, 20, 3))
+    normal_map[..., 2] = 1
+    depth = np.full((20, 20), 2.0)
+    flat = decimate(surface_mesh(depth, mask, CAMERA, normal_map=normal_map), 100, normal_map, CAMERA)
+    assert flat.tangents is not None
+    np.testing.assert_allclose(flat.tangents, np.tile((1, 0, 0), (len(flat.vertices), 1)), atol=1e-6)
+    assert flat.normal_texture is not None
+    assert (flat.normal_texture == (128, 128, 255)).all()
+    assert np.abs(pixel_rays(mask, CAMERA)[:, 2] + 1).max() == 0
+
+
+def test_nothing_left() -> None:
+    mask = np.ones((3, 3), bool)
+    normal_map = np.tile((0.0, 0.0, 1.0), (3, 3, 1))
+    mesh = surface_mesh(np.zeros((3, 3)), mask, normal_map=normal_map)
+    try:
+        assert 0 < len(decimate(mesh, 1, normal_map).triangles) < 8
+    except InputError as error:
+        assert "no mesh of 1 triangles is left" in str(error)

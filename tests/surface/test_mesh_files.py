@@ -1,0 +1,109 @@
+"""Files of meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from glb_file import read_glb
+from splinecli.errors import InputError, OutputError
+from splinecli.surface.mesh import SurfaceMesh, surface_mesh
+from splinecli.surface.mesh_files import GRAY, encode_glb, encode_obj, encode_ply, encode_stl
+from splinecli.surface.surface_files import Surface, write_surface
+
+SHAPE = (15, 20)
+DEPTH = 3 * np.sin(np.arange(20) / 4) + np.arange(15)[:, None] / 5
+COLOURS = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), np.uint8)
+
+
+def wave(coloured: bool = True, mask: NDArray[np.bool_] | None = None) -> SurfaceMesh:
+    mask = np.ones(SHAPE, bool) if mask is None else mask
+    return surface_mesh(DEPTH, mask, colours=COLOURS if coloured else None)
+
+
+def load(content: bytes, form: str, **more: Any) -> Any:
+    options: dict[str, Any] = {"process": False, "maintain_order": True, **more}
+    return trimesh.load_mesh(io.BytesIO(content), file_type=form, **options)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_ply(coloured: bool) -> None:
+    mesh = wave(coloured)
+    content = encode_ply(mesh, unit="pixel")
+    read = load(content, "ply")
+    np.testing.assert_array_equal(read.vertices, mesh.vertices)
+    np.testing.assert_array_equal(read.faces, mesh.triangles)
+    # trimesh passes over the normals.
+    width = 28 if coloured else 24
+    body = content.partition(b"end_header\n")[2][: width * len(mesh.vertices)]
+    normals = np.frombuffer(body, np.uint8).reshape(-1, width)[:, 12:24].copy().view("<f4")
+    np.testing.assert_allclose(normals, mesh.normals, atol=1e-6)
+    assert b"property float nx\nproperty float ny\nproperty float nz\n" in content
+    assert content.startswith(b"ply\nformat binary_little_endian 1.0\ncomment unit: pixel\n")
+    assert read.visual.kind == ("vertex" if coloured else None)
+    if coloured:
+        np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], COLOURS.reshape(-1, 3))
+
+
+def test_stl() -> None:
+    mesh = wave()
+    np.testing.assert_array_equal(load(encode_stl(mesh), "stl").triangles, mesh.vertices[mesh.triangles])
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_obj(coloured: bool, tmp_path: Path) -> None:
+    mesh = wave(coloured)
+    files = encode_obj(mesh, name="mesh", unit="millimetre")
+    assert sorted(files) == ["mesh.mtl", "mesh.obj", *(["mesh.png"] if coloured else [])]
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
+    np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.triangles)
+    normals = [line.split()[1:] for line in files["mesh.obj"].decode().splitlines() if line.startswith("vn ")]
+    np.testing.assert_allclose(np.array(normals, float), mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(read.visual.uv, mesh.uvs * (1, -1) + (0, 1), atol=1e-6)
+    if coloured:
+        np.testing.assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_glb(coloured: bool) -> None:
+    mesh = wave(coloured)
+    content = encode_glb(mesh, metres=0.002)
+    tree, arrays = read_glb(content)
+    np.testing.assert_allclose(arrays["POSITION"], mesh.vertices * 0.002, rtol=1e-6)
+    np.testing.assert_array_equal(arrays["indices"], mesh.triangles)
+    np.testing.assert_allclose(arrays["NORMAL"], mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(arrays["TEXCOORD_0"], mesh.uvs, atol=1e-6)
+    [material] = tree["materials"]
+    matte = material["pbrMetallicRoughness"]
+    assert (matte["metallicFactor"], matte["roughnessFactor"], material["doubleSided"]) == (0, 1, True)
+    assert ("TANGENT" in arrays, "normal" in arrays) == (False, False)  # the normals are exact
+    if coloured:
+        np.testing.assert_array_equal(arrays["colour"], COLOURS)
+    else:
+        assert matte["baseColorFactor"] == pytest.approx([GRAY / 255] * 3 + [1])
+    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
+    assert len(read.faces) == len(mesh.triangles)
+
+
+def test_a_mesh_without_triangles() -> None:
+    mesh = wave(mask=np.eye(*SHAPE, dtype=bool))
+    assert b"element vertex 15\n" in encode_ply(mesh, unit="pixel")
+    assert encode_obj(mesh, name="mesh", unit="pixel")["mesh.obj"].count(b"\nv ") == 15
+    assert len(encode_stl(mesh)) == 84
+    with pytest.raises(InputError, match="the mesh has no triangles: nowhere do three pixels"):
+        encode_glb(mesh, metres=1)
+
+
+def test_place_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError):
+        write_surface(tmp_path / "file", Surface(DEPTH, wave(), "pixel", 1), ["ply"])
