@@ -13,6 +13,7 @@ from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.masks import take_pixels
+from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 from splinecli.transfer import decode_transfer
 
@@ -41,10 +42,16 @@ AS_STORED = RadiometricCalibration()
 class Lineariser:
     """Linearise the pixels of a mask (H, W). Ambient image and common flat field are read once."""
 
-    def __init__(self, radiometry: RadiometricCalibration, mask: NDArray[np.bool_], n_images: int) -> None:
+    def __init__(
+        self,
+        radiometry: RadiometricCalibration,
+        mask: NDArray[np.bool_],
+        n_images: int,
+        window: Window = WHOLE,
+    ) -> None:
         """Read the shared images. Raises InputError for an unreadable image or a wrong number of flat fields."""
         self.radiometry = radiometry
-        self.mask = mask
+        self.mask, self._window = mask, window
         flats = radiometry.flat_field
         if len(flats) not in (0, 1, n_images):
             raise InputError(
@@ -75,5 +82,6 @@ class Lineariser:
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
 
     def _linear(self, path: Path) -> NDArray[np.float32]:
-        stored = decode_image(path, ExpectedSize(self.mask.shape, "the other images"))
+        expected = ExpectedSize(self._window.shape or self.mask.shape, "the other images")
+        stored = self._window.of(decode_image(path, expected))
         return decode_transfer(to_linear(take_pixels(stored, self.mask), path), self.radiometry.gamma)

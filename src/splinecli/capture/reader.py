@@ -26,6 +26,7 @@ from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
 from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource, Progress
+from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError, UsageError
 
 EQUAL = "equal"
@@ -44,6 +45,7 @@ def open_capture(
     light_frame: LightFrame = USUAL_FRAME,
     lights_format: LightForm = "xyz",
     lamps: LampOptions = NO_LAMP_OPTIONS,
+    window: Window = WHOLE,
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
@@ -58,10 +60,12 @@ def open_capture(
         light_frame: the frame of the light file.
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: where near lamps are, if no files in the folder say so.
+        window: the part of the images that is read.
 
     Raises:
-        InputError: the folder contains no capture (see find_capture_files) or a light file is wrong.
-        UsageError: the white level is not a number above 0.
+        InputError: the folder contains no capture (see find_capture_files), a light file is wrong, or the window is not
+            inside the images.
+        UsageError: the white level is not a number above 0, or the lamps are near and not the whole images are read.
     """
     if white_level is not None and not 0 < white_level < math.inf:
         raise UsageError(f"the white level is {white_level:g}, expected a number above 0")
@@ -79,6 +83,10 @@ def open_capture(
                 hint="Leave it out, or use --light-distance with a file of directions",
             )
         overrides, form = replace(overrides, lights=near.positions), "positions"
+    if near is not None and near.used and not window.is_whole:
+        raise UsageError(
+            "--crop and --scale are for distant lights; under near lamps, the whole image has to be read"
+        )
     files = find_capture_files(folder, overrides)
     source = _read_lights(files, radiometry, light_frame, form, near, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
@@ -97,6 +105,7 @@ def open_capture(
         radiometry=radiometry,
         warnings=tuple(warnings),
         white_level=white_level,
+        window=window.on(files.images[0]),
     )
 
 

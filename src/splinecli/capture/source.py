@@ -29,6 +29,7 @@ from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
+from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 
 Progress = Callable[[], object]
@@ -51,6 +52,7 @@ class CaptureSource:
         light_frame: the frame of the light file, in which the directions are no longer.
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
         lamps: what is known of near lamps, or None.
+        window: the part of the images that is read. All masks but those in files have its size.
     """
 
     files: CaptureFiles
@@ -64,6 +66,7 @@ class CaptureSource:
     intensities_measured: bool = True
     light_frame: LightFrame = USUAL_FRAME
     lamps: LampFiles | None = None
+    window: Window = WHOLE
 
     @property
     def n_lights(self) -> int:
@@ -108,9 +111,11 @@ class CaptureSource:
         mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False
         if self.files.ground_truth is not None:
+            whole = self.window.whole(mask)
             ground_truth, upside_down = read_ground_truth(
-                self.files.ground_truth, (mask.shape[0], mask.shape[1]), mask
+                self.files.ground_truth, (whole.shape[0], whole.shape[1]), whole
             )
+            ground_truth = self.window.of(ground_truth)
         images = self._stored_pixels(indices, mask)
         saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
         found = collect_observations(images, saturation, progress)
@@ -142,11 +147,11 @@ class CaptureSource:
         Raises:
             InputError: an image cannot be read or does not have the size of the mask.
         """
-        linearise = Lineariser(self.radiometry, mask, len(self.files.images))
+        linearise = Lineariser(self.radiometry, mask, len(self.files.images), self.window)
+        expected = self._expected(mask, 0)
 
         def read(index: int) -> NDArray[np.float32]:
-            path = self.files.images[index]
-            stored = decode_image(path, ExpectedSize(mask.shape, self.files.images[0].name))
+            stored = self.window.of(decode_image(self.files.images[index], expected))
             return self._colours(linearise, take_pixels(stored, mask), index)
 
         return read_ahead(read, indices)
@@ -159,13 +164,14 @@ class CaptureSource:
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
-        shape = common_size(self.files.images)[0][:2]
-        expected = ExpectedSize(shape, self.files.images[0].name)
-        linearise = Lineariser(self.radiometry, np.ones(shape, np.bool_), self.n_lights)
-        total = np.zeros(shape[0] * shape[1], np.float32)
+        whole = common_size(self.files.images)[0][:2]
+        expected = ExpectedSize(whole, self.files.images[0].name)
+        everywhere = self.window.of(np.ones(whole, np.bool_))
+        linearise = Lineariser(self.radiometry, everywhere, self.n_lights, self.window)
+        total = np.zeros(everywhere.size, np.float32)
 
         def read(index: int) -> NDArray[np.float32]:
-            stored = decode_image(self.files.images[index], expected)
+            stored = self.window.of(decode_image(self.files.images[index], expected))
             return self._colours(linearise, stored.reshape(-1, stored.shape[2]), index)
 
         for colours in read_ahead(read, range(self.n_lights)):
@@ -173,20 +179,30 @@ class CaptureSource:
             if progress is not None:
                 progress()
         try:
-            return replace(self, automatic_mask=find_object(total.reshape(shape)))
+            return replace(self, automatic_mask=find_object(total.reshape(everywhere.shape)))
         except InputError as error:
             raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
 
     def read_mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        """Return the mask (H, W) for images of this shape. Raises InputError."""
-        return read_capture_mask(self.files, shape) if self.automatic_mask is None else self.automatic_mask
+        """Return the mask (H, W) of what is read of images of this shape. Raises InputError."""
+        if self.automatic_mask is not None:
+            return self.automatic_mask
+        mask = self.window.of(read_capture_mask(self.files, shape))
+        if not mask.any():
+            raise InputError(
+                "the mask has no pixel in the part that is read",
+                path=self.files.mask or self.files.folder,
+                hint="Choose another --crop, or a larger --scale",
+            )
+        return mask
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:
         """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
         size = common_size([self.files.images[index] for index in indices])
         shape = size[0][:2]
         if self.automatic_mask is None and self.files.mask is None and not self.files.boundaries:
-            check_capture(size, shape[0] * shape[1], len(indices), self.files.folder)
+            n_pixels = self.window.of(np.broadcast_to(np.True_, shape)).size
+            check_capture(size, n_pixels, len(indices), self.files.folder)
         mask = self.read_mask(shape)
         check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
         return mask
@@ -213,16 +229,20 @@ class CaptureSource:
 
     def _stored_pixels(self, indices: Sequence[int], mask: NDArray[np.bool_]) -> Iterator[StoredPixels]:
         """Yield the mask's pixels under these lights."""
-        linearise = Lineariser(self.radiometry, mask, len(self.files.images))
-        expected = ExpectedSize(mask.shape, self.files.images[indices[0]].name)
+        linearise = Lineariser(self.radiometry, mask, len(self.files.images), self.window)
+        expected = self._expected(mask, indices[0])
 
         def read(index: int) -> StoredPixels:
             path = self.files.images[index]
-            pixels = take_pixels(decode_image(path, expected), mask)
+            pixels = take_pixels(self.window.of(decode_image(path, expected)), mask)
             linear, intensity = linearise(pixels, path, index), self.light_intensities[index]
             return StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
 
         return read_ahead(read, indices)
+
+    def _expected(self, mask: NDArray[np.bool_], index: int) -> ExpectedSize:
+        """Return the size that all images must have; messages name the image of this index."""
+        return ExpectedSize(self.window.shape or mask.shape, self.files.images[index].name)
 
     def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
         linear = linearise(pixels, self.files.images[index], index)

@@ -117,13 +117,15 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
             on_grid = np.zeros_like(mask)
             on_grid[::step, ::step] = mask[::step, ::step]
             # It refuses ambient images and flat fields that do not fit.
-            linearise = Lineariser(source.radiometry, on_grid, n_images)
+            linearise = Lineariser(source.radiometry, on_grid, n_images, source.window)
+            shape = stored.shape[:2]
             observations = np.zeros((int(np.count_nonzero(on_grid)), n_images), np.float32)
-        fits = mask.shape == stored.shape[:2]
-        pixels = stored[mask] if fits else stored.reshape(-1, stored.shape[2])
+        fits = shape == stored.shape[:2]
+        seen = source.window.of(stored) if fits else stored
+        pixels = seen[mask] if fits else seen.reshape(-1, seen.shape[2])
         if fits:
             finder.add(position, pixels, path, stated=stated_white_level(path))
-            linear = linearise(stored[on_grid], path, position)
+            linear = linearise(seen[on_grid], path, position)
             observations[:, position] = observe(linear, source.light_intensities[position])
         images.append(
             ImageSummary(
@@ -138,20 +140,20 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         if progress is not None:
             progress()
     assert mask is not None, "a capture has images"
-    level, summaries = _by_white_level(finder, images, mask)
+    level, summaries = _by_white_level(finder, images, shape)
     sample = None
-    if all(image.shape[:2] == mask.shape for image in images):
+    if all(image.shape[:2] == shape for image in images):
         sample = Sample(observations, mask[::step, ::step], step)
     _, of_lamps = source.near_lamps(mask)
     return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample, tuple(of_lamps))
 
 
 def _by_white_level(
-    finder: SaturationFinder, images: list[ImageSummary], mask: NDArray[np.bool_]
+    finder: SaturationFinder, images: list[ImageSummary], shape: tuple[int, ...]
 ) -> tuple[WhiteLevel | None, tuple[ImageSummary, ...]]:
     """Return the white level, and the images with brightness and saturation relative to it."""
     saturation = finder.finish()
-    level, shares = saturation.white_level, saturation.n_saturated / max(int(np.count_nonzero(mask)), 1)
+    level, shares = saturation.white_level, saturation.n_saturated / max(saturation.n_pixels, 1)
     summaries = []
     for image, share in zip(images, shares, strict=True):
         bright = image.bright
@@ -159,6 +161,6 @@ def _by_white_level(
         # The white level of 16-bit images does not apply to 8-bit images among them.
         if level is not None and full_scale >= level.value:
             bright *= full_scale / level.value
-        fits = image.shape[:2] == mask.shape
+        fits = image.shape[:2] == shape
         summaries.append(replace(image, bright=bright, saturated=float(share) if fits else image.saturated))
     return level, tuple(summaries)

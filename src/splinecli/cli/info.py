@@ -23,6 +23,8 @@ def info(
     object_width: float | None = inputs.OBJECT_WIDTH,
     camera_matrix: Path | None = inputs.LAMP_CAMERA_MATRIX,
     mask: Path | None = inputs.MASK,
+    crop: str | None = inputs.CROP,
+    scale: str | None = inputs.SCALE,
     ground_truth: Path | None = inputs.GROUND_TRUTH,
     transfer: str = inputs.TRANSFER,
     ambient: Path | None = inputs.AMBIENT,
@@ -52,6 +54,8 @@ def info(
         lights=lights,
         intensities=intensities,
         mask=mask,
+        crop=crop,
+        scale=scale,
         ground_truth=ground_truth,
         lamps=LampOptions(
             positions=None if light_positions is None else str(light_positions),

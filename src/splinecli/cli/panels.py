@@ -5,13 +5,14 @@ from __future__ import annotations
 SPEED = ("--device", "--precision", "--batch-size")
 LIMITS = ("--max-pixels-per-image", "--images-elsewhere")
 VALUES = ("--transfer", "--ambient", "--flat-field", "--white-level")
+PART = ("--crop", "--scale")
 REFINED = ("--refine-lights", "--light-error-deg")
 LAMPS = ("--light-positions", "--light-distance", "--pixel-size", "--object-width", "--camera-matrix")
 REPEAT = ("--overwrite", "--json", "--quiet")
 
 PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     "infer": {
-        "Input": ("--mask", "--auto-mask", "--ground-truth", *VALUES, "--as-stored", *LIMITS),
+        "Input": ("--mask", "--auto-mask", *PART, "--ground-truth", *VALUES, "--as-stored", *LIMITS),
         "Lights": (
             "--lights",
             "--light-frame",
@@ -40,7 +41,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Speed": ("--distil", *SPEED),
     },
     "info": {
-        "Input": ("--mask", "--ground-truth", *VALUES, *LIMITS),
+        "Input": ("--mask", *PART, "--ground-truth", *VALUES, *LIMITS),
         "Lights": (
             "--lights",
             "--light-frame",

@@ -39,6 +39,8 @@ class InferOptions:
             With `surface`, pixel_size is in millimetres and scales the surface, too.
         refine_lights: refine rough light directions. light_error_deg: their usual error; None for the default.
         auto_mask: find the object where the capture has no mask.
+        crop: the box X,Y,W,H of the images that is read; None for whole images.
+        scale: 1/N to read one of N rows and columns; None for all.
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
@@ -74,6 +76,8 @@ class InferOptions:
     light_error_deg: float | None = None
     mask: str | None = None
     auto_mask: bool = False
+    crop: str | None = None
+    scale: str | None = None
     ground_truth: str | None = None
     light_frame: str | None = None
     lights_format: LightForm = "xyz"
@@ -107,6 +111,7 @@ class InferOptions:
         from splinecli.capture.lights.light_frames import parse_light_frame
         from splinecli.capture.record import check_light_indices
         from splinecli.capture.restore.light_refinement import check_light_error
+        from splinecli.capture.window import parse_window
         from splinecli.results.files import MAPS, NORMALS
         from splinecli.transfer import parse_transfer
 
@@ -114,7 +119,7 @@ class InferOptions:
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
-        _ = self.lamps
+        _ = self.lamps, parse_window(self.crop, self.scale)
         if self.light_error_deg is not None:
             check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
         check_method(self.method)
@@ -201,6 +206,7 @@ class InferOptions:
         """Open the capture in the folder under these options. Raises InputError."""
         from splinecli.capture import open_capture
         from splinecli.capture.lights.light_frames import parse_light_frame
+        from splinecli.capture.window import parse_window
 
         return open_capture(
             folder,
@@ -213,6 +219,7 @@ class InferOptions:
             light_frame=parse_light_frame(self.light_frame),
             lights_format=self.lights_format,
             lamps=self.lamps,
+            window=parse_window(self.crop, self.scale),
         )
 
 

@@ -50,6 +50,7 @@ class InfoOptions:
         lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down".
         lamps: near lamps; see LampOptions.
+        crop, scale: the part of the images that is read; see InferOptions.
         transfer: the curve of the images: linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
@@ -68,6 +69,8 @@ class InfoOptions:
     light_frame: str | None = None
     lights_format: LightForm = "xyz"
     lamps: LampOptions = NO_LAMP_OPTIONS
+    crop: str | None = None
+    scale: str | None = None
     transfer: str = "linear"
     ambient: Path | None = None
     flat_field: Path | None = None
@@ -81,6 +84,7 @@ class InfoOptions:
         """Open the capture under these options. Raises InputError, UsageError."""
         from splinecli.capture import open_capture
         from splinecli.capture.lights.light_frames import parse_light_frame
+        from splinecli.capture.window import parse_window
 
         return open_capture(
             self.capture,
@@ -93,6 +97,7 @@ class InfoOptions:
             light_frame=parse_light_frame(self.light_frame),
             lights_format=self.lights_format,
             lamps=self.lamps,
+            window=parse_window(self.crop, self.scale),
         )
 
 
@@ -153,6 +158,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("lights", f"{report['light_directions']}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
         *([("lamps", report["lamps"])] if report["lamps"] else []),
         ("intensities", report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"),
+        *([("reads", report["reads"])] if report["reads"] else []),
         ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
         ("ground truth", report["ground_truth"] or "none"),
         ("white level", f"{level['value']:g}, {ORIGINS[level['origin']]}" if level else "none: floating-point"),
@@ -214,6 +220,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
             {"size": [width, height], "channels": channels, "type": dtype}
             for width, height, channels, dtype in kinds
         ],
+        "reads": source.window.in_words(),
         "n_pixels": summary.n_pixels,
         "light_directions": str(files.light_directions),
         "lamps": None if source.lamps is None else source.lamps.in_words(),

@@ -84,6 +84,10 @@ MASK = Option(
 AUTO_MASK = Option(
     False, "--auto-mask", help="If there is no mask, find the object in the images and write found_mask.png."
 )
+CROP = Option(
+    None, metavar="X,Y,W,H", help="Read this box of the images: left upper corner and size in pixels."
+)
+SCALE = Option(None, metavar="1/N", help="Read one of N rows and columns, for a first look. [default: all]")
 GROUND_TRUTH = Option(
     None, metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."
 )

@@ -1,0 +1,123 @@
+"""--crop and --scale: what is read is a part of the whole capture, and so are the results."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.capture import open_capture
+from splinecli.capture.window import Window, parse_window
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.info import InfoOptions, describe_capture
+
+MEDALLION = Path(__file__).parents[2] / "examples/medallion"
+WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]
+
+
+@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
+def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None) -> None:
+    window = parse_window(crop, scale)
+    whole = open_capture(MEDALLION).read(as_stored=True)
+    part = open_capture(MEDALLION, window=window).read(as_stored=True)
+    assert whole.ground_truth is not None and part.ground_truth is not None
+    np.testing.assert_array_equal(part.mask, window.of(whole.mask))
+    np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
+    image = np.zeros((*whole.mask.shape, whole.n_lights), np.float32)
+    image[whole.mask] = whole.observations
+    # Sums over the colours may round differently.
+    np.testing.assert_allclose(part.observations, window.of(image)[part.mask], rtol=1e-6)
+
+
+def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
+    """Both change from pixel to pixel, so other pixels of them would give other observations."""
+    folder = tmp_path / "capture"
+    shutil.copytree(MEDALLION, folder)
+    shape = cv2.imread(str(folder / "01.png")).shape[:2]
+    pattern = np.random.default_rng(0).integers(1, 30, shape).astype(np.uint8)
+    cv2.imwrite(str(folder / "ambient.png"), pattern)
+    flats = tmp_path / "flats"
+    flats.mkdir()
+    cv2.imwrite(str(flats / "flat.png"), 255 - pattern)
+    maps = []
+    for crop, scale in ((None, None), WINDOWS[2]):
+        options = InferOptions(
+            method="ls", crop=crop, scale=scale, flat_field=str(flats), output=str(tmp_path / f"{scale}")
+        )
+        source = options.open(folder)
+        capture = source.read(as_stored=True)
+        image = np.zeros((*capture.mask.shape, capture.n_lights), np.float32)
+        image[capture.mask] = capture.observations
+        maps.append(image)
+    part = parse_window(*WINDOWS[2]).of(maps[0])
+    # The flat field is divided by its mean over the pixels that are read.
+    ratio = maps[1][part > 0] / part[part > 0]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
+def test_results_are_a_part_of_those_of_the_whole(
+    crop: str | None, scale: str | None, tmp_path: Path
+) -> None:
+    maps = {}
+    for name, options in (("whole", (None, None)), ("part", (crop, scale))):
+        record = InferOptions(
+            method="ls", maps=("albedo",), crop=options[0], scale=options[1], output=str(tmp_path / name)
+        )
+        report = infer_capture(MEDALLION, record)
+        assert (report["options"]["crop"], report["options"]["scale"]) == options
+        folder = tmp_path / name / "medallion"
+        maps[name] = np.load(folder / "normals.npy"), np.load(folder / "albedo.npy")
+    for whole, part in zip(maps["whole"], maps["part"], strict=True):
+        np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
+
+
+def test_info_counts_what_is_read() -> None:
+    crop, scale = WINDOWS[2]
+    part = describe_capture(InfoOptions(capture=MEDALLION, crop=crop, scale=scale))
+    expected = open_capture(MEDALLION, window=parse_window(crop, scale)).read().n_pixels
+    assert part["n_pixels"] == expected
+    assert part["reads"] == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
+    assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
+
+
+@pytest.mark.parametrize(
+    ("crop", "scale", "problem"),
+    [
+        ("1,2,3", None, "--crop is '1,2,3'; expected X,Y,W,H"),
+        ("-1,0,5,5", None, "--crop is"),
+        ("0,0,0,5", None, "--crop is"),
+        (None, "4", "--scale is '4'; expected 1/N"),
+        (None, "1/0", "--scale is"),
+        (None, "0.5", "--scale is"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused(crop: str | None, scale: str | None, problem: str) -> None:
+    with pytest.raises(UsageError, match=problem.replace("?", r"\?")):
+        InferOptions(crop=crop, scale=scale)
+
+
+def test_windows_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(InputError, match="--crop 0,0,5000,5 is not inside the image of"):
+        open_capture(MEDALLION, window=parse_window("0,0,5000,5", None))
+    with pytest.raises(InputError, match="no pixel in the part that is read"):
+        open_capture(MEDALLION, window=parse_window("0,0,3,3", None)).read()
+
+
+def test_near_lamps_need_the_whole_image() -> None:
+    options = InferOptions(scale="1/2", light_distance=400.0, pixel_size=0.1)
+    with pytest.raises(SplinecliError, match="distant lights"):
+        options.open(MEDALLION)
+
+
+def test_a_mask_of_the_part_goes_back_into_the_whole() -> None:
+    window = Window((2, 1, 5, 4), 2, (7, 9))
+    mask = np.ones((2, 3), np.bool_)
+    whole = window.whole(mask)
+    assert whole.shape == (7, 9)
+    assert [tuple(place) for place in np.argwhere(whole)] == [(1, 2), (1, 4), (1, 6), (3, 2), (3, 4), (3, 6)]
