@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,11 @@ import numpy as np
 import pytest
 
 from kills import content
+from splinecli.capture import capture_size
+from splinecli.errors import InputError
+from splinecli.methods.least_squares import LeastSquares
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.publishing import held_folder
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="POSIX processes, limits and mounts")
@@ -71,6 +78,57 @@ def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
         assert "No space left on device" in done.stderr or "the disk may be full" in done.stderr
         assert set(content(folder / "left")) == {"kept"}
         assert not (folder / "left" / "a").exists()
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of 1.2 megapixels, whose reading takes long enough to be interrupted."""
+    folder = tmp_path_factory.mktemp("large")
+    lights = np.tile(LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True), (4, 1))
+    noise = np.random.default_rng(0).integers(0, 20_000, (1000, 1200), np.uint16)
+    cv2.imwrite(str(folder / "00.png"), noise)
+    for number in range(1, len(lights)):
+        os.link(folder / "00.png", folder / f"{number:02d}.png")
+    np.savetxt(folder / "lights.txt", lights)
+    return folder
+
+
+def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> None:
+    """One thread decodes an image while another uses the one before: both end, and nothing is left."""
+    command = [*COMMAND.split(), "infer", str(large), "--method", "ls", "-o", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell that runs the tests in the background may have switched Ctrl-C off.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    # The lock is taken just before the images are read.
+    deadline = time.monotonic() + 60
+    while not list((tmp_path / "out").glob("*/.lock")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "splinecli: interrupted.\n")
+    assert content(tmp_path) == {}
+
+
+def test_too_little_memory_for_the_results(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The images fit, the albedo does not. This is said before the normals are estimated."""
+    before = content(folder / "out")
+    monkeypatch.setattr(capture_size, "results_bytes", lambda *_, albedo=False: 10**15 * albedo)
+    options = InferOptions(method="ls", maps=("albedo",), output=str(folder / "out"))
+    monkeypatch.setattr(LeastSquares, "estimate", None)
+    with pytest.raises(
+        InputError, match=r"the results of 3600 pixels take 1000000\.0 GB of memory"
+    ) as caught:
+        infer_capture(folder / "a", options)
+    assert (
+        caught.value.hint
+        == "Mask the object, or use --scale or --crop, or neither albedo in --maps nor --html"
+    )
+    assert content(folder / "out") == before
 
 
 def test_a_limit_on_the_size_of_files_keeps_earlier_results(folder: Path) -> None:

@@ -16,6 +16,7 @@ REPORT = {
     "first_image": "1.png",
     "last_image": "2.png",
     "image_kinds": [{"size": [30, 20], "channels": 3, "type": "uint8"}],
+    "reads": None,
     "n_pixels": 600,
     "light_directions": "cat/lights.txt",
     "lamps": None,
@@ -48,6 +49,9 @@ def test_lines_of_a_report() -> None:
         "exposure     brightest 1 % from 25 to 50 % of the white level, at most 1.2 % of an image saturated",
         "expect       701 MiB of memory and about 3 s on a laptop",
     ]
+    assert "reads        5 x 4 pixels from (1, 2)" in summary_lines(
+        {**REPORT, "reads": "5 x 4 pixels from (1, 2)"}
+    )
     assert "white level  none: floating-point" in summary_lines({**REPORT, "white_level": None})
 
 

@@ -9,9 +9,14 @@ from splinecli.capture.formats.decoding import stored_size
 from splinecli.capture.formats.image_size import ExpectedSize, check_memory, check_stored_size, image_bytes
 from splinecli.capture.formats.raw import RAW_SUFFIXES
 
-_BYTES_OF_PIXEL = (
-    40  # of each pixel of the mask: its estimate, and what the methods keep of it beside its observations
-)
+_BYTES_OF_RESULTS = 52
+"""Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
+
+_BYTES_OF_ALBEDO = 52
+"""Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
+
+_IMAGES = 2
+"""Images in memory while they are read; see read_ahead."""
 
 StoredSize = tuple[tuple[int, ...], int]
 """The shape (H, W, C) of an image as stored, and the bytes of each number."""
@@ -35,15 +40,21 @@ def common_size(images: Sequence[Path]) -> StoredSize:
     return largest
 
 
+def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False) -> int:
+    """Return the bytes that `infer` takes for the results of a capture, beside its observations."""
+    return n_pixels * (_BYTES_OF_RESULTS + (_BYTES_OF_ALBEDO + n_lights if albedo else 0))
+
+
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
-    """Return the bytes that `infer` takes for a capture: observations and estimate in float32, and one image.
+    """Return the bytes that `infer` takes for a capture: observations in float32, and images or results.
 
     Args:
         largest: the size of the largest image.
         n_pixels: the number of the mask's pixels.
         n_lights: the number of images that are read.
     """
-    return n_pixels * (4 * n_lights + _BYTES_OF_PIXEL) + image_bytes(*largest)
+    images = min(_IMAGES, n_lights) * image_bytes(*largest)
+    return n_pixels * 4 * n_lights + max(images, results_bytes(n_pixels, n_lights))
 
 
 def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
@@ -53,5 +64,5 @@ def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Pat
         capture_bytes(largest, n_pixels, n_lights),
         f"{n_lights} images of {width} x {height} pixels, {n_pixels} of them in the mask, take",
         folder,
-        hint="Mask the object, reduce the images, or choose fewer lights",
+        hint="Mask the object, reduce the images (infer --scale), or choose fewer lights",
     )

@@ -80,6 +80,7 @@ def _infer_into(
         warnings += capture.warnings[before:]
     if estimator is None:
         estimator = make_method(options)
+    _check_memory(capture, folder, options)
     distilled, found = distil_for(capture, estimator, options.distil, observer)
     warnings += found
     estimate = _estimate(capture, distilled or estimator, observer)
@@ -151,6 +152,21 @@ def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int
     from splinecli.capture.lights.draws import draw_lights
 
     return draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
+
+
+def _check_memory(capture: Capture, folder: Path, options: InferOptions) -> None:
+    """Raise InputError where the results take more memory than is left, before hours of work."""
+    from splinecli.capture.capture_size import results_bytes
+    from splinecli.capture.formats.image_size import check_memory
+
+    albedo = "albedo" in options.maps or options.html
+    check_memory(
+        results_bytes(capture.n_pixels, capture.n_lights, albedo=albedo),
+        f"the results of {capture.n_pixels} pixels take",
+        folder,
+        hint="Mask the object, or use --scale or --crop"
+        + (", or neither albedo in --maps nor --html" if albedo else ""),
+    )
 
 
 def _estimate(capture: Capture, estimator: Estimator, observer: Observer) -> NormalEstimate:
