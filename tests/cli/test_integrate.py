@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from splinecli.files import COMPLETE
 from splinecli.normals import encode_picture
@@ -157,6 +158,21 @@ def test_millimetres_in_the_files(run):
         extents = trimesh.load(Path("out", name)).extents * unit_mm
         assert extents[[0, 2]] == pytest.approx([width_mm, np.ptp(report["range"])], rel=1e-4), name
     assert b"\ncomment unit: millimetre\n" in Path("out/mesh.ply").read_bytes()
+
+
+def test_a_picture_of_the_depth(run):
+    arguments = ["--format", "npy,png", "--pixel-size", 0.5, "--json"]
+    report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
+    picture, depth = cv2.imread("out/depth.png", cv2.IMREAD_UNCHANGED), np.load("out/depth.npy")
+    low, high = report["range"]
+    assert (picture.dtype, report["unit"]) == (np.uint16, "millimetre")
+    np.testing.assert_array_equal(picture == 0, np.isnan(depth))
+    inside = picture > 0
+    read = low + (picture[inside] - 1.0) / 65_534 * (high - low)
+    np.testing.assert_allclose(read, depth[inside], atol=(high - low) / 65_534)
+    assert (picture[inside].min(), picture.max()) == (1, 65_535)
+    with Image.open("out/depth.png") as opened:
+        assert f"1 = {low:.7g}, 65535 = {high:.7g}; unit: millimetre" in opened.info["depth"]
 
 
 def test_a_decimated_mesh_and_its_textures(run):

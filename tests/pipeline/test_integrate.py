@@ -43,7 +43,7 @@ def test_options() -> None:
     with pytest.raises(FrozenInstanceError):
         options.stiffness = 1.0  # type: ignore[misc]
     with pytest.raises(
-        UsageError, match="no format named 'fbx'; expected one of glb, ply, obj, stl, npy, tiff"
+        UsageError, match="no format named 'fbx'; expected one of glb, ply, obj, stl, npy, tiff, png"
     ):
         IntegrateOptions(normals=Path("a"), formats=("fbx",))
     with pytest.raises(UsageError, match="--decimate is 0, expected a number of triangles of at least 1"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -21,13 +22,14 @@ def test_a_report(matte_pixels, as_stored, reading):
     warning = CaptureWarning(EIGHT_BIT, "The images have 8 bits.")
     report = report_of(
         estimate_normals(capture, estimator), estimator, {"method": "ls"}, "0" * 64,
-        as_stored=as_stored, read_seconds=0.12345, warnings=[warning],
+        light_file=Path("lights.txt"), as_stored=as_stored, read_seconds=0.12345, warnings=[warning],
     )  # fmt: skip
     assert report == json.loads(json.dumps(report))
     assert (report["schema"], report["reading"]) == (SCHEMA, reading)
     assert report["warnings"] == [{"code": "eight_bit", "text": "The images have 8 bits."}]
     assert (report["n_lights"], report["n_pixels"], report["image_size"]) == (12, 200, [1, 200])
     assert report["seconds"]["read"] == 0.123
+    assert report["light_file"] == str(Path.cwd() / "lights.txt")
     assert report["angular_error_deg"] is None
 
 

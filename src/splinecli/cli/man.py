@@ -66,7 +66,7 @@ FILES = (
     (
         "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff",
         "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json. Both can write mesh.obj"
-        " (with mesh.mtl and mesh.png) and mesh.stl.",
+        " (with mesh.mtl and mesh.png) and mesh.stl, integrate also depth.png.",
     ),
     (
         "OUT/NAME/page.html",

@@ -96,6 +96,7 @@ def _infer_into(
         estimator,
         options.as_dict(),
         inputs_sha256(source, options.weights),
+        light_file=source.files.light_directions,
         as_stored=options.as_stored,
         read_seconds=read_seconds,
         warnings=warnings,

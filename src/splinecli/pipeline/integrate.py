@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
     from splinecli.normals import Convention
 
+SCHEMA = 1
+"""The version of the fields of surface.json. It rises when a field changes its meaning."""
+
 INPUT_FORMATS = ("npy", "tiff", "png", "png8")
 """The formats in which `integrate` looks for a normal map in a folder, exact ones first."""
 
@@ -131,6 +134,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             progress=share_of_iterations(advance),
         )
     report = {
+        "schema": SCHEMA,
         "normals": str(options.normals),
         "colours": None if picture is None else str(picture),
         "n_pixels": int(np.count_nonzero(mask)),
@@ -140,6 +144,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     }
     with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as stage:
         write_surface(stage, surface, options.formats)
+        report["folder"] = str(options.folder.absolute())
         report["files"] = [
             name for name in options.files if (stage / name).exists() or name == SURFACE_REPORT
         ]

@@ -81,7 +81,7 @@ def write_estimate(
             write(stage)
         files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
         seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
-        report = {**report, "seconds": seconds, "files": files}
+        report = {**report, "seconds": seconds, "folder": str(folder.absolute()), "files": files}
         (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     return report
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from splinecli import __version__
@@ -23,6 +24,7 @@ def report_of(
     options: Mapping[str, Any],
     inputs: str,
     *,
+    light_file: Path,
     as_stored: bool,
     read_seconds: float,
     warnings: Sequence[CaptureWarning],
@@ -30,13 +32,14 @@ def report_of(
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
-    write_estimate adds `seconds.write` and `files`.
+    write_estimate adds `seconds.write`, `folder` and `files`.
 
     Args:
         estimate: the result.
         estimator: the method that made it.
         options: the options of the run, ready for JSON.
         inputs: a digest that changes when an input file changes.
+        light_file: the file that gave the lights.
         as_stored: whether the capture was read without any restoration.
         read_seconds: seconds that reading the capture took.
         warnings: what the user should know about the result.
@@ -52,6 +55,7 @@ def report_of(
         "weights": estimator.weights,
         "n_lights": capture.n_lights,
         "light_indices": list(capture.light_indices),
+        "light_file": str(light_file.absolute()),
         "light_directions": capture.light_directions.round(6).tolist(),
         "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
         "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),

@@ -1,4 +1,4 @@
-"""The files of a surface: meshes, the depth map as float32 NPY and TIFF, and a picture of it."""
+"""The files of a surface: meshes, the depth map as float32 NPY and TIFF, and as a 16-bit PNG picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MESH_FILES = {
 }
 """The file names of each format of a mesh; mesh.png is the texture of an OBJ file, if there are colours."""
 
-SURFACE_FILES = {**MESH_FILES, "npy": ("depth.npy",), "tiff": ("depth.tiff",)}
+SURFACE_FILES = {**MESH_FILES, "npy": ("depth.npy",), "tiff": ("depth.tiff",), "png": ("depth.png",)}
 """The file names of each format."""
 
 SURFACE_REPORT = "surface.json"
@@ -33,6 +33,8 @@ SURFACE_REPORT = "surface.json"
 DEFAULT_MESHES = ("glb", "ply")
 DEPTH_FORMATS = ("npy", "tiff")
 DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
+
+_WHITE = 65535  # of 16 bits
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,8 @@ def _encode(surface: Surface, form: str) -> dict[str, bytes]:
         buffer.write(mesh_files.encode_ply(surface.mesh, unit=surface.unit))
     elif form == "stl":
         buffer.write(mesh_files.encode_stl(surface.mesh))
+    elif form == "png":
+        _save_depth_picture(surface, buffer)
     elif form == "npy":
         np.save(buffer, surface.depth.astype(np.float32), allow_pickle=False)
     else:
@@ -95,3 +99,19 @@ def _encode(surface: Surface, form: str) -> dict[str, bytes]:
 
         tifffile.imwrite(buffer, surface.depth.astype(np.float32))
     return {SURFACE_FILES[form][0]: buffer.getvalue()}
+
+
+def _save_depth_picture(surface: Surface, file: io.BytesIO) -> None:
+    """Write the depth map as 16-bit gray: 0 outside the object, from 1 for the smallest value to 65535 for the largest.
+
+    The text `depth` of the PNG file has these values and their unit.
+    """
+    import numpy as np
+    from PIL import Image, PngImagePlugin
+
+    low, high = float(np.nanmin(surface.depth)), float(np.nanmax(surface.depth))
+    share = (surface.depth - low) / max(high - low, np.finfo(np.float64).tiny)
+    text = PngImagePlugin.PngInfo()
+    text.add_text("depth", f"0 outside, 1 = {low:.7g}, {_WHITE} = {high:.7g}; unit: {surface.unit}")
+    gray = np.where(np.isfinite(share), np.rint(1 + np.nan_to_num(share) * (_WHITE - 1)), 0)
+    Image.fromarray(gray.astype(np.uint16)).save(file, "PNG", pnginfo=text)

@@ -37,6 +37,7 @@ NOT_PHOTOGRAPHS = frozenset(
         "confidence",
         "preview",
         "depth",
+        "mesh",
         "found_mask",
         "calibration",
     }

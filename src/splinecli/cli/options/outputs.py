@@ -46,7 +46,8 @@ SURFACE_FORMATS = Option(
     ",".join(DEFAULT_FORMATS),
     "--format",
     metavar="LIST",
-    help=f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32.",
+    help=f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or"
+    " as a 16-bit picture (png).",
     autocompletion=complete_list(*SURFACE_FILES),
 )
 MAPS = Option(

@@ -1,0 +1,60 @@
+"""The documents of infer and integrate are those that docs/reports.schema.json describes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
+
+
+def check(document: Any, name: str) -> None:
+    """Raise ValidationError if the document is not what the definition `name` of the schema says."""
+    validator = jsonschema.Draft202012Validator({**SCHEMA, "$ref": f"#/$defs/{name}"})
+    validator.validate(document)
+
+
+def test_the_schema_is_one():
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--method", "ls", "--surface", "--maps", "albedo"],
+        ["--method", "spline-net-pixelwise", "--light-indices", "0,1,2,3", "--rotations", 1],
+    ],
+)
+def test_reports_of_infer(capture, run, arguments):
+    [printed] = json.loads(run("infer", capture, *arguments, "--json").out)
+    written = json.loads(Path("out/sphere/report.json").read_text("utf-8"))
+    assert printed == written
+    check(written, "report")
+    assert (written["surface"] is None) == ("--surface" not in arguments)
+    assert Path(written["light_file"]) == (capture / "light_directions.txt").absolute()
+    assert Path(written["folder"]) == Path.cwd() / "out/sphere"
+    assert all((Path(written["folder"]) / name).is_file() for name in written["files"])
+
+
+def test_reports_of_integrate(capture, run):
+    assert run("infer", capture, "--method", "ls").code == 0
+    check(json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "surface_report")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["infer", "missing"], ["infer", "--strange"], ["integrate", "missing"]]
+)
+def test_failures(run, arguments):
+    printed = json.loads(run(*arguments, "--json").out)
+    check(printed[0] if arguments[0] == "infer" else printed, "failure")
+
+
+def test_another_field_does_not_fit(capture, run):
+    [report] = json.loads(run("infer", capture, "--method", "ls", "--json").out)
+    for change in ({"colour": 1}, {"schema": 2}, {"reading": "guessed"}):
+        with pytest.raises(jsonschema.ValidationError):
+            check({**report, **change}, "report")
