@@ -20,10 +20,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.capture import read_capture
+from splinecli.capture import open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.lights.light_advice import mirror_twin
 from splinecli.capture.lights.light_check import LightCheck, check_lights
+from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.capture.sample import sample_observations
@@ -39,6 +40,8 @@ FRAMES = {
     "x and y negated": "x-left,y-down",
 }
 FIRST_SCENE, SEED = 5000, 71
+Lit = tuple[str, Array, Array, NDArray[np.bool_], bool]
+"""Name, observations (P, F), lights (F, 3), mask (H, W), and whether a file gives the intensities of the lights."""
 
 
 def wrong_files(
@@ -78,8 +81,8 @@ def words(check: LightCheck) -> str:
 
 def rendered(
     count: int, measured: Path | None, n_lights: int
-) -> Iterator[tuple[str, Array, Array, NDArray[np.bool_]]]:
-    """Yield class of material, observations, lights and mask of rendered scenes with lights up to 60 degrees."""
+) -> Iterator[Lit]:
+    """Yield rendered scenes, by their class of material, with lights up to 60 degrees from the view."""
     library = None if measured is None else read_measured(measured)
     config = SceneConfig(size=80, lights=4, samples=2, directions=48, bounces=2)
     for index in range(FIRST_SCENE, FIRST_SCENE + count):
@@ -96,18 +99,19 @@ def rendered(
         lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1).astype(np.float32)
         result = render_scene(dataclasses.replace(scene, lights=lights), config)
         for name, observations in result.observations.items():
-            yield f"rendered, {name}", observations, lights.astype(np.float64), result.mask
+            yield f"rendered, {name}", observations, lights.astype(np.float64), result.mask, True
 
 
-def real(
-    folders: list[Path], n_lights: int, draws: int
-) -> Iterator[tuple[str, Array, Array, NDArray[np.bool_]]]:
+def real(folders: list[Path], n_lights: int, draws: int) -> Iterator[Lit]:
     for folder in folders:
-        capture = read_capture(folder)
+        source = open_capture(folder)
+        # As the check of infer, it sees no intensities that were estimated under the lights in question.
+        capture, known = source.read(as_stored=True), source.intensities_measured
         wanted = n_lights if n_lights < capture.n_lights else None
         for draw in draw_lights(capture.light_directions, wanted, trials=draws, seed=SEED):
             chosen = list(draw)
-            yield folder.name, capture.observations[:, chosen], capture.light_directions[chosen], capture.mask
+            lights = capture.light_directions[chosen]
+            yield folder.name, capture.observations[:, chosen], lights, capture.mask, known
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -129,13 +133,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rendered(options.scenes, options.measured, options.lights),
     )
     for source in sources:
-        for name, observations, lights, mask in source:
+        for name, observations, lights, mask, known in source:
             sample = sample_observations(observations, mask)
             for kind, given, is_right in wrong_files(lights, rng):
                 started = time.perf_counter()
-                check = check_lights(sample.observations, sample.mask, given)
+                factors = find_factors(sample.observations, intensities_known=known)
+                check = check_lights(sample.observations, sample.mask, given, factors=factors)
                 longest = max(longest, time.perf_counter() - started)
-                doubted = check.order is not None or check.best is not None
+                doubted = check.order is not None or check.best is not None or check.odd_image is not None
                 named[kind, name] += doubted
                 mended[kind, name] += doubted and is_right(check)
                 total[kind, name] += 1

@@ -11,6 +11,9 @@ from splinecli.errors import UsageError
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
+AUTOMATIC = "auto"
+"""The curve that the images state: sRGB for JPEG and for PNG that says so, linear for others."""
+
 
 def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
@@ -23,12 +26,12 @@ def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def parse_transfer(text: str) -> float | None:
-    """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear", None for "srgb".
+    """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear" and AUTOMATIC, None for "srgb".
 
     Raises:
         UsageError: the name is unknown, or G is not between 0.1 and 10.
     """
-    named: dict[str, float | None] = {"linear": 1.0, "srgb": None}
+    named: dict[str, float | None] = {AUTOMATIC: 1.0, "linear": 1.0, "srgb": None}
     if text in named:
         return named[text]
     if match := re.fullmatch(r"gamma:([0-9.]+)", text):
@@ -39,7 +42,7 @@ def parse_transfer(text: str) -> float | None:
         if 0.1 <= gamma <= 10:
             return gamma
     raise UsageError(
-        f"the transfer curve is {text!r}; expected linear, srgb, or gamma:G with G from 0.1 to 10"
+        f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
 from splinecli.capture.formats.header import is_display_encoded
+from splinecli.capture.stamp import stamp_capture
 from splinecli.errors import InputError
 from splinecli.results.albedo import albedo_map
 
@@ -162,3 +163,13 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     assert "display_encoded" in codes(read_capture(folder).warnings)
     srgb_source = open_capture(folder, radiometry=RadiometricCalibration(None))
     assert "display_encoded" not in codes(srgb_source.warnings)
+    mixed = observed(folder)
+    for number in range(4):
+        image = folder / f"{number}.png"
+        image.write_bytes(with_chunk(image.read_bytes(), b"sRGB", b"\0"))
+    np.testing.assert_array_equal(observed(folder), mixed)  # it is asked to be linear
+    capture = read_capture(folder)
+    assert "display_decoded" in codes(capture.warnings) and "display_encoded" not in codes(capture.warnings)
+    np.testing.assert_array_equal(capture.observations, observed(folder, gamma=None))
+    assert (capture.observations < mixed).all()
+    assert stamp_capture(open_capture(folder)) != stamp_capture(srgb_source)

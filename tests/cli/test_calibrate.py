@@ -196,7 +196,13 @@ def test_a_display_encoded_target_is_reported(run):
         cv2.imwrite(str(path.with_suffix(".jpg")), (picture // 257).astype(np.uint8))
         path.unlink()
     arguments = ["calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray", "--overwrite"]
-    assert "Add --transfer srgb if they are sRGB" in run(*arguments).err
+    assert "Add --transfer srgb if they are sRGB" in run(*arguments, "--transfer", "linear").err
+    intensities = []
+    for curve in ("linear", "srgb", "auto"):
+        run(*arguments, "--transfer", curve)
+        intensities.append(Path("calibration/light_intensities.txt").read_text())
+    assert intensities[2] == intensities[1]
+    assert "are read as sRGB. Add --transfer linear" in run(*arguments).err
     assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err
 
 

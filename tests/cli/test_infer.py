@@ -266,7 +266,7 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     result = run("infer", capture, "--transfer", "rec709")
     assert (result.code, result.out) == (2, "")
     assert (
-        "the transfer curve is 'rec709'; expected linear, srgb, or gamma:G with G from 0.1 to 10"
+        "the transfer curve is 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"
         in result.err
     )
 

@@ -30,6 +30,7 @@ AMBIENT_SUBTRACTED = "ambient_subtracted"
 BLACK_PIXELS = "black_pixels"
 DARK_IMAGES = "dark_images"
 DIFFERENT_SIZES = "different_sizes"
+DISPLAY_DECODED = "display_decoded"
 DISPLAY_ENCODED = "display_encoded"
 EIGHT_BIT = "eight_bit"
 ENCODED_VALUES = "encoded_values"
@@ -140,6 +141,14 @@ def lights_matched(light_file: str, how: str) -> CaptureWarning:
 
 def ambient_subtracted(ambient: str) -> CaptureWarning:
     return CaptureWarning(AMBIENT_SUBTRACTED, f"{ambient} was subtracted from all images as ambient light.")
+
+
+def display_decoded() -> CaptureWarning:
+    return CaptureWarning(
+        DISPLAY_DECODED,
+        "The images say that they are display-encoded (JPEG, or PNG that says so) and are read as sRGB. Add --transfer"
+        " linear if their values are linear.",
+    )
 
 
 def display_encoded() -> CaptureWarning:

@@ -26,6 +26,7 @@ class RadiometricCalibration:
 
     Args:
         gamma: exponent of the images' transfer curve; 1 for linear images, None for sRGB.
+        automatic: whether images are sRGB if all of them say that they are display-encoded.
         ambient: an image under ambient light alone, which is subtracted from all others.
         flat_field: images of an evenly white surface, one for each light or one for all. Images are divided by them.
     """
@@ -33,7 +34,11 @@ class RadiometricCalibration:
     gamma: float | None = 1.0
     ambient: Path | None = None
     flat_field: tuple[Path, ...] = ()
+    automatic: bool = False
 
+
+AUTOMATIC = RadiometricCalibration(automatic=True)
+"""Stored values are linear light, unless all images say otherwise."""
 
 AS_STORED = RadiometricCalibration()
 """Stored values are linear light."""

@@ -22,7 +22,7 @@ from splinecli.capture.lights.light_angles import LightForm, RowForm
 from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.named_lights import NamedLights, read_lights
-from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
+from splinecli.capture.linearise import AUTOMATIC, RadiometricCalibration
 from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource, Progress
@@ -40,7 +40,7 @@ def open_capture(
     intensities: StrPath | None = None,
     mask: StrPath | None = None,
     ground_truth: StrPath | None = None,
-    radiometry: RadiometricCalibration = AS_STORED,
+    radiometry: RadiometricCalibration = AUTOMATIC,
     white_level: float | None = None,
     light_frame: LightFrame = USUAL_FRAME,
     lights_format: LightForm = "xyz",
@@ -94,7 +94,11 @@ def open_capture(
     if radiometry.ambient is None and ambient is not None:
         radiometry = replace(radiometry, ambient=ambient)
         warnings.append(capture_warnings.ambient_subtracted(ambient.name))
-    if radiometry.gamma == 1 and any(is_display_encoded(image) for image in files.images):
+    encoded = [is_display_encoded(image) for image in files.images] if radiometry.gamma == 1 else []
+    if radiometry.automatic and encoded and all(encoded):
+        radiometry = replace(radiometry, gamma=None)
+        warnings.append(capture_warnings.display_decoded())
+    elif any(encoded):
         warnings.append(capture_warnings.display_encoded())
     orientation = common_orientation(files.images)
     if orientation != UPRIGHT:

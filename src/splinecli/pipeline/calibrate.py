@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
 from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.transfer import AUTOMATIC
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,6 +31,10 @@ DISPLAY_ENCODED = (
     "The images of the gray target look display-encoded (JPEG, or PNG that says so), but are read as linear."
     " Add --transfer srgb if they are sRGB."
 )
+DISPLAY_DECODED = (
+    "The images of the gray target say that they are display-encoded (JPEG, or PNG that says so) and are read as sRGB."
+    " Add --transfer linear if their values are linear."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +47,7 @@ class CalibrateOptions:
         masks: a mask of each ball, or empty.
         ball_diameter: of each ball, in any unit, which becomes that of the lamps' positions.
         gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
-        transfer: the curve of the gray target's images: linear, srgb or gamma:G.
+        transfer: the curve of the gray target's images: auto, linear, srgb or gamma:G.
         compare: a text file of light directions to compare the result with.
         output: the folder of the results.
         overwrite: replace earlier results.
@@ -57,7 +62,7 @@ class CalibrateOptions:
     ball_diameter: float | None = None
     gray_ball: Path | None = None
     gray_card: Path | None = None
-    transfer: str = "linear"
+    transfer: str = AUTOMATIC
     compare: Path | None = None
     output: Path = Path("calibration")
     overwrite: bool = False
@@ -126,15 +131,16 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     circles = options.circles or [None] * len(balls)
     lights = combine_balls(_calibrate_balls(balls, circles, observer))
     intensities = None
+    warnings: list[str] = []
     if target_files is not None:
         from splinecli.calibration.gray import measure_light_intensities
 
         kind: Target = "ball" if options.gray_ball is not None else "card"
-        intensities = measure_light_intensities(target_files, lights.directions, kind, gamma=options.gamma)
+        gamma, warnings = _target_curve(options, target_files)
+        intensities = measure_light_intensities(target_files, lights.directions, kind, gamma=gamma)
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
-    if options.gamma == 1 and target_files is not None and _looks_display_encoded(target_files):
-        report["warnings"].append(DISPLAY_ENCODED)
+    report["warnings"] += warnings
     _write(options.output, lights, intensities, lamps, report)
     for line in summary_lines(report):
         observer.say(line)
@@ -159,10 +165,14 @@ def _calibrate_balls(
         ]
 
 
-def _looks_display_encoded(files: BallFiles) -> bool:
+def _target_curve(options: CalibrateOptions, files: BallFiles) -> tuple[float | None, list[str]]:
+    """Return the transfer curve of the gray target's images, and warnings about it."""
     from splinecli.capture.formats.header import is_display_encoded
 
-    return any(is_display_encoded(image) for image in files.images)
+    encoded = [is_display_encoded(image) for image in files.images] if options.gamma == 1 else []
+    if options.transfer == AUTOMATIC and encoded and all(encoded):
+        return None, [DISPLAY_DECODED]
+    return options.gamma, [DISPLAY_ENCODED] if any(encoded) else []
 
 
 def _write(

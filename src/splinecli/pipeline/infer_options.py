@@ -13,6 +13,7 @@ from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.normals import Convention
 from splinecli.pipeline.surface import check_decimation, check_surface_options
 from splinecli.surface.surface_files import DEFAULT_MESHES, MESH_FILES
+from splinecli.transfer import AUTOMATIC, parse_transfer
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
@@ -41,7 +42,7 @@ class InferOptions:
         auto_mask: find the object where the capture has no mask.
         crop: the box X,Y,W,H of the images that is read; None for whole images.
         scale: 1/N to read one of N rows and columns; None for all.
-        transfer: the curve of the images: linear, srgb or gamma:G.
+        transfer: the curve of the images: auto, linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
         white_level: stored value from which a pixel counts as saturated, such as 4095. None to find it.
@@ -81,7 +82,7 @@ class InferOptions:
     ground_truth: str | None = None
     light_frame: str | None = None
     lights_format: LightForm = "xyz"
-    transfer: str = "linear"
+    transfer: str = AUTOMATIC
     ambient: str | None = None
     flat_field: str | None = None
     white_level: float | None = None
@@ -113,7 +114,6 @@ class InferOptions:
         from splinecli.capture.restore.light_refinement import check_light_error
         from splinecli.capture.window import parse_window
         from splinecli.results.files import MAPS, NORMALS
-        from splinecli.transfer import parse_transfer
 
         if self.n_lights is not None and self.light_indices is not None:
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
@@ -229,14 +229,14 @@ def radiometric_calibration(
     """Return what --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
     from splinecli.capture import RadiometricCalibration
     from splinecli.capture.layouts.image_lists import check_not_empty, list_images
-    from splinecli.transfer import parse_transfer
 
     flats: tuple[Path, ...] = ()
     if flat_field is not None:
         folder = Path(flat_field)
         flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
         check_not_empty(flats, folder)
-    return RadiometricCalibration(parse_transfer(transfer), None if ambient is None else Path(ambient), flats)
+    dark = None if ambient is None else Path(ambient)
+    return RadiometricCalibration(parse_transfer(transfer), dark, flats, transfer == AUTOMATIC)
 
 
 def _check_one_of(what: str, value: str, allowed: Mapping[str, Any] | tuple[str, ...]) -> None:

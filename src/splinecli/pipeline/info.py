@@ -10,6 +10,7 @@ from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions
 from splinecli.errors import UsageError
 from splinecli.pipeline.infer_options import LightForm, radiometric_calibration
 from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.transfer import AUTOMATIC
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
@@ -51,7 +52,7 @@ class InfoOptions:
         light_frame: the frame of the light file, such as "x-left,y-down".
         lamps: near lamps; see LampOptions.
         crop, scale: the part of the images that is read; see InferOptions.
-        transfer: the curve of the images: linear, srgb or gamma:G.
+        transfer: the curve of the images: auto, linear, srgb or gamma:G.
         ambient: an image without any of the lights.
         flat_field: a folder of images of an evenly white surface.
         white_level: the stored value from which a pixel counts as saturated. None finds it.
@@ -71,7 +72,7 @@ class InfoOptions:
     lamps: LampOptions = NO_LAMP_OPTIONS
     crop: str | None = None
     scale: str | None = None
-    transfer: str = "linear"
+    transfer: str = AUTOMATIC
     ambient: Path | None = None
     flat_field: Path | None = None
     white_level: float | None = None

@@ -92,9 +92,9 @@ GROUND_TRUTH = Option(
     None, metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."
 )
 TRANSFER = Option(
-    "linear",
+    "auto",
     metavar="CURVE",
-    help="Transfer curve of the images: linear, srgb or gamma:G.",
+    help="Transfer curve of the images: auto, linear, srgb or gamma:G. auto reads JPEG, and PNG that says so, as sRGB.",
     autocompletion=complete_curves,
 )
 AMBIENT = Option(
@@ -178,9 +178,9 @@ BALL_DIAMETER = Option(
 GRAY_BALL = Option(None, metavar="DIR", help="Images of a matte gray ball under the same lights.")
 GRAY_CARD = Option(None, metavar="DIR", help="Images of a matte gray card that faces the camera.")
 GRAY_TRANSFER = Option(
-    "linear",
+    "auto",
     metavar="CURVE",
-    help="Transfer curve of the gray target's images: linear, srgb or gamma:G.",
+    help="Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
     autocompletion=complete_curves,
 )
 

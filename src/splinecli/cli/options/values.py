@@ -49,7 +49,7 @@ class Precision(StrEnum):
 
 def complete_curves() -> list[str]:
     """Return transfer curves, the last of them as an example."""
-    return ["linear", "srgb", "gamma:2.2"]
+    return ["auto", "linear", "srgb", "gamma:2.2"]
 
 
 def complete_weights() -> list[str]:
