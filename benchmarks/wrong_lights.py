@@ -79,9 +79,7 @@ def words(check: LightCheck) -> str:
     return check.order or (check.best.name if check.best is not None else "")
 
 
-def rendered(
-    count: int, measured: Path | None, n_lights: int
-) -> Iterator[Lit]:
+def rendered(count: int, measured: Path | None, n_lights: int) -> Iterator[Lit]:
     """Yield rendered scenes, by their class of material, with lights up to 60 degrees from the view."""
     library = None if measured is None else read_measured(measured)
     config = SceneConfig(size=80, lights=4, samples=2, directions=48, bounces=2)

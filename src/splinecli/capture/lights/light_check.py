@@ -36,7 +36,7 @@ NEAR = 0.1
 LOWEST_CURL = 0.1
 """Curls below this are noise. On a cap of a sphere, other frames give little more."""
 
-RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.8
+RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
 
 _AS_GIVEN = "as given"
