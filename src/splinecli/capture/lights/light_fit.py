@@ -20,6 +20,12 @@ Array = NDArray[np.float64]
 LIT_SHARE = 0.1
 """Observations below this share of a pixel's largest one count as shadow."""
 
+DARK_SHARES = (0.1, 0.02)
+"""Pixels below this share of the brightest hundredth are left out: background. The second counts where too few are left
+by the first, because highlights outshine the object."""
+
+MIN_PIXELS_PER_LIGHT = 10
+
 MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000
 """Limits of the sample that the factors are found from."""
 
@@ -105,7 +111,7 @@ def find_factors(observations: NDArray[np.floating], *, intensities_known: bool 
     """
     values = sample_pixels(observations)
     n_pixels, n_lights = values.shape
-    if n_lights < 4 or n_pixels < 10 * n_lights:
+    if n_lights < 4 or n_pixels < MIN_PIXELS_PER_LIGHT * n_lights:
         return None
     lit = (values > LIT_SHARE).astype(np.float64)
     matrix = np.linalg.svd(values, full_matrices=False)[2][:3]
@@ -118,7 +124,7 @@ def find_factors(observations: NDArray[np.floating], *, intensities_known: bool 
     # The largest values of a row are 1, but a few rows in deep shadow may be wild.
     kept = np.abs(rows @ matrix).max(axis=1) < 3
     rows, residuals, lit = rows[kept], residuals[kept], lit[kept]
-    if len(rows) < 10 * n_lights:
+    if len(rows) < MIN_PIXELS_PER_LIGHT * n_lights:
         return None
     brightness = np.sqrt((values[kept] ** 2).sum(axis=1).mean())
     scale = np.linalg.qr(rows)[1] / np.sqrt(len(rows)) / brightness
@@ -166,15 +172,15 @@ def fit_residual(values: Array, light_directions: Array) -> float:
 
 def sample_pixels(observations: NDArray[np.floating]) -> Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
-    brightest = observations.max(axis=1)
-    limit = np.quantile(brightest, 0.99)
-    usable = np.flatnonzero(brightest > 0.1 * limit)
-    if len(usable) < 0.05 * np.count_nonzero(brightest > 0.02 * limit):
-        usable = np.flatnonzero(brightest > 0.02 * limit)  # a few pixels outshine the object
-    number = min(len(usable), MAX_PIXELS, max(MAX_OBSERVATIONS // observations.shape[1], 1))
-    chosen = usable[np.linspace(0, len(usable) - 1, number).astype(int)] if len(usable) else usable
-    values = observations[chosen].astype(np.float64)
-    values = values / values.max(axis=1, keepdims=True)
-    # Three unknowns need more than three lit observations to leave a residual.
-    kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
+    n_lights, brightest = observations.shape[1], observations.max(axis=1)
+    for share in DARK_SHARES:
+        usable = np.flatnonzero(brightest > share * np.quantile(brightest, 0.99))
+        number = min(len(usable), MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1))
+        chosen = usable[np.linspace(0, len(usable) - 1, number).astype(int)] if len(usable) else usable
+        values = observations[chosen].astype(np.float64)
+        values = values / values.max(axis=1, keepdims=True)
+        # Three unknowns need more than three lit observations to leave a residual.
+        kept: Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
+        if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:
+            break
     return kept
