@@ -115,6 +115,11 @@ def test_a_decimated_surface_in_millimetres(capture, run):
     assert sorted(path.suffix for path in Path("out/sphere").glob("mesh.*")) == [".stl"]
     middle, rim = np.load("out/sphere/depth.npy")[11:13, 11:13].mean(), surface["range"][0]
     assert middle - rim == pytest.approx(0.1 * 12 / (2 * 2.5), rel=0.1)
+    # One of two rows and columns are read: each pixel of the map is as wide as two of the photographs.
+    assert run("infer", capture, "--method", "ls", "--scale", "1/2", *arguments, "--overwrite").code == 0
+    scaled = read_report(Path("out/sphere"))["surface"]
+    assert scaled["pixel_size_mm"] == 0.2
+    assert np.ptp(scaled["range"]) == pytest.approx(np.ptp(surface["range"]), rel=0.2)
 
 
 @pytest.mark.parametrize(

@@ -239,16 +239,20 @@ def _surface(
     observer: Observer,
 ) -> Callable[[Path], None]:
     """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
+    from splinecli.capture.window import parse_window
     from splinecli.pipeline.surface import make_surface, share_of_iterations
     from splinecli.surface.surface_files import DEPTH_FORMATS, write_surface
 
+    pixel_size = options.pixel_size
+    if pixel_size is not None:
+        pixel_size *= parse_window(options.crop, options.scale).step
     with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
         surface, report["surface"] = make_surface(
             estimate.normal_map,
             estimate.capture.mask,
             colours=colours,
             n_triangles=options.decimate,
-            pixel_size_mm=options.pixel_size,
+            pixel_size_mm=pixel_size,
             progress=share_of_iterations(advance),
         )
     return partial(write_surface, surface=surface, formats=(*options.mesh_formats, *DEPTH_FORMATS))
