@@ -70,7 +70,7 @@ class Perceptron(nn.Module):
         self.mean.copy_(inputs.mean(dim=0))
         self.spread.copy_(inputs.std(dim=0) + 1e-3)
         optimiser = torch.optim.AdamW(
-            self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99)
+            self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99), fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimiser, _LEARNING_RATE, total_steps=steps + 1, pct_start=0.1

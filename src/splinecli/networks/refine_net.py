@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from types import EllipsisType
 
@@ -84,13 +85,13 @@ class RefineNet(nn.Module):
             masks.append(max_pool2d(masks[-1], 2))
         normals, error = (part.contiguous() for part in split_features(features))
         towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
-        joined = torch.cat((pad(torch.cat((features, *towards), dim=1), border), masks[0]), dim=1)
-        x = self.enter(joined.contiguous(memory_format=torch.channels_last)) * masks[0]
+        # In place where possible: a tile's maps of 32 channels decide how much memory is needed.
+        x = self.enter(_joined((features, *towards, mask), border)).to(normals.dtype).mul_(masks[0])
         passed = []
         for scale, blocks in enumerate(self.encode):
             if scale:
                 passed.append(x)
-                x = self.down[scale - 1](x) * masks[scale]
+                x = self.down[scale - 1](x).to(normals.dtype).mul_(masks[scale])
             for block in blocks:  # type: ignore[attr-defined]
                 x = block(x, masks[scale])
         origin = (0, 0)
@@ -109,6 +110,13 @@ class RefineNet(nn.Module):
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
             corrected = corrected + weight * difference[..., *inner]
         return _unit(corrected) * mask, (error + change[:, 3:5]) * mask
+
+
+def _joined(maps: Sequence[Tensor], border: tuple[int, ...]) -> Tensor:
+    """Return maps as the channels of one, with a border of zeros, in the layout that is fastest for the layers."""
+    joined = torch.cat(list(maps), dim=1)
+    joined = pad(joined, border) if any(border) else joined
+    return joined.contiguous(memory_format=torch.channels_last)
 
 
 def _grown(part: Part, margin: int) -> Part:

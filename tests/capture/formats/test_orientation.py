@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 
 from splinecli.capture.formats.orientation import UPRIGHT, common_orientation
 from splinecli.errors import InputError
@@ -23,6 +23,13 @@ def write(folder: Path, name: str, orientation: int | None) -> Path:
 def test_one_orientation(tmp_path: Path, tag: int | None, expected: int) -> None:
     images = [write(tmp_path, "a.jpg", tag), write(tmp_path, "b.tif", tag), write(tmp_path, "c.png", tag)]
     assert common_orientation(images) == expected
+
+
+def test_the_pixels_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decoding takes seconds for an image of 24 megapixels."""
+    image = write(tmp_path, "c.png", 6)
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+    assert common_orientation([image]) == 6
 
 
 def test_different_orientations_are_refused(tmp_path: Path) -> None:

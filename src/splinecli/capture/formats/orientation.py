@@ -44,8 +44,9 @@ def _orientation(path: Path) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            with Image.open(path) as image:  # reads the header alone
-                value = image.getexif().get(_ORIENTATION, UPRIGHT)
+            with Image.open(path) as image:
+                # Of the base class, because that of PNG decodes the image to find tags behind its pixels.
+                value = Image.Image.getexif(image).get(_ORIENTATION, UPRIGHT)
         except Exception:  # damaged tags cause a dozen types of errors
             return UPRIGHT
     return value if value in range(1, 9) else UPRIGHT
