@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.pipeline.info import ORIGINS, InfoOptions, summary_lines
+from splinecli.pipeline.info import ORIGINS, REFINED_PIXELS, InfoOptions, summary_lines
 
 REPORT = {
     "capture": "cat",
@@ -53,6 +53,13 @@ def test_lines_of_a_report() -> None:
         {**REPORT, "reads": "5 x 4 pixels from (1, 2)"}
     )
     assert "white level  none: floating-point" in summary_lines({**REPORT, "white_level": None})
+
+
+def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
+    from splinecli.methods.refiner import TILE
+    from splinecli.networks.refine_net import REACH
+
+    assert REFINED_PIXELS == (TILE + 2 * REACH) ** 2
 
 
 def test_every_origin_of_a_white_level_has_words() -> None:

@@ -19,17 +19,20 @@ if TYPE_CHECKING:
 PIXELS_PER_SECOND = 2000
 """Speed of spline-net on a laptop's processor. benchmarks/inference_speed.py measures that of your machine."""
 
-LEARNED_PER_SECOND = 500
+LEARNED_PER_SECOND = 1000
 """Pixels of the sample of a distilled network: a pixel's time in the network, and that of learning it."""
 
-DISTILLED_PER_SECOND = 150_000
-"""Speed of reading, of the distilled network and of writing together."""
+DISTILLED_PER_SECOND = 130_000
+"""Speed of reading, of the distilled network, of the refinement and of writing together, on two cores."""
 
 STARTING_SECONDS = 3
 """Time that infer takes besides the pixels."""
 
-BASE_MIB = 700
-"""Memory of Python, PyTorch and a batch of pixels. The memory of a capture is added to it."""
+BASE_MIB = 500
+"""Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
+
+REFINED_PIXELS, REFINED_BYTES = 960**2, 800
+"""The most pixels that are refined at once: a tile with its margin. Bytes of each."""
 
 ORIGINS = {
     "given": "given by --white-level",
@@ -259,4 +262,5 @@ def _memory_mib(summary: CaptureSummary) -> float:
 
     first = summary.images[0]
     largest = first.shape, np.dtype(first.dtype).itemsize
-    return BASE_MIB + capture_bytes(largest, summary.n_pixels, summary.source.n_lights) / 2**20
+    refined = REFINED_BYTES * min(summary.n_pixels, REFINED_PIXELS)
+    return BASE_MIB + (capture_bytes(largest, summary.n_pixels, summary.source.n_lights) + refined) / 2**20

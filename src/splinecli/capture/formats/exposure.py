@@ -58,8 +58,9 @@ def read_exposure(path: Path) -> Exposure | None:
 def _read_tags(path: Path) -> tuple[Any, Any, Any]:
     from PIL import Image
 
-    with Image.open(path) as image:  # reads the header alone
-        tags = image.getexif().get_ifd(_EXIF)
+    with Image.open(path) as image:
+        # Of the base class: see orientation.py.
+        tags = Image.Image.getexif(image).get_ifd(_EXIF)
     return tags[_EXPOSURE_TIME], tags[_F_NUMBER], tags[_ISO]
 
 
