@@ -31,7 +31,7 @@ STARTING_SECONDS = 3
 BASE_MIB = 500
 """Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
 
-REFINED_PIXELS, REFINED_BYTES = 960**2, 800
+REFINED_PIXELS, REFINED_BYTES = 960**2, 1100
 """The most pixels that are refined at once: a tile with its margin. Bytes of each."""
 
 ORIGINS = {
