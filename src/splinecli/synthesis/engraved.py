@@ -1,4 +1,4 @@
-"""Flat pieces with detail of a few pixels, such as engraved, woven or faceted surfaces, that fill the frame.
+"""Plates and half ellipsoids with detail of a few pixels, such as engraved, woven or faceted surfaces.
 
 Rendered scenes have few bends of a pixel's size. These pieces have, but no cast shadows or interreflection.
 """
@@ -14,16 +14,20 @@ from torch import Tensor
 from splinecli.synthesis.scenes import CLASSES, draw_class
 
 
-def draw_engraved(size: int, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw a piece of size x size pixels; return its unit normals (P, 3) and its radiance (P, F), pixels row-major.
+def draw_engraved(
+    size: int, lights: Tensor, generator: torch.Generator, *, round_share: float = 1 / 3
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw a piece; return its unit normals (P, 3), its radiance (P, F), and its mask (size, size) with P true pixels.
 
-    The slopes of the surface are the sum of three waves of U(0.3, 2) frames with slopes of up to 0.3, and of one kind
-    of detail: V-shaped grooves U(1, 6) pixels wide to either side, facets of 3 to 20 pixels, or a random texture with a
-    grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third of it for the texture. The
-    material is that of draw_class, with 1 to 300 patches.
+    Some pieces are half ellipsoids, whose mask ends at their rim. The others are plates that fill the frame: tilted by
+    a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has one kind of
+    detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or bent; facets of 3 to 20 pixels; or a
+    random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third of it
+    for the texture. The material is that of draw_class, with 1 to 300 patches.
 
     Args:
         lights: (F, 3), unit.
+        round_share: share of half ellipsoids.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> float:
@@ -38,32 +42,51 @@ def draw_engraved(size: int, lights: Tensor, generator: torch.Generator) -> tupl
         direction = torch.tensor((math.cos(angle), math.sin(angle)))
         return direction, places @ direction
 
-    slopes = torch.zeros(size * size, 2)
-    for _ in range(3):
-        direction, place = along()
-        wave = (2 * math.pi * (place / (uniform(0.3, 2) * size) + uniform())).sin()
-        slopes += uniform(0, 0.3) * wave[:, None] * direction
+    mask = torch.ones(size * size, dtype=torch.bool)
+    if uniform() < round_share:
+        direction, _ = along()
+        across = torch.stack((direction, torch.tensor((-direction[1], direction[0]))))
+        middle = places - places.mean(dim=0)
+        axes = torch.tensor((uniform(0.3, 0.49), uniform(0.3, 0.49))) * size
+        at = middle @ across.T / axes
+        mask = at.square().sum(1) < 1
+        height = (1 - at.square().sum(1)).clamp(min=0).sqrt()[:, None]
+        base = torch.cat((uniform(0.3, 1.5) * (at / axes * axes.mean()) @ across, height), dim=1)
+    else:
+        slopes = uniform(0, 0.7) * along()[0].expand(size * size, 2)
+        for _ in range(3):
+            direction, place = along()
+            wave = (2 * math.pi * (place / (uniform(0.3, 2) * size) + uniform())).sin()
+            slopes = slopes + uniform(0, 0.3) * wave[:, None] * direction
+        base = torch.cat((-slopes, torch.ones(size * size, 1)), dim=1)
+    base = torch.nn.functional.normalize(base, dim=1)
     steepness = uniform(0.05, 0.6)
     kind = int(3 * uniform())
     if kind == 0:
         direction, place = along()
-        side = (place / uniform(1, 6) + uniform(0, 2)).floor() % 2
-        slopes += steepness * (2 * side[:, None] - 1) * direction
+        bend = _blurred(torch.randn(1, size, size, generator=generator), 12).view(-1)
+        place = place + (uniform() < 0.5) * uniform(0, 12) * bend / bend.std()
+        number = (place / uniform(1, 6) + uniform(0, 2)).floor().long()
+        number = number - number.min()
+        side = 2.0 * (number % 2) - 1
+        if uniform() < 0.5:
+            side = torch.randn(int(number.max()) + 1, generator=generator)[number]
+        detail = steepness * side[:, None] * direction
     elif kind == 1:
         count = int((size / uniform(3, 20)) ** 2) + 1
-        slopes += (steepness * torch.randn(count, 2, generator=generator))[_cells(count, size, generator)]
+        detail = (steepness * torch.randn(count, 2, generator=generator))[_cells(count, size, generator)]
     else:
-        noise = torch.randn(2, size, size, generator=generator)
-        grain = _blurred(noise, uniform(0.4, 1.5))
-        slopes += steepness / 3 * (grain / grain.std()).view(2, -1).T
-    normals = torch.cat((-slopes, torch.ones(size * size, 1)), dim=1)
+        grain = _blurred(torch.randn(2, size, size, generator=generator), uniform(0.4, 1.5))
+        detail = steepness / 3 * (grain / grain.std()).view(2, -1).T
+    normals = base - base[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
     normals = torch.nn.functional.normalize(normals, dim=1)
     patches = int(300 ** uniform())
     material = draw_class(
         CLASSES[int(len(CLASSES) * uniform())], patches, generator, one_gloss=uniform() < 0.5
-    ).take(_cells(patches, size, generator))
+    ).take(_cells(patches, size, generator)[mask])
+    normals = normals[mask]
     cosines = (normals @ lights.T).clamp(min=0)
-    return normals, material.shade(cosines, normals[:, 2:], lights[:, 2])
+    return normals, material.shade(cosines, normals[:, 2:], lights[:, 2]), mask.view(size, size)
 
 
 def _cells(count: int, size: int, generator: torch.Generator) -> Tensor:

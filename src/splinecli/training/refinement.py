@@ -15,6 +15,7 @@ from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_features import brightness, refine_features, split_features, turn_features
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import Entry, PixelSet
+from splinecli.synthesis.background import add_background
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
@@ -37,7 +38,10 @@ _ENLARGED_SHARE = 0.6
 _MOST_ENLARGED = 3.0
 """A share of the captures of scenes is enlarged, by a factor from 1 to this one."""
 
-_ENGRAVED_SHARE = 0.25
+_BACKGROUND_SHARE = 0.35
+"""A share of the captures shows what lies behind the object; see add_background."""
+
+_ENGRAVED_SHARE = 0.4
 _ENGRAVED_SIZE = 96
 """A share of the captures show no scene, but an engraved piece of this size; see draw_engraved."""
 
@@ -56,7 +60,7 @@ class SceneMaps(NamedTuple):
 
     Attributes:
         features: (CHANNELS, H, W) float16, see refine_features; zero outside the mask.
-        normals: (3, H, W) float16, the truth.
+        normals: (3, H, W) float16, the truth; zero where it is not known.
         mask: (1, H, W) bool.
     """
 
@@ -148,28 +152,29 @@ def _photograph(
         np.float32
     )
     maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
-    radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-    return _after_network(network, radiance, lights[chosen], truth, mask, config, generator)
+    return _after_network(network, maps, lights[chosen], mask, config, generator)
 
 
 def _photograph_engraved(network: SplineNet, config: CaptureConfig, generator: torch.Generator) -> SceneMaps:
     count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
     lights = draw_light_directions(1, int(count), generator)[0]
-    truth, radiance = draw_engraved(_ENGRAVED_SIZE, lights, generator)
-    mask = torch.ones(_ENGRAVED_SIZE, _ENGRAVED_SIZE, dtype=torch.bool)
-    return _after_network(network, radiance, lights, truth, mask, config, generator)
+    truth, radiance, mask = draw_engraved(_ENGRAVED_SIZE, lights, generator)
+    maps = _placed(torch.cat((radiance, truth), dim=1), mask)
+    return _after_network(network, maps, lights, mask, config, generator)
 
 
 def _after_network(
     network: SplineNet,
-    radiance: Tensor,
+    maps: Tensor,
     lights: Tensor,
-    truth: Tensor,
     mask: Tensor,
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> SceneMaps:
-    """Return the maps of radiance (P, F) and true normals (P, 3) that were photographed and estimated."""
+    """Return what is estimated from photographs of maps (F + 3, H, W) of radiance and true normals."""
+    if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
+        maps, mask = add_background(maps, mask, lights, generator)
+    radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
     observations, lights = photograph_scene(radiance, lights, config, generator)
     features = pixel_features(network, observations, lights)
     return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
@@ -263,11 +268,11 @@ def refinement_losses(network: SplineNet, maps: SceneMaps, *, bfloat16: bool = F
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
         normals, error = network.refine_net(maps.features, maps.mask)
-    inside = maps.mask[:, 0]
-    area = inside.sum((1, 2)).clamp(min=1)
+    known = maps.normals.any(dim=1)
+    area = known.sum((1, 2)).clamp(min=1)
 
     def mean_over_capture(values: Tensor) -> Tensor:
-        return (values * inside).sum((1, 2)) / area
+        return (values * known).sum((1, 2)) / area
 
     def angles_of(estimate: Tensor) -> Tensor:
         return angles(estimate.movedim(1, -1), maps.normals.movedim(1, -1))
