@@ -50,7 +50,7 @@ def test_kills_of_every_command() -> None:
         sys.executable,
         str(Path(__file__).with_name("kill_commands.py")),
         "--steps",
-        "4",
+        "2",
         "--kills",
         "7",
     ]

@@ -12,11 +12,13 @@ LIGHTS = torch.tensor(spiral_lights(9, 75), dtype=torch.float32)
 SIZE = 48
 
 
-@pytest.mark.parametrize("seed", range(9))
+@pytest.mark.parametrize("seed", range(12))
 def test_a_piece(seed: int) -> None:
-    normals, radiance = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))
-    assert normals.shape == (SIZE**2, 3) and radiance.shape == (SIZE**2, 9)
-    torch.testing.assert_close(normals.norm(dim=1), torch.ones(SIZE**2))
+    normals, radiance, mask = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))
+    assert mask.shape == (SIZE, SIZE)
+    pixels = int(mask.sum())
+    assert normals.shape == (pixels, 3) and radiance.shape == (pixels, 9)
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(pixels))
     assert (normals[:, 2] > 0).all()
     assert torch.isfinite(radiance).all() and (radiance >= 0).all()
     assert (radiance[normals @ LIGHTS.T <= 0] == 0).all()
@@ -24,11 +26,25 @@ def test_a_piece(seed: int) -> None:
     assert torch.equal(again[0], normals) and torch.equal(again[1], radiance)
 
 
+def test_round_pieces_turn_away_at_their_rim() -> None:
+    """On average, the normals point away from the middle, and more so further out."""
+    for seed in range(6):
+        normals, _, mask = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed), round_share=1.0)
+        assert 0.25 < mask.float().mean() < 0.8 and not mask[0].any()
+        rows, columns = mask.nonzero().float().T
+        outwards = torch.stack((columns - columns.mean(), rows.mean() - rows), dim=1)
+        radius = outwards.norm(dim=1)
+        along = (normals[:, :2] * torch.nn.functional.normalize(outwards, dim=1)).sum(1)
+        inner, outer = along[radius < radius.median()].mean(), along[radius >= radius.median()].mean()
+        assert 0 < inner < outer
+
+
 def test_detail_has_the_size_of_pixels() -> None:
     """In most pieces, normals differ more over four pixels than the waves of the frame make them."""
     steps = []
     for seed in range(30):
-        normals = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))[0].view(SIZE, SIZE, 3)
+        generator = torch.Generator().manual_seed(seed)
+        normals = draw_engraved(SIZE, LIGHTS, generator, round_share=0.0)[0].view(SIZE, SIZE, 3)
         steps.append((normals[:, 4:] - normals[:, :-4]).norm(dim=-1).mean())
     # Waves of 0.3 frames with slopes of 0.3 change by up to 2 pi 4 / 15 x 0.3 x 0.64 = 0.3 in the mean, few by 0.1.
     assert torch.stack(steps).median() > 0.1

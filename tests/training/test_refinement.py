@@ -103,6 +103,7 @@ def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.Monk
     for name, value in (("FIRST_EXAMPLES", 3), ("VALIDATION_SCENES", 2)):
         monkeypatch.setattr(tasks, name, value)
     monkeypatch.setattr(refinement, "_ENGRAVED_SHARE", 0.0)
+    monkeypatch.setattr(refinement, "_BACKGROUND_SHARE", 0.0)
     return replace(
         tiny,
         network=replace(tiny.network, error_head=True, refines=True),
@@ -154,6 +155,21 @@ def test_captures_of_a_pool(
     assert drawn.normals.shape == (3, 3, 14, 14)
     straight = refinement_losses(network, stack_maps([one])).before
     torch.testing.assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
+
+
+def test_unknown_normals_count_for_nothing(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
+    torch.manual_seed(0)
+    network = SplineNet(refining.network)
+    pool = ScenePool([(bumpy_set, bumpy_set.entries, 1.0)], network, refining.pixels, 1)
+    pool.add()
+    maps = stack_maps(pool.examples)
+    normals = maps.normals.clone()
+    normals[..., 7:] = 0
+    mask = maps.mask.clone()
+    mask[..., 7:] = False
+    # An untrained net changes nothing, so what lies beside a pixel does not matter.
+    half = refinement_losses(network, maps._replace(mask=mask, normals=normals))
+    torch.testing.assert_close(refinement_losses(network, maps._replace(normals=normals)), half)
 
 
 def test_enlarged_maps_mix_nothing_from_outside_of_the_mask() -> None:

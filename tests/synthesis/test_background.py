@@ -1,0 +1,46 @@
+"""Backgrounds: the object stays as it is, its shadow falls away from the light, and masks show more than the object."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from conftest import spiral_lights
+from splinecli.synthesis.background import _shadows, add_background
+
+LIGHTS = torch.tensor(spiral_lights(6, 60), dtype=torch.float32)
+
+
+def disc(size: int = 40) -> torch.Tensor:
+    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    return (rows - 20).square() + (columns - 20).square() < 12**2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_object_stays(seed: int) -> None:
+    mask = disc()
+    maps = torch.rand(9, 40, 40, generator=torch.Generator().manual_seed(9)) + 0.2
+    found, shown = add_background(maps, mask, LIGHTS, torch.Generator().manual_seed(seed))
+    # The object is where the maps have its values; all its pixels are shown, and others too.
+    held = (found == maps[:, 20, 20, None, None]).all(dim=0).nonzero()
+    assert len(held) == 1
+    top, left = (held[0] - 20).tolist()
+    rows, columns = mask.nonzero().T
+    assert torch.equal(found[:, rows + top, columns + left], maps[:, mask])
+    assert shown[rows + top, columns + left].all()
+    assert int(shown.sum()) > int(mask.sum())
+    behind = shown.clone()
+    behind[rows + top, columns + left] = False
+    assert torch.isfinite(found).all() and (found[:6] >= 0).all()
+    length = found[6:, behind].norm(dim=0)
+    assert bool((length == 0).all()) or torch.allclose(length, torch.ones_like(length))
+
+
+def test_shadows_fall_away_from_the_light() -> None:
+    """A light at the right, 45 degrees up, moves the shadow left by the distance; one above moves it down."""
+    mask, side = disc(), math.sqrt(0.5)
+    right, above = _shadows(mask, torch.tensor([[side, 0, side], [0, side, side]]), 7)
+    assert torch.equal(right[:, :-7], mask[:, 7:])
+    assert torch.equal(above[7:], mask[:-7])
