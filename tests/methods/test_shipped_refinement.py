@@ -86,3 +86,17 @@ def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
 
     refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
     assert depth(refined) == pytest.approx(depth(pixelwise), rel=0.1)
+
+
+@pytest.mark.parametrize("behind", [0.002, 0.3])
+def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
+    """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the sphere."""
+    x, y = (COLUMNS - SIZE / 2 + 0.5) / 24, (SIZE / 2 - 0.5 - ROWS) / 24
+    height = np.sqrt((1 - x**2 - y**2).clip(0))
+    sphere = height > 0.2
+    normals = np.where(sphere[..., None], np.stack((x, y, height), axis=-1), PLATE)
+    refined, pixelwise = (
+        angle_between_deg(estimate.normal_map[sphere], normals[sphere]).mean()
+        for estimate in refined_and_not(normals, np.where(sphere, 0.5, behind), noise=0.002)
+    )
+    assert refined < pixelwise + 0.3
