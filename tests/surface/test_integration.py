@@ -419,7 +419,16 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
             {"camera_matrix": np.diag([9.0, 0, 1])},
             InputError,
             "[[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]] is not a camera matrix [[fx, s, cx], [0, fy, cy], "
-            "[0, 0, 1]] with positive fx and fy. Give it in pixels, with columns to the right and rows down.",
+            "[0, 0, 1]] with positive fx and fy, and numbers of at most a million. Give it in pixels, with columns to "
+            "the right and rows down.",
+        ),
+        (
+            (NORMALS, MASK),
+            {"camera_matrix": np.array([[500, 1e308, 9], [0, 500, 8], [0, 0, 1]])},
+            InputError,
+            "[[500.0, 1e+308, 9.0], [0.0, 500.0, 8.0], [0.0, 0.0, 1.0]] is not a camera matrix [[fx, s, cx], [0, fy, "
+            "cy], [0, 0, 1]] with positive fx and fy, and numbers of at most a million. Give it in pixels, with "
+            "columns to the right and rows down.",
         ),
         (
             (NORMALS, MASK),

@@ -14,6 +14,9 @@ from splinecli.errors import InputError, UsageError
 
 Floats = NDArray[np.float64]
 
+_LARGEST = 1e6
+"""Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular."""
+
 
 def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> Floats:
     """Return the points (P, 3) at depth 1, z = -1, that a camera at the origin sees in the pixels of a mask (H, W).
@@ -58,13 +61,13 @@ def ray_basis(camera_matrix: NDArray[np.floating]) -> Floats:
     if matrix.shape != (3, 3):
         raise UsageError(f"the camera matrix has shape {matrix.shape}, expected (3, 3)")
     if not (
-        np.isfinite(matrix).all()
-        and min(matrix[0, 0], matrix[1, 1], np.linalg.det(matrix[:2, :2])) > 0
+        (np.abs(matrix) <= _LARGEST).all()  # False for NaN
+        and min(matrix[0, 0], matrix[1, 1], np.linalg.det(matrix[:2, :2])) > 1 / _LARGEST
         and (matrix[2] == (0, 0, 1)).all()
     ):
         raise InputError(
             f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
-            " with positive fx and fy",
+            " with positive fx and fy, and numbers of at most a million",
             hint="Give it in pixels, with columns to the right and rows down",
         )
     return np.asarray(np.linalg.inv(matrix).T * (1, -1, -1), np.float64)
