@@ -69,7 +69,7 @@ def test_the_lock_file_of_another_user(tmp_path: Path, monkeypatch: pytest.Monke
     def refuse(*_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     message = r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise choose another -o"
     with pytest.raises(OutputError, match=message), locked(tmp_path):
         pytest.fail("it has no lock")

@@ -112,7 +112,18 @@ def test_a_folder_in_the_place_of_a_file(tmp_path: Path) -> None:
     assert content(tmp_path) == {"pictures": b""}
 
 
-@pytest.mark.parametrize("plan", ["{", "[]", '{"remove": ["../kept"], "report": "report.json"}'])
+@pytest.mark.parametrize(
+    "plan",
+    [
+        "{",
+        "[]",
+        '{"remove": ["../kept"], "report": "report.json"}',
+        '{"remove": ["a\\u0000"], "report": "report.json"}',
+        '{"remove": [1], "report": "report.json"}',
+        '{"remove": [], "report": ""}',
+        '{"remove": [], "report": "."}',
+    ],
+)
 def test_a_hostile_plan_removes_nothing(tmp_path: Path, plan: str) -> None:
     write(tmp_path, {"kept": b"", f"out/{COMPLETE}/plan.json": plan.encode(), f"out/{COMPLETE}/files/a": b""})
     with pytest.raises(OutputError, match=r"plan\.json is damaged"), held_folder(tmp_path / "out"):

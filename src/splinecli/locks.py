@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -52,7 +53,7 @@ def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            file = (folder / LOCK).open("a")
+            file = _open_lock(folder / LOCK)
         except FileNotFoundError:  # another process removed the folder, because it was empty
             continue
         except PermissionError:
@@ -78,6 +79,17 @@ def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
             )
         if not got:
             time.sleep(_SECONDS_BETWEEN_TRIES)
+
+
+def _open_lock(path: Path) -> IO[str]:
+    """Open a lock file, which is made as needed. Raises OutputError where there is something else, such as a pipe."""
+    # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
+    flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OutputError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+    return os.fdopen(descriptor, "r+")
 
 
 def _try_lock(file: IO[str]) -> bool:

@@ -171,9 +171,12 @@ def _read_plan(folder: Path) -> tuple[list[str], str]:
     )
 
 
-def _is_inside(name: str) -> bool:
+def _is_inside(name: object) -> bool:
+    """Return whether this is the name of a file inside a folder."""
+    if not isinstance(name, str) or "\0" in name:
+        return False
     path = PurePosixPath(name)
-    return not path.is_absolute() and ".." not in path.parts
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
 
 
 def _check_place(path: Path) -> None:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.cli import main
+from splinecli.cli.main import main
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 SIZE = 24

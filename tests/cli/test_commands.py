@@ -165,7 +165,8 @@ def test_a_subfolder_without_permission_is_skipped(command, skipped, make_captur
     [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active"), ({"GOMP_SPINCOUNT": "9"}, None)],
 )
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expected):
-    script = "import os; from splinecli.cli import main; main(['--version']); print(os.environ.get('OMP_WAIT_POLICY'))"
+    script = "import os; from splinecli.cli.main import main; main(['--version']); "
+    script += "print(os.environ.get('OMP_WAIT_POLICY'))"
     clean = {
         name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
     }

@@ -22,7 +22,7 @@ def call(**variables: str) -> str:
     """What `splinecli` prints under these environment variables."""
     # A completion that imported torch would take seconds.
     script = (
-        "import sys; from splinecli.cli import main\n"
+        "import sys; from splinecli.cli.main import main\n"
         "try: sys.exit(main([]))\n"
         "finally: print(*{'torch', 'cv2'} & set(sys.modules), end='', file=sys.stderr)"
     )

@@ -90,7 +90,7 @@ def test_the_page_of_infer_shows_the_help(run, request):
 def test_help_and_ls_do_not_import_torch(capture):
     """`infer --method ls` and all help run without torch; help also without OpenCV and rich."""
     script = (
-        "import sys; from splinecli.cli import main; code = main(sys.argv[1:]);"
+        "import sys; from splinecli.cli.main import main; code = main(sys.argv[1:]);"
         "print(code, *sorted({'torch', 'cv2', 'rich'} & set(sys.modules)), file=sys.stderr)"
     )
 

@@ -84,6 +84,35 @@ def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
     assert not Path("out").exists()
 
 
+@posix
+def test_a_pipe_in_place_of_the_lock_is_refused(capture, run):
+    Path("out/sphere").mkdir(parents=True)
+    os.mkfifo("out/sphere/.lock")
+    result = run("infer", capture, "--method", "ls")
+    assert (result.code, result.err) == (
+        5,
+        "splinecli: out/sphere/.lock: is not a file, so it cannot lock the folder. Remove it.\n",
+    )
+
+
+def test_a_zero_byte_in_a_list_of_images(capture, run):
+    (capture / "filenames.txt").write_text("image1.png\na\0b.png\n")
+    result = run("infer", capture, "--method", "ls")
+    assert result.code == 3
+    assert result.err.startswith('splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist')
+
+
+@pytest.mark.parametrize("value", ["1" + "0" * 100, "1" + "0" * 400])
+@pytest.mark.parametrize("key", ["direction", "intensity"])
+def test_whole_numbers_of_lights_of_any_length(capture, run, key, value):
+    light = {"direction": "[0, 0, -1]", "intensity": "[1, 1, 1]", key: f"[{value}, 1, -1]"}
+    text = ", ".join(f'"{name}": {numbers}' for name, numbers in light.items())
+    Path("lights.json").write_text(f'{{"lights": [{", ".join(8 * ["{" + text + "}"])}]}}')
+    result = run("infer", capture, "--method", "ls", "--lights", "lights.json")
+    assert "defect" not in result.err
+    assert result.code in (0, 3) if len(value) < 300 else result.code == 3
+
+
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"lights": [' + "9" * 400 + "]}", "9" * 5_000])
 def test_lights_that_no_parser_likes(capture, run, text):
     Path("lights.json").write_text(text)
@@ -207,10 +236,28 @@ def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
     assert run("info", capture).code == 1
 
 
+@posix
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_the_program_starts(capture, number):
+    """It comes when the first module of the command line is imported, before PyTorch and the rest."""
+    script = (
+        "import os, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *_):\n"
+        f"        if name == 'splinecli.cli.main': os.kill(os.getpid(), {int(number)})\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from splinecli.__main__ import run\n"
+        f"sys.argv = ['splinecli', 'infer', {str(capture)!r}]\n"
+        "run()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "splinecli: interrupted.\n")
+
+
 def start(code: str) -> subprocess.Popen[str]:
     """Start a process that runs the code as the command line would, and wait until it says so."""
     script = "import importlib, time\nm = importlib.import_module('splinecli.cli.main')"
-    script += f"\ndef work(*_):\n    {code}\nm.main = work\nm.run()"
+    script += f"\ndef work(*_):\n    {code}\nm.main = work\nfrom splinecli.__main__ import run\nrun()"
     process = subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

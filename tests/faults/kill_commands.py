@@ -110,7 +110,7 @@ class KilledCommand:
         if name == "evaluate":  # what was scored is kept, so that all runs have the same seconds
             shutil.copy(self.case / "out/trials.jsonl", self.start / "out/trials.jsonl")
         self.old, self.new = self._state(self.start), self._state(self.case)
-        self.new_count = 0
+        self.kill_count = self.new_count = 0
 
     def kill(self, step: int | None = None, seconds: float | None = None) -> Iterator[str]:
         """Kill the command at a step or after some time, and yield what is wrong afterwards."""
@@ -118,6 +118,7 @@ class KilledCommand:
 
         self._reset()
         was_killed = self._run_killed(step, seconds)
+        self.kill_count += was_killed  # a run may end before its time
         if not was_killed and self._state(self.case) != self.new:
             yield "a run that was not killed ends with other files"
         yield from self._found_by_readers()
@@ -256,25 +257,25 @@ def main() -> int:
     names = options.command or list(REPLACEMENTS)
     with tempfile.TemporaryDirectory() as work:
         for name in names:
-            command, count = KilledCommand(name, Path(work)), 0
+            command = KilledCommand(name, Path(work))
             total = command.count_steps()
             steps = sorted(
                 {int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))}
             )
             for step in steps:
                 problems = list(command.kill(step=step))
-                count, failures = count + 1, failures + bool(problems)
+                failures += bool(problems)
                 for problem in problems:
                     print(f"{name}, step {step}: {problem}")
             for _ in range(options.kills // len(names)):
                 seconds = rng.uniform(0, 1.1 * command.seconds)
                 problems = list(command.kill(seconds=seconds))
-                count, failures = count + 1, failures + bool(problems)
+                failures += bool(problems)
                 for problem in problems:
                     print(f"{name}, {seconds:.3f} s: {problem}")
-            kills += count
+            kills += command.kill_count
             print(
-                f"{name}: {count} kills, at {len(steps)} of {total} steps and at random times;"
+                f"{name}: {command.kill_count} kills, at {len(steps)} of {total} steps and at random times;"
                 f" {command.new_count} ended in the new files",
                 flush=True,
             )

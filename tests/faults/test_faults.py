@@ -63,21 +63,26 @@ def test_kills_of_every_command() -> None:
 
 @pytest.mark.parametrize("disk_kb", [16, 64])
 def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
-    """The disk has room for one set of results, not for two; or for none."""
+    """The disk has room for no results; or for one set, and is filled after it."""
     mount = f"mount -t tmpfs -o size={disk_kb}k tiny disk"
     infer = f"{COMMAND} infer a --method ls -o disk --overwrite --format npy -q"
+    fill = f"{infer} && cp -r disk before && cat /dev/zero >disk/fill 2>/dev/null;"
     script = (
-        f"mkdir disk; {mount} || exit 77; cp a/lights.txt disk/kept; {infer}; echo $? >code; cp -r disk left"
+        f"mkdir disk; {mount} || exit 77; cp a/lights.txt disk/kept; {fill if disk_kb == 64 else ''}"
+        f" {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
     done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
     if done.returncode or not (folder / "code").exists():
         pytest.skip(f"this system does not let the test mount a disk ({done.stderr.strip()})")
-    assert (folder / "code").read_text() == ("5\n" if disk_kb == 16 else "0\n")
+    assert (folder / "code").read_text() == "5\n"
+    assert done.stderr.count("\n") == 1
+    assert "No space left on device" in done.stderr or "the disk may be full" in done.stderr
+    left = content(folder / "left")
     if disk_kb == 16:
-        assert done.stderr.count("\n") == 1
-        assert "No space left on device" in done.stderr or "the disk may be full" in done.stderr
-        assert set(content(folder / "left")) == {"kept"}
+        assert set(left) == {"kept"}
         assert not (folder / "left" / "a").exists()
+    else:
+        assert "a/normals.npy" in left and left == content(folder / "before")
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +145,7 @@ def test_a_limit_on_the_size_of_files_keeps_earlier_results(folder: Path) -> Non
 
 LIMITED = """
 import json, resource, sys
-from splinecli.cli import main
+from splinecli.cli.main import main
 command = ["infer", "a", "--method", "ls", "-q", "--overwrite"]
 most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
 codes = [main(command)]  # imports what it needs
@@ -156,6 +161,7 @@ print(json.dumps(codes))
 def test_a_limit_on_open_files(folder: Path) -> None:
     """The command is refused with one message as long as the limit is too low, and the next start finds results."""
     done = subprocess.run([sys.executable, "-c", LIMITED], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     first, *codes = json.loads(done.stdout)
     limited, unlimited = codes[::2], codes[1::2]
     assert first == limited[-1] == 0

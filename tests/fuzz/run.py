@@ -82,7 +82,7 @@ def _run_here(folder: Path, command: str, out: Path, err: Path) -> None:
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
-        from splinecli.cli import main
+        from splinecli.cli.main import main
 
         code = main(shlex.split(command))
         sys.stdout.flush()
@@ -93,7 +93,7 @@ def _run_here(folder: Path, command: str, out: Path, err: Path) -> None:
 
 def run_warm(folder: Path, command: str) -> int:
     """Run a command in this process, so that what it imports is there for all forked processes."""
-    from splinecli.cli import main
+    from splinecli.cli.main import main
 
     here = Path.cwd()
     os.chdir(folder)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from splinecli.errors import ModelError
 from splinecli.networks import weights
@@ -92,6 +95,56 @@ def test_a_configuration_that_cannot_be(random_network: Make, tmp_path: Path, co
     write_like_splinecli(tmp_path / "odd.safetensors", network, tensors, config=config)
     with pytest.raises(ModelError):
         load_weights(tmp_path / "odd.safetensors")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"width": 4096, "head_width": 4096, "map_size": 128},
+        {"width": 4096, "li_blocks": 64, "ne_blocks": 64},
+        {"set_width": 4096, "set_layers": 64},
+        {"li_blocks": 65},
+    ],
+)
+def test_a_configuration_far_larger_than_the_tensors(
+    random_network: Make, tmp_path: Path, settings: dict[str, int]
+) -> None:
+    """It is refused without making its tensors, which would take gigabytes."""
+    network, path = random_network(), tmp_path / "a.safetensors"
+    config = json.dumps({**network.config.to_dict(), **settings})
+    write_like_splinecli(path, network, dict(network.state_dict()), config=config)
+    made: list[int] = []
+    with TensorsMade(made), pytest.raises(ModelError, match=r"do not fit the configuration|from 1 to 64"):
+        load_weights(path)
+    assert max(made, default=0) < 1_000_000
+
+
+class TensorsMade(TorchFunctionMode):
+    """Notes the elements of all tensors that functions of PyTorch return, but for those without memory."""
+
+    def __init__(self, made: list[int]) -> None:
+        super().__init__()
+        self.made = made
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, Tensor) and not result.is_meta:
+            self.made.append(result.numel())
+        return result
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
+def test_a_pipe_is_no_weight_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.safetensors")
+    with pytest.raises(ModelError, match="is not a file"):
+        load_weights(tmp_path / "pipe.safetensors")
+
+
+def test_a_weight_file_of_gigabytes(saved: Path) -> None:
+    with saved.open("ab") as file:
+        file.truncate(3 << 30)
+    with pytest.raises(ModelError, match="found 3221 MB, expected at most 500"):
+        load_weights(saved)
 
 
 def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:

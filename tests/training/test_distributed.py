@@ -151,7 +151,7 @@ def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Pat
 
 FAILING = """
 import os, signal
-from splinecli.cli.main import run
+from splinecli.__main__ import run
 from splinecli.training import loop, tasks
 from splinecli.training.run_log import RunLog
 loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, tasks.VALIDATION_PIXELS = 0.05, 5, 16

@@ -36,6 +36,8 @@ def find_mode(path: Path) -> int | None:
         return None
     except OSError as error:
         raise _unreadable(path, error.strerror) from None
+    except ValueError:
+        raise _unreadable(path, "a zero byte in its name") from None
 
 
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:

@@ -1,5 +1,1 @@
-"""The command line: the only place with typer, rich, printing and exit codes."""
-
-from splinecli.cli.main import main
-
-__all__ = ["main"]
+"""The command line: the only place with typer, rich, printing and exit codes. It begins in main.py."""

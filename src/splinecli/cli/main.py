@@ -17,7 +17,7 @@ from splinecli.cli.app import app
 from splinecli.cli.closed_pipes import UntilClosed
 from splinecli.cli.console import print_lines
 from splinecli.cli.failures import explain, is_defect
-from splinecli.cli.signals import INTERRUPTED, end_on_sigterm, ignore_signals
+from splinecli.cli.signals import INTERRUPTED
 from splinecli.errors import printable
 
 
@@ -74,7 +74,10 @@ def _apart(stream: TextIO) -> TextIO:
     if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != 2:
         return stream
     stream.flush()
-    own = os.fdopen(os.dup(2), "wb", buffering=0)
+    try:
+        own = os.fdopen(os.dup(2), "wb", buffering=0)
+    except OSError:  # a limit on open files; the command reports it
+        return stream
     return io.TextIOWrapper(own, stream.encoding, stream.errors, line_buffering=True, write_through=True)
 
 
@@ -86,20 +89,3 @@ def _let_threads_sleep() -> None:
     """
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-
-def run() -> None:
-    """Run the console script. SIGTERM is treated like Ctrl-C."""
-    try:
-        end_on_sigterm()
-        code = main()
-    except KeyboardInterrupt:  # outside of the command
-        code = fail("interrupted.", INTERRUPTED)
-    ignore_signals()
-    if "TORCHELASTIC_RUN_ID" in os.environ:
-        # PyTorch's communication threads sometimes abort a process of torchrun after its work is done, and torchrun
-        # counts that as a failure. os._exit does not wait for these threads.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
 from typing import Any, NoReturn
 
 INTERRUPTED = 130
@@ -36,6 +37,13 @@ def ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
+def report_interruption() -> int:
+    """Print that the process was interrupted, without Python's streams, and return the exit code."""
+    with suppress(OSError):  # stderr is closed
+        os.write(2, b"splinecli: interrupted.\n")
+    return INTERRUPTED
+
+
 def _interrupt(number: int, frame: Any) -> NoReturn:
     signal.signal(number, signal.SIG_IGN)
     raise KeyboardInterrupt
@@ -46,5 +54,4 @@ def _watch(reader: int) -> None:
     while os.read(reader, 1) != bytes([signal.SIGTERM]):
         pass
     time.sleep(GRACE_SECONDS)
-    os.write(2, b"splinecli: interrupted.\n")
-    os._exit(INTERRUPTED)
+    os._exit(report_interruption())

@@ -89,7 +89,7 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 
 def _as_text_cell(value: Any) -> Any:
     """Return a value as a cell that no spreadsheet takes for a formula: an apostrophe marks it as text."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+    return f"'{value}" if isinstance(value, str) and value.lstrip(" \n").startswith(_FORMULA) else value
 
 
 def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:

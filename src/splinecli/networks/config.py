@@ -22,6 +22,11 @@ _CHOICES = {
 _LEAST = {"set_width": 0}
 """Smallest values of settings that may be below 1."""
 
+_MOST = {"li_blocks": 64, "ne_blocks": 64, "set_layers": 64}
+"""Largest values of settings that count layers. Each layer is an object in memory, whatever its size."""
+
+_MOST_OTHERS = 4096
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -83,11 +88,11 @@ class NetworkConfig:
             elif (
                 not isinstance(value, int)
                 or isinstance(value, bool)
-                or not _LEAST.get(name, 1) <= value <= 4096
+                or not _LEAST.get(name, 1) <= value <= _MOST.get(name, _MOST_OTHERS)
             ):
                 raise ModelError(
-                    f"network setting {name!r} is {value!r};"
-                    f" expected a whole number from {_LEAST.get(name, 1)} to 4096"
+                    f"network setting {name!r} is {value!r}; expected a whole number"
+                    f" from {_LEAST.get(name, 1)} to {_MOST.get(name, _MOST_OTHERS)}"
                 )
         config = cls(**values, fits=fits)
         # Both sizes halve the map twice. An instance norm needs more than one cell after that.

@@ -21,6 +21,7 @@ from splinecli.networks.spline_net import SplineNet
 
 FORMAT = "splinecli-weights-1"
 _LENGTH_BYTES = 8  # of the number at the start of a safetensors file, the length of its header
+_LONGEST = 500_000_000  # bytes of a file; a checkpoint of the paper's networks has 170 MB
 SHIPPED = resources.files("splinecli") / "assets"
 
 
@@ -45,7 +46,7 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors):
         tensor = tensors[name]
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
-        digest.update(tensor.numpy().tobytes())
+        digest.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
 
 
@@ -91,8 +92,16 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
     try:
         if path.is_dir():
             raise ModelError("is a folder", path=path, hint=hint)
+        if path.exists() and not path.is_file():
+            raise ModelError("is not a file", path=path, hint=hint)
         if not path.is_file():
             raise ModelError("no such file", path=path, hint=hint)
+        if path.stat().st_size > _LONGEST:
+            raise ModelError(
+                f"found {path.stat().st_size / 1e6:.0f} MB, expected at most {_LONGEST / 1e6:.0f}",
+                path=path,
+                hint=hint,
+            )
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             found = metadata.get("format", "none")
@@ -141,7 +150,10 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
     tensors, metadata = read_tensors(path, FORMAT, hint)
-    network = SplineNet(NetworkConfig.from_dict(read_json_entry(metadata, "config", path)))
+    config = NetworkConfig.from_dict(read_json_entry(metadata, "config", path))
+    with torch.device("meta"):  # without memory: the configuration may ask for any size
+        load_strictly(SplineNet(config), {key: tensor.to("meta") for key, tensor in tensors.items()}, path)
+    network = SplineNet(config)
     load_strictly(network, tensors, path)
     for key, tensor in tensors.items():
         if not torch.isfinite(tensor).all():

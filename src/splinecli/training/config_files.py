@@ -117,6 +117,8 @@ def configure(
         TrainingConfig.from_dict(values)
     except ModelError as error:
         raise ModelError(error.problem, path=file, hint=error.hint) from error
+    except RecursionError:
+        raise ModelError("is nested too deeply", path=file) from None
     for change in changes:
         values = _merge(values, change)
     return _with_absolute_paths(TrainingConfig.from_dict(values))

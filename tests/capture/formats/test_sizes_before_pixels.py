@@ -20,6 +20,7 @@ from scipy.io import savemat
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.capture import open_capture
 from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.header import is_display_encoded, stated_white_level
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, limit_pixels
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
@@ -82,6 +83,17 @@ def write_tiff(path: Path, height: int, width: int, strip: bytes) -> None:
     start = 8 + 2 + 12 * len(tags) + 4
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, start if tag == 273 else value) for tag, value in tags)
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + strip)
+
+
+def write_tile(path: Path, side: int) -> None:
+    """A small TIFF with one compressed tile of zeros, far larger than the picture."""
+    packer = zlib.compressobj(1)
+    tile = b"".join(packer.compress(bytes(side)) for _ in range(side)) + packer.flush()
+    tags = [(256, 18), (257, 16), (258, 8), (259, 8), (262, 1), (277, 1), (322, side), (323, side), (324, 0)]
+    tags.append((325, len(tile)))
+    start = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, start if tag == 324 else value) for tag, value in tags)
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + tile)
 
 
 def write_mat(path: Path, shape: tuple[int, int, int], n_zeros: int) -> None:
@@ -184,6 +196,45 @@ def test_a_capture_larger_than_the_memory_is_not_decoded(
 def test_a_tiff_whose_strip_expands_beyond_its_pixels(tmp_path: Path) -> None:
     write_tiff(tmp_path / "a.tif", *SMALL, zlib.compress(bytes(1 << 28), 1))
     refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
+
+
+def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
+    write_tile(tmp_path / "small.tif", 128)
+    assert decode_image(tmp_path / "small.tif").shape == (*SMALL, 1)
+    write_tile(tmp_path / "a.tif", 21_000)
+    refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
+
+
+def test_a_tiff_with_a_tag_of_gigabytes(tmp_path: Path) -> None:
+    write_tiff(tmp_path / "a.tif", *SMALL, zlib.compress(bytes(16 * 18)))
+    assert decode_image(tmp_path / "a.tif").shape == (*SMALL, 1)
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    content[8 + 2 : 8 + 2 + 12] = struct.pack("<HHII", 254, 2, 1 << 31, 200)
+    (tmp_path / "a.tif").write_bytes(content)
+    with (tmp_path / "a.tif").open("ab") as file:
+        file.truncate(3 << 30)
+    refused(lambda: read_mask(tmp_path / "a.tif"), "the TIFF is damaged")
+
+
+def test_headers_without_end(tmp_path: Path) -> None:
+    """Each would take seconds to minutes to walk through. The steps that are read are counted in place of time."""
+    jpeg, png, mat = (tmp_path / name for name in ("a.jpg", "a.png", "a.mat"))
+    jpeg.write_bytes(b"\xff\xd8" + b"\xff" * 2_000_000)
+    refused(lambda: decode_image(jpeg), "the JPEG is truncated")
+    jpeg.write_bytes(b"\xff\xd8" + b"\xff\xe1\0\2" * 2_000_000)
+    refused(lambda: decode_image(jpeg), "the JPEG is truncated")
+    plain = cv2.imencode(".png", np.zeros(SMALL, np.uint8))[1].tobytes()
+    png.write_bytes(plain[:33] + chunk(b"tEXt", b"") * 1_000_000 + plain[33:])
+    assert stated_white_level(png) is None
+    refused(lambda: decode_image(png), "the PNG is truncated")
+    png.write_bytes(plain[:33])
+    with png.open("ab") as file:
+        file.truncate(3 << 30)
+    assert not is_display_encoded(png)
+    mat.write_bytes(bytes(126) + b"IM")
+    with mat.open("ab") as file:
+        file.truncate(3 << 30)
+    refused(lambda: ground_truth(mat), "the MATLAB file is damaged")
 
 
 def test_arrays_too_large_to_read(tmp_path: Path) -> None:

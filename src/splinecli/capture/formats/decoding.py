@@ -187,10 +187,16 @@ def _rgb(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 
 
+_MOST_SMALL_CHUNKS, _USUAL_CHUNK = 10_000, 1024
+"""A PNG has no more chunks than these, and one for each so many bytes. Writers make chunks of 8 kB and more."""
+
+
 def _check_png(data: bytes, path: Path) -> None:
     """Raise InputError unless all chunks up to IEND are complete and have the right checksum."""
     position, view = len(_PNG), memoryview(data)
-    while position + 12 <= len(data):
+    for _ in range(_MOST_SMALL_CHUNKS + len(data) // _USUAL_CHUNK):
+        if position + 12 > len(data):
+            break
         length = int.from_bytes(data[position : position + 4], "big")
         body, end = position + 4, position + 12 + length
         if end > len(data):

@@ -10,6 +10,9 @@ from splinecli.errors import InputError
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_MOST_PARTS = 10_000
+"""Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
+
 _MAX_SAMPLE_VALUE, _WHITE_LEVEL = 281, 50717  # tags of TIFF and DNG
 
 
@@ -47,7 +50,9 @@ def _png_size(file: BinaryIO) -> tuple[tuple[int, int, int], int] | None:
 def _jpeg_size(file: BinaryIO) -> tuple[tuple[int, int, int], int] | None:
     """Return the size in the header of a JPEG's frame, which stands behind segments of any length."""
     file.seek(2)
-    while len(start := file.read(2)) == 2 and start[0] == 0xFF:
+    for _ in range(_MOST_PARTS):
+        if len(start := file.read(2)) < 2 or start[0] != 0xFF:
+            return None
         if start[1] == 0xFF:  # fill
             file.seek(-1, 1)
             continue
@@ -104,7 +109,9 @@ def stated_white_level(path: Path) -> int | None:
 
 def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
     """Yield name and content of the chunks before a PNG's pixels, from a file positioned after the signature."""
-    while len(header := file.read(8)) == 8 and header[4:] not in (b"IDAT", b"IEND"):
+    for _ in range(_MOST_PARTS):
+        if len(header := file.read(8)) < 8 or header[4:] in (b"IDAT", b"IEND"):
+            return
         length = int.from_bytes(header[:4], "big")
         # Those of interest are short; others, such as profiles, may be long.
         content = file.read(min(length, 16))

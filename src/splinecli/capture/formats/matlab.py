@@ -22,6 +22,7 @@ _COMPRESSED, _MATRIX = 15, 14  # types of elements
 _ITEM_BYTES = 16  # of a complex number, the largest
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
+_MOST_ELEMENTS = 10_000
 _CHUNK = 1 << 20
 
 Order = Literal["little", "big"]
@@ -76,8 +77,10 @@ def _choose(variables: list[_Variable], path: Path) -> _Variable:
 
 
 def _variables(file: BinaryIO, order: Order) -> Iterator[_Variable]:
-    """Yield the variables of a file that is positioned behind its header."""
-    while len(tag := file.read(_TAG_BYTES)) == _TAG_BYTES:
+    """Yield the variables of a file that is positioned behind its header. Raises ValueError for too many elements."""
+    for _ in range(_MOST_ELEMENTS):
+        if len(tag := file.read(_TAG_BYTES)) < _TAG_BYTES:
+            return
         kind, length = _integers(tag, order)
         start = file.tell()
         content = file.read(min(length, _START_BYTES))
@@ -86,6 +89,7 @@ def _variables(file: BinaryIO, order: Order) -> Iterator[_Variable]:
         if kind in (_COMPRESSED, _MATRIX):
             yield _Variable(*_name_and_shape(content, order), start, length, kind == _COMPRESSED)
         file.seek(start + length)
+    raise ValueError("the file has too many elements")
 
 
 def _name_and_shape(content: bytes, order: Order) -> tuple[str, tuple[int, ...]]:

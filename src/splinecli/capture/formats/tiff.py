@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,11 @@ from splinecli.errors import InputError
 from splinecli.memory import is_out_of_memory
 
 _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
+_LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture
+
+_LONGEST_TAG = 1 << 24  # values, such as the bytes of a colour profile
+_MOST_PARTS = 1 << 18  # strips or tiles
+_PLACES_OF_PARTS = (273, 279, 324, 325)  # tags with one value for each strip or tile
 
 # Values of TIFF's PhotometricInterpretation, the meaning of a sample.
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
@@ -72,6 +77,7 @@ def _first_page(path: Path) -> Iterator[Any]:
 
     with _quiet_tifffile():
         try:
+            _check_tags(path)
             with tifffile.TiffFile(path) as file:
                 yield file.pages.first
         except InputError:
@@ -80,6 +86,23 @@ def _first_page(path: Path) -> Iterator[Any]:
             if is_out_of_memory(error):
                 raise
             raise _damaged(path) from None
+
+
+def _check_tags(path: Path) -> None:
+    """Raise InputError for a tag with millions of values, because tifffile reads tags as a whole."""
+    with path.open("rb") as file:
+        start = file.read(16)
+        order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
+        big = 43 in start[2:4]  # BigTIFF has wider numbers
+        number, length, entry = (8, 8, 20) if big else (4, 2, 12)
+        file.seek(int.from_bytes(start[8:16] if big else start[4:8], order))
+        count = int.from_bytes(file.read(length), order)
+        entries = file.read(min(count, 1 << 16) * entry)
+    for place in range(0, len(entries), entry):
+        tag = int.from_bytes(entries[place : place + 2], order)
+        values = int.from_bytes(entries[place + 4 : place + 4 + number], order)
+        if values > (_MOST_PARTS if tag in _PLACES_OF_PARTS else _LONGEST_TAG):
+            raise _damaged(path)
 
 
 def _damaged(path: Path) -> InputError:
@@ -104,11 +127,15 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
 def _check_complete(page: Any, path: Path) -> None:
     """Raise InputError where a part of the pixels lies beyond the end of the file, or is longer than its pixels.
 
-    A compressed part that is longer than its pixels would be may expand to a thousand times their size.
+    A compressed part that is longer than its pixels would be may expand to a thousand times their size. So may a tile
+    that is far larger than the picture.
     """
     size = path.stat().st_size
-    longest = 2 * math.prod(page.chunks) * page.dtype.itemsize + _LONGEST_EMPTY_PART
-    if any(count > longest for count in page.databytecounts):
+    expanded = math.prod(page.chunks) * page.dtype.itemsize
+    longest = 2 * expanded + _LONGEST_EMPTY_PART
+    if expanded > 2 * math.prod(page.shape) * page.dtype.itemsize + _LARGEST_EMPTY_PART or any(
+        count > longest for count in page.databytecounts
+    ):
         raise _damaged(path)
     if any(
         count == 0 or offset + count > size

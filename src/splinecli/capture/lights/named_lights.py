@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import reprlib
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,7 +201,7 @@ def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> 
     values = light.get(key)
     good = isinstance(values, list) and len(values) == 3
     if not good or not all(
-        isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
         for value in values or ()
     ):
         raise InputError(
