@@ -51,7 +51,8 @@ def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
 
     No light can be in a cell outside the disc. Its direction is a zero vector.
     """
-    centre = (torch.arange(size, dtype=torch.float64) + 0.5) * (2 / size) - 1
+    # The result is cached, so it must not depend on a default device.
+    centre = (torch.arange(size, dtype=torch.float64, device="cpu") + 0.5) * (2 / size) - 1
     y, x = torch.meshgrid(-centre, centre, indexing="ij")
     z_squared = 1 - x**2 - y**2
     inside = z_squared > 0

@@ -218,6 +218,8 @@ def test_no_changed_byte_goes_unnoticed(make_set: MakeSet, array: str, entry: st
             r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)",
         ),
         ("n_lights", 29, r"observations\.npy: .* expected \(40, 29\)"),
+        ("name", 2.5, r"manifest\.json: the name, scene or source of an entry is no text"),
+        ("name", "../b", r"manifest\.json: '\.\./b' is not the name of a folder"),
         ("sha256", {}, r"manifest\.json: an entry is incomplete \(a checksum is missing\)"),
         ("sha256", {"observations": "0" * 64}, r"manifest\.json: an entry is incomplete"),
         ("sha256", None, r"manifest\.json: an entry is incomplete"),

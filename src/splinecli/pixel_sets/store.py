@@ -134,6 +134,11 @@ def parse_entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
         raise InputError(f"an entry is incomplete ({error})", path=folder / MANIFEST) from error
     if not complete:
         raise InputError("an entry is incomplete (a checksum is missing)", path=folder / MANIFEST)
+    for entry in entries:
+        if not all(isinstance(text, str) for text in (entry.name, entry.scene, entry.source)):
+            raise InputError("the name, scene or source of an entry is no text", path=folder / MANIFEST)
+        if not entry.name or "\0" in entry.name or Path(entry.name).name != entry.name:
+            raise InputError(f"{entry.name!r} is not the name of a folder", path=folder / MANIFEST)
     return entries
 
 
