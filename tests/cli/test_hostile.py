@@ -241,7 +241,8 @@ def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
 def test_a_signal_while_the_program_starts(capture, number):
     """It comes when the first module of the command line is imported, before PyTorch and the rest."""
     script = (
-        "import os, sys\n"
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it\n"
         "class Finder:\n"
         "    def find_spec(self, name, *_):\n"
         f"        if name == 'splinecli.cli.main': os.kill(os.getpid(), {int(number)})\n"
