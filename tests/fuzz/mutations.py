@@ -222,7 +222,8 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
 def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:
     """Put something else in the place of a file: a folder, a pipe, a device, another file, or nothing."""
     kind = rng.choice(("folder", "pipe", "loop", "device", "other file", "nothing", "huge", "unreadable"))
-    other = rng.choice(others).read_bytes()
+    existing = [file for file in others if file.is_file()]
+    other = rng.choice(existing or [path]).read_bytes()
     path.unlink()
     if kind == "folder":
         path.mkdir()

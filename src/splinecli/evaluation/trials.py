@@ -13,6 +13,7 @@ from typing import Any
 from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
 from splinecli.capture.stamp import digest
+from splinecli.errors import OutputError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.files import parse_json, refusals_as_output_errors
 from splinecli.methods import Estimator
@@ -113,6 +114,8 @@ class TrialStore:
         with refusals_as_output_errors(path):
             if fresh:
                 path.unlink(missing_ok=True)
+            if path.exists() and not path.is_file():  # a pipe would wait for its other end
+                raise OutputError("is not a file", path=path, hint="Remove it, or choose another -o")
             lines = _lines(path) if path.is_file() else ()
             line = "\n"
             for line in lines:
