@@ -102,10 +102,15 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+def is_special(path: Path) -> bool:
+    """Return whether there is something else than a file, such as a folder, a pipe or a device. It might never end."""
+    return path.exists() and not path.is_file()
+
+
 def read_json(path: Path) -> Any:
     """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and for what is no file."""
-    if not path.is_file() and path.exists():
-        raise ValueError("it is no file")  # a device might never end
+    if is_special(path):
+        raise ValueError("it is no file")
     if path.stat().st_size > _MOST_JSON:
         raise ValueError(f"it has more than {_MOST_JSON / 1e6:.0f} MB")
     return parse_json(path.read_text("utf-8"))

@@ -15,7 +15,7 @@ from splinecli.capture.lights.draws import Draw
 from splinecli.capture.stamp import digest
 from splinecli.errors import OutputError
 from splinecli.evaluation.protocol import Protocol
-from splinecli.files import parse_json, refusals_as_output_errors
+from splinecli.files import is_special, parse_json, refusals_as_output_errors
 from splinecli.methods import Estimator
 
 _LONGEST_LINE = 1 << 16  # characters
@@ -114,7 +114,7 @@ class TrialStore:
         with refusals_as_output_errors(path):
             if fresh:
                 path.unlink(missing_ok=True)
-            if path.exists() and not path.is_file():  # a pipe would wait for its other end
+            if is_special(path):
                 raise OutputError("is not a file", path=path, hint="Remove it, or choose another -o")
             lines = _lines(path) if path.is_file() else ()
             line = "\n"

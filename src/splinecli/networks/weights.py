@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from splinecli.errors import ModelError
-from splinecli.files import file_sha256, parse_json, write_bytes
+from splinecli.files import file_sha256, is_special, parse_json, write_bytes
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 
@@ -92,7 +92,7 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
     try:
         if path.is_dir():
             raise ModelError("is a folder", path=path, hint=hint)
-        if path.exists() and not path.is_file():
+        if is_special(path):
             raise ModelError("is not a file", path=path, hint=hint)
         if not path.is_file():
             raise ModelError("no such file", path=path, hint=hint)

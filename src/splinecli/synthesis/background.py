@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from splinecli.synthesis.engraved import draw_engraved
+from splinecli.synthesis.random_numbers import draw_number
 
 _MARGIN = 16
 """Most pixels that are added at each side of the object."""
@@ -33,9 +36,7 @@ def add_background(
         The maps have zero for normals that are not known: in darkness, and where the light is uneven.
     """
 
-    def uniform(low: float = 0.0, high: float = 1.0) -> float:
-        return low + (high - low) * float(torch.rand((), generator=generator))
-
+    uniform = partial(draw_number, generator)
     sides = [int(uniform(0, _MARGIN + 1)) for _ in range(4)]
     maps, mask = pad(maps * mask, sides), pad(mask, sides)
     count, (height, width) = len(lights), mask.shape

@@ -13,10 +13,7 @@ from torch import Tensor
 
 from splinecli.observation_map import dot, rotate_about_view_axis
 from splinecli.synthesis.material import Material
-
-
-def _uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-    return torch.rand(*shape, generator=generator, device=generator.device) * (high - low) + low
+from splinecli.synthesis.random_numbers import draw_uniform
 
 
 @dataclass(frozen=True)
@@ -116,28 +113,28 @@ def draw_wall(
     """
     pixels = len(normals)
     spread = torch.randn(pixels, 1, generator=generator, device=generator.device) * math.radians(50)
-    facing_it = _uniform(generator, pixels, 1) < 0.6
+    facing_it = draw_uniform(generator, pixels, 1) < 0.6
     own = torch.atan2(normals[:, 1:2], normals[:, 0:1])
-    azimuth = torch.where(facing_it, own + spread, _uniform(generator, pixels, 1, high=2 * math.pi))
-    present = _uniform(generator, pixels, 1) < share
-    height = _uniform(generator, pixels, 1, low=math.radians(8), high=math.radians(75)) * present
-    half_width = _uniform(generator, pixels, 1, low=math.radians(15), high=math.radians(88))
-    lean = _uniform(generator, pixels, 1, high=math.radians(60))
+    azimuth = torch.where(facing_it, own + spread, draw_uniform(generator, pixels, 1, high=2 * math.pi))
+    present = draw_uniform(generator, pixels, 1) < share
+    height = draw_uniform(generator, pixels, 1, low=math.radians(8), high=math.radians(75)) * present
+    half_width = draw_uniform(generator, pixels, 1, low=math.radians(15), high=math.radians(88))
+    lean = draw_uniform(generator, pixels, 1, high=math.radians(60))
     toward = torch.cat((azimuth.cos(), azimuth.sin(), torch.zeros_like(azimuth)), dim=1)
     up = torch.tensor((0.0, 0.0, 1.0), device=normals.device)
-    same = _uniform(generator, pixels, 1) < 0.5
-    reflectance = (1 - height.cos()) * _uniform(generator, pixels, 1, low=0.5, high=2.0)
-    reflectance = reflectance * _uniform(generator, pixels, 1)
-    albedo = _uniform(generator, pixels, 1, low=0.05, high=0.9)
+    same = draw_uniform(generator, pixels, 1) < 0.5
+    reflectance = (1 - height.cos()) * draw_uniform(generator, pixels, 1, low=0.5, high=2.0)
+    reflectance = reflectance * draw_uniform(generator, pixels, 1)
+    albedo = draw_uniform(generator, pixels, 1, low=0.05, high=0.9)
     reflectance = torch.where(same, reflectance, reflectance * albedo)
-    elevation = height * _uniform(generator, pixels, 1, low=0.2, high=0.9)
+    elevation = height * draw_uniform(generator, pixels, 1, low=0.2, high=0.9)
     elevation = torch.minimum(elevation, math.radians(85) - lean)
     return Wall(
         azimuth=toward,
         # Without shadows the wall lies below every light but still reflects.
         tan_height=height.tan() if shadows else torch.zeros_like(height),
         tan_half_width=half_width.tan(),
-        softness=_uniform(generator, pixels, 1, low=0.01, high=0.06),
+        softness=draw_uniform(generator, pixels, 1, low=0.01, high=0.06),
         facing=-toward * lean.cos() + up * lean.sin(),
         reflectance=reflectance if interreflections else torch.zeros_like(reflectance),
         towards=toward * elevation.cos() + up * elevation.sin(),
@@ -147,5 +144,5 @@ def draw_wall(
 
 def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tensor:
     """Draw ambient light (P, 1), to be scaled by the albedo: 10^U(-3.5, -1.3) for a share of the pixels, else 0."""
-    present = _uniform(generator, pixels, 1) < share
-    return 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present
+    present = draw_uniform(generator, pixels, 1) < share
+    return 10 ** draw_uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present

@@ -6,11 +6,13 @@ Rendered scenes have few bends of a pixel's size. These pieces have, but no cast
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splinecli.synthesis.random_numbers import draw_number
 from splinecli.synthesis.scenes import CLASSES, draw_class
 
 
@@ -30,54 +32,9 @@ def draw_engraved(
         round_share: share of half ellipsoids.
     """
 
-    def uniform(low: float = 0.0, high: float = 1.0) -> float:
-        return low + (high - low) * float(torch.rand((), generator=generator))
-
-    rows, columns = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
-    places = torch.stack((columns, -rows), dim=-1).view(-1, 2)  # y up
-
-    def along() -> tuple[Tensor, Tensor]:
-        """Return a random direction (2,) and the places along it (P,)."""
-        angle = uniform(0, 2 * math.pi)
-        direction = torch.tensor((math.cos(angle), math.sin(angle)))
-        return direction, places @ direction
-
-    mask = torch.ones(size * size, dtype=torch.bool)
-    if uniform() < round_share:
-        direction, _ = along()
-        across = torch.stack((direction, torch.tensor((-direction[1], direction[0]))))
-        middle = places - places.mean(dim=0)
-        axes = torch.tensor((uniform(0.3, 0.49), uniform(0.3, 0.49))) * size
-        at = middle @ across.T / axes
-        mask = at.square().sum(1) < 1
-        height = (1 - at.square().sum(1)).clamp(min=0).sqrt()[:, None]
-        base = torch.cat((uniform(0.3, 1.5) * (at / axes * axes.mean()) @ across, height), dim=1)
-    else:
-        slopes = uniform(0, 0.7) * along()[0].expand(size * size, 2)
-        for _ in range(3):
-            direction, place = along()
-            wave = (2 * math.pi * (place / (uniform(0.3, 2) * size) + uniform())).sin()
-            slopes = slopes + uniform(0, 0.3) * wave[:, None] * direction
-        base = torch.cat((-slopes, torch.ones(size * size, 1)), dim=1)
-    base = torch.nn.functional.normalize(base, dim=1)
-    steepness = uniform(0.05, 0.6)
-    kind = int(3 * uniform())
-    if kind == 0:
-        direction, place = along()
-        bend = _blurred(torch.randn(1, size, size, generator=generator), 12).view(-1)
-        place = place + (uniform() < 0.5) * uniform(0, 12) * bend / bend.std()
-        number = (place / uniform(1, 6) + uniform(0, 2)).floor().long()
-        number = number - number.min()
-        side = 2.0 * (number % 2) - 1
-        if uniform() < 0.5:
-            side = torch.randn(int(number.max()) + 1, generator=generator)[number]
-        detail = steepness * side[:, None] * direction
-    elif kind == 1:
-        count = int((size / uniform(3, 20)) ** 2) + 1
-        detail = (steepness * torch.randn(count, 2, generator=generator))[_cells(count, size, generator)]
-    else:
-        grain = _blurred(torch.randn(2, size, size, generator=generator), uniform(0.4, 1.5))
-        detail = steepness / 3 * (grain / grain.std()).view(2, -1).T
+    uniform = partial(draw_number, generator)
+    base, mask = _draw_base(size, round_share, generator)
+    detail = _draw_detail(size, generator)
     normals = base - base[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
     normals = torch.nn.functional.normalize(normals, dim=1)
     patches = int(300 ** uniform())
@@ -87,6 +44,63 @@ def draw_engraved(
     normals = normals[mask]
     cosines = (normals @ lights.T).clamp(min=0)
     return normals, material.shade(cosines, normals[:, 2:], lights[:, 2]), mask.view(size, size)
+
+
+def _draw_base(size: int, round_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw a half ellipsoid or a plate; return its unit normals (size^2, 3) and its mask (size^2,)."""
+    uniform = partial(draw_number, generator)
+    places = _places(size)
+    if uniform() < round_share:
+        direction = _draw_direction(generator)
+        across = torch.stack((direction, torch.tensor((-direction[1], direction[0]))))
+        middle = places - places.mean(dim=0)
+        axes = torch.tensor((uniform(0.3, 0.49), uniform(0.3, 0.49))) * size
+        at = middle @ across.T / axes
+        radius = at.square().sum(1)
+        height = (1 - radius).clamp(min=0).sqrt()[:, None]
+        base = torch.cat((uniform(0.3, 1.5) * (at / axes * axes.mean()) @ across, height), dim=1)
+        return torch.nn.functional.normalize(base, dim=1), radius < 1
+    slopes = uniform(0, 0.7) * _draw_direction(generator).expand(size * size, 2)
+    for _ in range(3):
+        direction = _draw_direction(generator)
+        wave = (2 * math.pi * (places @ direction / (uniform(0.3, 2) * size) + uniform())).sin()
+        slopes = slopes + uniform(0, 0.3) * wave[:, None] * direction
+    base = torch.cat((-slopes, torch.ones(size * size, 1)), dim=1)
+    return torch.nn.functional.normalize(base, dim=1), torch.ones(size * size, dtype=torch.bool)
+
+
+def _draw_detail(size: int, generator: torch.Generator) -> Tensor:
+    """Draw the slopes (size^2, 2) of grooves, facets or a texture."""
+    uniform = partial(draw_number, generator)
+    steepness = uniform(0.05, 0.6)
+    kind = int(3 * uniform())
+    if kind == 0:
+        direction = _draw_direction(generator)
+        bend = _blurred(torch.randn(1, size, size, generator=generator), 12).view(-1)
+        place = _places(size) @ direction + (uniform() < 0.5) * uniform(0, 12) * bend / bend.std()
+        number = (place / uniform(1, 6) + uniform(0, 2)).floor().long()
+        number = number - number.min()
+        side = 2.0 * (number % 2) - 1
+        if uniform() < 0.5:
+            side = torch.randn(int(number.max()) + 1, generator=generator)[number]
+        return steepness * side[:, None] * direction
+    if kind == 1:
+        count = int((size / uniform(3, 20)) ** 2) + 1
+        return (steepness * torch.randn(count, 2, generator=generator))[_cells(count, size, generator)]
+    grain = _blurred(torch.randn(2, size, size, generator=generator), uniform(0.4, 1.5))
+    return steepness / 3 * (grain / grain.std()).view(2, -1).T
+
+
+def _places(size: int) -> Tensor:
+    """Return the places (size^2, 2) of the pixels, y up."""
+    rows, columns = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
+    return torch.stack((columns, -rows), dim=-1).view(-1, 2)
+
+
+def _draw_direction(generator: torch.Generator) -> Tensor:
+    """Draw a unit vector (2,)."""
+    angle = draw_number(generator, 0, 2 * math.pi)
+    return torch.tensor((math.cos(angle), math.sin(angle)))
 
 
 def _cells(count: int, size: int, generator: torch.Generator) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from splinecli.capture.restore.saturation import restore_saturated
+from splinecli.synthesis.random_numbers import draw_uniform
 
 DARK_SHARE = 0.4
 """Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""
@@ -20,18 +21,14 @@ BITS = (10, 12, 14, 16)
 """Depths of the pixels that do not have 8 bits, equally often."""
 
 
-def _uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-    return torch.rand(*shape, generator=generator, device=generator.device) * (high - low) + low
-
-
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Add Gaussian errors of calibration to the directions (P, F, 3) of a share of the pixels.
 
     Their sigma on either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth exceeds 4.
     """
     pixels = len(directions)
-    sigma = math.radians(8.0) * _uniform(generator, pixels, 1, 1) ** 3
-    sigma = sigma * (_uniform(generator, pixels, 1, 1) < share)
+    sigma = math.radians(8.0) * draw_uniform(generator, pixels, 1, 1) ** 3
+    sigma = sigma * (draw_uniform(generator, pixels, 1, 1) < share)
     moved = directions + sigma * torch.randn(directions.shape, generator=generator, device=directions.device)
     moved = torch.cat((moved[..., :2], moved[..., 2:].clamp(min=0.01)), dim=-1)
     return torch.nn.functional.normalize(moved, dim=-1)
@@ -39,8 +36,8 @@ def disturb_light_directions(directions: Tensor, share: float, generator: torch.
 
 def disturb_light_intensities(observations: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Multiply observations (P, F) by Gaussian errors of intensity, sigma U(0, 5 %), for a share of the pixels."""
-    sigma = _uniform(generator, len(observations), 1, high=0.05) * (
-        _uniform(generator, len(observations), 1) < share
+    sigma = draw_uniform(generator, len(observations), 1, high=0.05) * (
+        draw_uniform(generator, len(observations), 1) < share
     )
     factor = 1 + sigma * torch.randn(observations.shape, generator=generator, device=observations.device)
     return observations * factor.clamp(min=0)
@@ -52,8 +49,8 @@ def draw_light_intensities(pixels: int, lights: int, share: float, generator: to
     A capture is exposed as its lamps are, and divided by their intensities afterwards: the observations of a weak lamp
     have coarser steps and more noise.
     """
-    unequal = _uniform(generator, pixels, 1) < share
-    intensities = 2 ** _uniform(generator, pixels, lights, low=-2.0, high=0.0)
+    unequal = draw_uniform(generator, pixels, 1) < share
+    intensities = 2 ** draw_uniform(generator, pixels, lights, low=-2.0, high=0.0)
     return torch.where(unequal, intensities / intensities.amax(dim=1, keepdim=True), 1.0)
 
 
@@ -64,11 +61,11 @@ def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Gen
     For `saturated_share` of the pixels it lies at U(1, 3), to be clipped.
     """
     pixels = len(radiance)
-    dark = _uniform(generator, pixels, 1) < DARK_SHARE
-    level = _uniform(generator, pixels, 1)
+    dark = draw_uniform(generator, pixels, 1) < DARK_SHARE
+    level = draw_uniform(generator, pixels, 1)
     level = 10 ** torch.where(dark, 2.0 * level - 2.7, 1.3 * level - 1.3)
-    over = _uniform(generator, pixels, 1, low=1.0, high=3.0)
-    level = torch.where(_uniform(generator, pixels, 1) < saturated_share, over, level)
+    over = draw_uniform(generator, pixels, 1, low=1.0, high=3.0)
+    level = torch.where(draw_uniform(generator, pixels, 1) < saturated_share, over, level)
     return level / radiance.amax(dim=1, keepdim=True).clamp(min=1e-6)
 
 
@@ -78,9 +75,9 @@ def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
     The read noise is at most a thirtieth of a pixel's largest observation: few keep a capture that is darker than that.
     """
     pixels = len(exposed)
-    read = 10 ** _uniform(generator, pixels, 1, low=-4.0, high=-2.5)
+    read = 10 ** draw_uniform(generator, pixels, 1, low=-4.0, high=-2.5)
     read = torch.minimum(read, exposed.amax(dim=1, keepdim=True) / 30)
-    shot = 10 ** _uniform(generator, pixels, 1, low=-3.5, high=-2.0)
+    shot = 10 ** draw_uniform(generator, pixels, 1, low=-3.5, high=-2.0)
     sigma = (read * read + shot * shot * exposed.clamp(min=0)).sqrt()
     noise = torch.randn(exposed.shape, generator=generator, device=exposed.device)
     return (exposed + sigma * noise).clamp(0, 1)
@@ -93,8 +90,8 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
     rounded, and half are cut, as where somebody keeps the high byte of 16.
     """
     pixels = len(exposed)
-    eight = _uniform(generator, pixels, 1) < eight_bit_share
-    kind = _uniform(generator, pixels, 1)
+    eight = draw_uniform(generator, pixels, 1) < eight_bit_share
+    kind = draw_uniform(generator, pixels, 1)
     depth = torch.tensor(BITS, device=exposed.device)[
         torch.randint(len(BITS), (pixels, 1), generator=generator, device=exposed.device)
     ]
@@ -116,7 +113,7 @@ def restore(
         directions: (P, F, 3), unit.
         valid: (P, F) bool; the others are left out.
     """
-    chosen = (_uniform(generator, len(observed), 1) < 0.5)[:, 0] & clipped.any(dim=1)
+    chosen = (draw_uniform(generator, len(observed), 1) < 0.5)[:, 0] & clipped.any(dim=1)
     rows = chosen.nonzero()[:, 0]
     if not len(rows):
         return observed

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from splinecli.synthesis.random_numbers import draw_uniform
+
 
 def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: torch.Generator) -> Tensor:
     """Draw the number of lights of each pixel (P,). Within a draw they differ by at most a fifth.
@@ -15,10 +17,10 @@ def draw_light_counts(pixels: int, low: int, high: int, usual: int, generator: t
     Each draw has a largest number. For half of the draws it is usual - 1 to usual + 2, else it is log-uniform over
     low..high. The pixels have four fifths of that number or more, which saves padding.
     """
-    anywhere = low * ((high + 1) / low) ** _uniform(generator, 1)
-    about = usual - 1 + 4 * _uniform(generator, 1)
-    largest = torch.where(_uniform(generator, 1) < 0.5, about, anywhere).floor().clamp(low, high)
-    return (largest * (1 - 0.2 * _uniform(generator, pixels))).round().long().clamp(low, high)
+    anywhere = low * ((high + 1) / low) ** draw_uniform(generator, 1)
+    about = usual - 1 + 4 * draw_uniform(generator, 1)
+    largest = torch.where(draw_uniform(generator, 1) < 0.5, about, anywhere).floor().clamp(low, high)
+    return (largest * (1 - 0.2 * draw_uniform(generator, pixels))).round().long().clamp(low, high)
 
 
 _LEAST_CONE_DEG, _MOST_CONE_DEG = 20, 90
@@ -35,7 +37,7 @@ def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -
 
 def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
     """Return ranks (P, F) of the lights (P, F, 3) of P pixels, whose lowest are chosen; see choose_in_cone."""
-    uniform = _uniform(generator, *directions.shape[:2])
+    uniform = draw_uniform(generator, *directions.shape[:2])
     half_angle = _uniform_deg(generator, len(directions), 1, low=_LEAST_CONE_DEG, high=_MOST_CONE_DEG)
     z = directions[..., 2]
     # Lights within the cone have a random rank below 1. The others follow, the closest to the axis first.
@@ -69,7 +71,7 @@ def draw_light_directions(
         rows = (kind == number).nonzero()[:, 0]
         if len(rows):
             x[rows], y[rows] = draw_rig(len(rows), lights, generator)
-    x, y = _turn(x, y, 2 * math.pi * _uniform(generator, pixels, 1))
+    x, y = _turn(x, y, 2 * math.pi * draw_uniform(generator, pixels, 1))
     shrink = (0.996 / torch.hypot(x, y).clamp(min=1e-6)).clamp(max=1)
     x, y = x * shrink, y * shrink
     return torch.stack((x, y, (1 - x * x - y * y).clamp(min=0).sqrt()), dim=-1)
@@ -83,17 +85,17 @@ def _draw_ellipse(pixels: int, lights: int, generator: torch.Generator) -> Point
     """
     x, y = _in_disc(pixels, lights, generator)
     major = _uniform_deg(generator, pixels, 1, low=20, high=88).sin()
-    x, y = x * major, y * major * _uniform(generator, pixels, 1, low=0.5)
-    x, y = _turn(x, y, 2 * math.pi * _uniform(generator, pixels, 1))
-    leans = _uniform(generator, pixels, 1) < 0.5
-    return x + leans * _uniform(generator, pixels, 1, high=0.35) * (1 - 0.6 * major), y
+    x, y = x * major, y * major * draw_uniform(generator, pixels, 1, low=0.5)
+    x, y = _turn(x, y, 2 * math.pi * draw_uniform(generator, pixels, 1))
+    leans = draw_uniform(generator, pixels, 1) < 0.5
+    return x + leans * draw_uniform(generator, pixels, 1, high=0.35) * (1 - 0.6 * major), y
 
 
 def _draw_cone(pixels: int, lights: int, generator: torch.Generator) -> Points:
     """Fill a disc of radius sin U(8, 20) degrees. Its centre is at up to 0.5 from the view axis."""
     x, y = _in_disc(pixels, lights, generator)
     radius = _uniform_deg(generator, pixels, 1, low=8, high=20).sin()
-    return x * radius + _uniform(generator, pixels, 1, high=0.5), y * radius
+    return x * radius + draw_uniform(generator, pixels, 1, high=0.5), y * radius
 
 
 def _draw_ring(pixels: int, lights: int, generator: torch.Generator) -> Points:
@@ -102,7 +104,7 @@ def _draw_ring(pixels: int, lights: int, generator: torch.Generator) -> Points:
     Half of the rings are whole, the others arcs of U(120, 360) degrees. The azimuths have a sigma of 10 degrees.
     """
     arc = _uniform_deg(generator, pixels, 1, low=120, high=360)
-    arc = torch.where(_uniform(generator, pixels, 1) < 0.5, 2 * math.pi, arc)
+    arc = torch.where(draw_uniform(generator, pixels, 1) < 0.5, 2 * math.pi, arc)
     azimuth = arc * torch.arange(lights, device=generator.device) / lights
     polar = _uniform_deg(generator, pixels, 1, low=15, high=75)
     return _near(polar, azimuth, lights, generator, polar_sigma_deg=2, azimuth_sigma_deg=10)
@@ -114,11 +116,11 @@ def _draw_line(pixels: int, lights: int, generator: torch.Generator) -> Points:
     They are off the line by a sigma of sin U(1, 10) degrees, so that they lie nearly in one plane.
     """
     x = (
-        _uniform(generator, pixels, lights, low=-1)
+        draw_uniform(generator, pixels, lights, low=-1)
         * _uniform_deg(generator, pixels, 1, low=30, high=85).sin()
     )
     sigma = _uniform_deg(generator, pixels, 1, low=1, high=10).sin()
-    return x, _uniform(generator, pixels, 1, high=0.5) + sigma * _normal(generator, pixels, lights)
+    return x, draw_uniform(generator, pixels, 1, high=0.5) + sigma * _normal(generator, pixels, lights)
 
 
 def _draw_hand_held(pixels: int, lights: int, generator: torch.Generator) -> Points:
@@ -126,10 +128,10 @@ def _draw_hand_held(pixels: int, lights: int, generator: torch.Generator) -> Poi
 
     A cluster has U(1, 5) lights on average. They have a sigma of 6 degrees on either angle.
     """
-    clusters = (lights / _uniform(generator, pixels, 1, low=1, high=5)).clamp(min=1)
+    clusters = (lights / draw_uniform(generator, pixels, 1, low=1, high=5)).clamp(min=1)
     member = torch.arange(lights, device=generator.device).remainder(clusters).long()
     sector = _uniform_deg(generator, pixels, 1, low=90, high=360)
-    azimuth = (_uniform(generator, pixels, lights) * sector).gather(1, member)
+    azimuth = (draw_uniform(generator, pixels, lights) * sector).gather(1, member)
     polar = _uniform_deg(generator, pixels, lights, low=20, high=70).gather(1, member)
     return _near(polar, azimuth, lights, generator, polar_sigma_deg=6, azimuth_sigma_deg=6)
 
@@ -144,8 +146,8 @@ _RIGS = {
 
 
 def _in_disc(pixels: int, lights: int, generator: torch.Generator) -> Points:
-    radius = _uniform(generator, pixels, lights).sqrt()
-    angle = 2 * math.pi * _uniform(generator, pixels, lights)
+    radius = draw_uniform(generator, pixels, lights).sqrt()
+    angle = 2 * math.pi * draw_uniform(generator, pixels, lights)
     return radius * angle.cos(), radius * angle.sin()
 
 
@@ -171,13 +173,9 @@ def _turn(x: Tensor, y: Tensor, angle: Tensor) -> Points:
     return angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y
 
 
-def _uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-    return torch.rand(*shape, generator=generator, device=generator.device) * (high - low) + low
-
-
 def _uniform_deg(generator: torch.Generator, *shape: int, low: float, high: float) -> Tensor:
     """Draw angles in radians, uniform between two angles in degrees."""
-    return torch.deg2rad(_uniform(generator, *shape, low=low, high=high))
+    return torch.deg2rad(draw_uniform(generator, *shape, low=low, high=high))
 
 
 def _normal(generator: torch.Generator, *shape: int) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from splinecli.synthesis.faults import (
     draw_light_intensities,
     quantise,
 )
+from splinecli.synthesis.random_numbers import draw_number
 
 _BRIGHT_SHARE = 1e-3
 """Share of the observations that may be brighter than the one from which the exposure is chosen."""
@@ -44,9 +46,7 @@ def photograph_scene(
         generator: source of all random numbers.
     """
 
-    def uniform(low: float = 0.0, high: float = 1.0) -> float:
-        return low + (high - low) * float(torch.rand((), generator=generator))
-
+    uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
     arriving = radiance * intensities
