@@ -85,6 +85,25 @@ def test_a_failure_keeps_the_earlier_files(tmp_path: Path, monkeypatch: pytest.M
     assert content(tmp_path) == OLD
 
 
+def test_a_message_names_the_file_that_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write_directly(stage: Path) -> None:
+        write(stage, {"b.txt": b"whole", "pictures/1.png": b"half"})
+        fail()
+
+    def write_by_rename(stage: Path) -> None:
+        monkeypatch.setattr("splinecli.files.sync", fail)
+        files.write_bytes(stage / "pictures" / "1.png", b"half")
+
+    for work in (write_directly, write_by_rename):
+        with pytest.raises(OutputError) as caught, new_files(tmp_path, report=REPORT) as stage:
+            work(stage)
+        assert caught.value.path == tmp_path / "pictures" / "1.png"
+        assert not list(tmp_path.iterdir())
+
+
 def test_ctrl_c_between_moves_finishes_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(tmp_path, OLD)
     replace, calls = Path.replace, []

@@ -17,6 +17,9 @@ from splinecli.errors import OutputError
 UNFINISHED = ".splinecli-unfinished"
 """The ending of hidden files and folders that are being written. What a killed process left is removed later."""
 
+DRAFT = f".new{UNFINISHED}"
+"""The hidden folder of new files while they are written; see publishing."""
+
 COMPLETE = ".new.splinecli-complete"
 """A hidden folder of complete new files that are being moved to their places; see publishing."""
 
@@ -124,15 +127,23 @@ def _whole_number(digits: str) -> int:
 
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError inside the context into an OutputError that names the path."""
+    """Turn an OSError inside the context into an OutputError that names the path, or the one that a draft is for."""
     try:
         yield
     except OSError as error:
         # NumPy tells only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
         raise OutputError(
-            f"cannot be written ({reason})", path=path, hint="Choose another place with -o"
+            f"cannot be written ({reason})", path=_final_place(path), hint="Choose another place with -o"
         ) from error
+
+
+def _final_place(path: Path) -> Path:
+    """Return where a file of a draft belongs (see publishing); any other path as it is."""
+    if DRAFT not in path.parts:
+        return path
+    place = path.parts.index(DRAFT)
+    return Path(*path.parts[:place], *path.parts[place + 2 :])
 
 
 def check_writable(folder: Path) -> None:

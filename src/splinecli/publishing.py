@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from splinecli.errors import OutputError
 from splinecli.files import (
     COMPLETE,
+    DRAFT,
     UNFINISHED,
     check_writable,
     is_unfinished,
@@ -27,9 +28,6 @@ from splinecli.files import (
     sync_names,
 )
 from splinecli.locks import locked
-
-DRAFT = f".new{UNFINISHED}"
-"""The hidden folder of new files while they are written. A rename to COMPLETE marks them as complete."""
 
 _FILES, _PLAN = "files", "plan.json"
 
@@ -89,7 +87,12 @@ def new_files(folder: Path, *, report: str, stale: Iterable[str] = ()) -> Iterat
     with refusals_as_output_errors(folder):
         try:
             (draft / _FILES).mkdir(parents=True)
-            yield draft / _FILES
+            try:
+                yield draft / _FILES
+            except OSError:
+                # The error of a write has no name of a file.
+                with refusals_as_output_errors(_last_written(draft / _FILES)):
+                    raise
             names = [path.relative_to(draft / _FILES).as_posix() for path in _files_in(draft / _FILES)]
             for name in names:
                 _check_place(folder / name)
@@ -184,6 +187,11 @@ def _check_place(path: Path) -> None:
         raise OutputError("found a folder, expected a file", path=path)
     if path.parent.exists() and not path.parent.is_dir():
         raise OutputError("found a file, expected a folder", path=path.parent)
+
+
+def _last_written(folder: Path) -> Path:
+    """Return the file that changed last; the folder where there is none."""
+    return max(_files_in(folder), key=lambda path: path.stat().st_mtime_ns, default=folder)
 
 
 def _files_in(folder: Path) -> list[Path]:

@@ -7,7 +7,8 @@ A kill comes before a change of a file, or at a random time. After it,
 - no reader takes a file from a folder in which new files are being moved to their places.
 
 Then the folder is put in order, as the next start does. It must hold the earlier files or the new ones, and nothing
-else. Then the same command runs again, and must end with the same files as an undisturbed run.
+else. Then the same command runs again, and must end with the same files as an undisturbed run. An undisturbed run must
+also sync every file before it renames it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,8 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parents[1] / "fuzz"), str(Path(__file__).parents[1])]
 
 from run import prepare_process, run_warm  # noqa: E402
+
+from sync_order import missing_syncs, record_calls  # noqa: E402
 
 from kills import changes_files, content  # noqa: E402
 
@@ -132,6 +135,14 @@ class KilledCommand:
         self._run_again()
         if self._state(self.case) != self.new:
             yield "the next run ends with other files"
+
+    def missing_syncs(self) -> Iterator[str]:
+        """Yield what an undisturbed run renames before it is on the disk."""
+        self._reset()
+        calls = record_calls(self._run_again)
+        if not any(kind == "rename" for kind, _, _ in calls):
+            yield "nothing is renamed"
+        yield from missing_syncs(calls)
 
     def count_steps(self) -> int:
         """Return the number of changes of files in an undisturbed run."""
@@ -241,6 +252,13 @@ def _killer(step: int):
     return count
 
 
+def _print_problems(what: str, problems: Iterable[str]) -> bool:
+    """Print the problems, and return whether there are any."""
+    found = [f"{what}: {problem}" for problem in problems]
+    print("".join(f"{line}\n" for line in found), end="")
+    return bool(found)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -258,21 +276,16 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as work:
         for name in names:
             command = KilledCommand(name, Path(work))
+            failures += _print_problems(name, command.missing_syncs())
             total = command.count_steps()
             steps = sorted(
                 {int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))}
             )
             for step in steps:
-                problems = list(command.kill(step=step))
-                failures += bool(problems)
-                for problem in problems:
-                    print(f"{name}, step {step}: {problem}")
+                failures += _print_problems(f"{name}, step {step}", command.kill(step=step))
             for _ in range(options.kills // len(names)):
                 seconds = rng.uniform(0, 1.1 * command.seconds)
-                problems = list(command.kill(seconds=seconds))
-                failures += bool(problems)
-                for problem in problems:
-                    print(f"{name}, {seconds:.3f} s: {problem}")
+                failures += _print_problems(f"{name}, {seconds:.3f} s", command.kill(seconds=seconds))
             kills += command.kill_count
             print(
                 f"{name}: {command.kill_count} kills, at {len(steps)} of {total} steps and at random times;"
