@@ -43,6 +43,12 @@ def evaluation_of(
     )
 
 
+def test_names_that_are_not_printable() -> None:
+    names = ["a\n$\\frac$", "b\udcff"]
+    html = html_report([evaluation_of(["ls", "iw12"], names)], [], [])
+    assert Page(html).text["th"].count(r"a\n$\frac$") == Page(html).text["th"].count(r"b\udcff") > 1
+
+
 def test_one_evaluation() -> None:
     page = Page(
         html_report([evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."])

@@ -31,7 +31,6 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parents[1] / "fuzz"), str(Path(__file__).parents[1])]
 
 from run import prepare_process, run_warm  # noqa: E402
-
 from sync_order import missing_syncs, record_calls  # noqa: E402
 
 from kills import changes_files, content  # noqa: E402

@@ -23,7 +23,7 @@ def record_calls(work: Callable[[], object]) -> list[Call]:
 
     def sync(handle: int) -> None:
         fsync(handle)
-        path = Path(os.readlink(f"/proc/self/fd/{handle}"))
+        path = Path(f"/proc/self/fd/{handle}").readlink()
         calls.append(("sync", path, path))
 
     def follow(kind: str, change: Callable[..., object]) -> Callable[..., object]:

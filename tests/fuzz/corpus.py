@@ -190,7 +190,7 @@ TARGETS = (
         ("*",),
         (
             "infer . --method ls -o out --overwrite --maps albedo",
-            "info .",
+            "info . --plot plots/lights.png --overwrite",
             "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
             "prepare . -o out/set",
         ),
@@ -242,7 +242,8 @@ TARGETS = (
             "infer capture --method ls -o out",
             "infer capture --method ls -o out --update",
             "integrate out/capture -o out/capture --overwrite",
-            "evaluate capture --method ls --n-lights 4 --trials 1 -o out",
+            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite",
+            "prepare capture -o out/set",
         ),
         earlier="evaluate capture --method ls --n-lights 4 --trials 1 -o out",
     ),

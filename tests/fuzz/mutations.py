@@ -37,6 +37,13 @@ ODD_VALUES: tuple[Any, ...] = (
     None, True, False, [], {}, "", -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "a\nb", [[[]]], {"a": 1},
     [1, 2, 3], -(2**63), 2**31,
 )  # fmt: skip
+ODD_NAMES = (
+    b"a\nsplinecli: warning: fake", b"\x1b[2J\x07", b"a\xff\xfeb", b"-o", b"--method", b"..a", b"...", b" ", b"a b\t",
+    b"=1+1", b"a" * 240, "\u202eb".encode(), "é".encode(), "e\u0301".encode(), b"[a]*?", b"$(touch x)`", b"'\"",
+    b"%s%n", b"$\\frac$", b"<b>", b"~", b"a\\b", b"nul", b"report.json", b"mask", b"light_directions", b"ambient",
+    b".hidden", b"1e999",
+)  # fmt: skip
+"""Names that a terminal, a shell, a spreadsheet or splinecli itself might take for something else."""
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _TEXTS = (".txt", ".lp", ".json", ".toml", ".csv", ".jsonl", ".html")
 
@@ -217,6 +224,22 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
     path.unlink()  # it may be a link to the corpus
     path.write_bytes(change(data, rng))
     return f"{change.__name__.strip('<>')} {path.name}"
+
+
+def rename(path: Path, rng: random.Random) -> Path:
+    """Give a file or a folder an odd name, most often with its own suffix, and return it."""
+    suffix = path.suffix if rng.random() < 0.8 else ""
+    new = path.with_name(os.fsdecode(rng.choice(ODD_NAMES)) + suffix)
+    if new.exists():
+        new = path.with_name(f"{new.stem} 2{suffix}")
+    path.rename(new)
+    return new
+
+
+def odd_path(name: str, rng: random.Random) -> str:
+    """Return another way to write the path of a file or folder in the present folder."""
+    forms = ("{}", "{}", "./{}", ".//{}", "../case/{}", "{}/../{}", "{}/", "{}/.", "nothing/../{}", "-{}", "")
+    return rng.choice(forms).format(name, name)
 
 
 def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:

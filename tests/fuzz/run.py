@@ -6,7 +6,7 @@ A case is decided by its seed alone: `--first N --cases 1` repeats case N. It pa
 - a failure is told in one line on stderr, and a success writes no error;
 - there is no traceback, and no character that a terminal would obey;
 - it takes less than 10 s of processor time and 1 GB of memory, or 300 MB if it fails;
-- a failure leaves the earlier output as it was, and no run leaves hidden files.
+- a failure leaves the earlier output as it was, and no run leaves unfinished files or locks.
 
 Each case runs in a process of its own, forked from one that has imported everything, so it takes milliseconds.
 """
@@ -34,10 +34,12 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 from corpus import OUT, Target, write_corpus  # noqa: E402
-from mutations import mutate  # noqa: E402
+from mutations import mutate, odd_path, rename  # noqa: E402
 
 from kills import content  # noqa: E402
+from splinecli.errors import printable  # noqa: E402
 
+RENAMED_SHARE = 0.1  # of the cases, which have odd names in place of odd contents
 CPU_SECONDS, WALL_SECONDS, MEMORY, MEMORY_IF_REFUSED = 10, 120, 10**9, 300 * 2**20
 DOCUMENTED = {0, 2, 3, 4, 5}
 
@@ -135,8 +137,9 @@ def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> I
         yield f"{ended.memory / 1e9:.2f} GB"
     if ended.code and any(after.get(name) != value for name, value in before.items()):
         yield "earlier output changed"
-    if hidden := [name for name in after.keys() - before.keys() if "/." in f"/{name}"]:
-        yield f"hidden files {hidden}"
+    new = after.keys() - before.keys()
+    if left := [name for name in new if ".splinecli-" in name or name.endswith("/.lock")]:
+        yield f"files are left: {left}"
 
 
 def _is_note(line: str) -> bool:
@@ -154,11 +157,23 @@ def run_case(number: int, corpus: Path, targets: list[Target], work: Path) -> tu
     changed = rng.sample(files, min(len(files), rng.choice((1, 1, 1, 2))))
     others = [path for path in files if path not in changed] or files[:1]
     command = rng.choice(target.commands)
-    did = ", ".join(mutate(path, others, rng) for path in changed)
+    if rng.random() < RENAMED_SHARE:
+        did, command = rename_one(folder, files, command, rng)
+    else:
+        did = ", ".join(mutate(path, others, rng) for path in changed)
     before = content(folder / OUT)
     ended = run_forked(folder, command)
     found = list(faults(ended, before, content(folder / OUT)))
-    return f"{target.name}: {did}; {command}", ended, found
+    return f"{target.name}: {did}; {printable(command)}", ended, found
+
+
+def rename_one(folder: Path, files: list[Path], command: str, rng: random.Random) -> tuple[str, str]:
+    """Rename a file or a folder of a case, here and in the command. Return what was done, and the new command."""
+    folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name != OUT]
+    path = rng.choice(folders if folders and rng.random() < 0.5 else files)
+    new = rename(path, rng)
+    words = [odd_path(new.name, rng) if word == path.name else word for word in shlex.split(command)]
+    return f"{path.name} is now {new.name!r}", shlex.join(words)
 
 
 def run_cases(

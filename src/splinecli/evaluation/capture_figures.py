@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
-from splinecli.errors import UsageError
+from splinecli.errors import UsageError, printable
 from splinecli.evaluation.plan import first_trial
 from splinecli.evaluation.protocol import Protocol, heading
 from splinecli.evaluation.trial_capture import TrialSource
@@ -72,7 +72,7 @@ def capture_figures(
         e.name: estimate_normals(capture, e, progress=lambda count: advance(count / capture.n_pixels / steps))
         for e in estimators
     }
-    title = f"{name}, {heading(protocol)}{_listed(trial.lights)}"
+    title = f"{printable(name)}, {heading(protocol)}{_listed(trial.lights)}"
     figures = [_maps_figure(capture, estimates, stem, title)]
     for estimator in estimators:
         if estimator.name.startswith("spline-net"):

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli import __version__
+from splinecli.errors import printable
 from splinecli.evaluation.outcome import Evaluation, all_captures, all_skipped
 from splinecli.evaluation.protocol import EVERY_CAPTURE, heading, lights_in_words
 from splinecli.evaluation.statistics import (
@@ -130,17 +131,15 @@ def _error_table(evaluation: Evaluation) -> Table:
     header, *rows = table_rows(evaluation)
     best = best_cells([header, *rows])
     maes_deg = {(r.method, r.capture): r.maes_deg for r in evaluation.results}
-    maes_deg |= {(method, AVERAGE): trial_averages(evaluation, method) for method in evaluation.methods}
-    body = [
-        [
-            Cell(method),
-            *(
-                Cell(value, _plus_minus(maes_deg[method, header[c]]), "best" if (r, c) in best else "")
-                for c, value in enumerate(values, start=1)
-            ),
+    body = []
+    for r, (method, *values) in enumerate(rows, start=1):
+        trials = [maes_deg[method, capture] for capture in evaluation.captures]
+        trials.append(trial_averages(evaluation, method))
+        cells = [
+            Cell(value, _plus_minus(maes), "best" if (r, c) in best else "")
+            for c, (value, maes) in enumerate(zip(values, trials, strict=True), start=1)
         ]
-        for r, (method, *values) in enumerate(rows, start=1)
-    ]
+        body.append([Cell(method), *cells])
     return [[Cell(name) for name in header], *body]
 
 
@@ -151,7 +150,7 @@ def _seconds_table(evaluation: Evaluation) -> Table:
         [Cell(method), *(Cell(f"{seconds[method, capture]:.3g}") for capture in evaluation.captures)]
         for method in evaluation.methods
     ]
-    return [[Cell("method"), *(Cell(capture) for capture in evaluation.captures)], *body]
+    return [[Cell("method"), *(Cell(printable(capture)) for capture in evaluation.captures)], *body]
 
 
 def _matrix(methods: Sequence[str], comparisons: Sequence[Comparison]) -> Table:

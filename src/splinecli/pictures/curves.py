@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from splinecli.errors import printable
 from splinecli.pictures.plotting import MethodStyle, method_styles, png_bytes
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def _add_legend(
 
 
 def _finish(axes: Axes, title: str, label: str) -> None:
-    axes.set_title(title, fontsize=_LARGE, parse_math=False)
+    axes.set_title(printable(title), fontsize=_LARGE, parse_math=False)
     axes.set_xlabel(label, fontsize=_SMALL)
     axes.set_ylabel("mean angular error (deg)", fontsize=_SMALL)
     axes.set_ylim(bottom=0)

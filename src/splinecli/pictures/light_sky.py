@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.errors import printable
 from splinecli.pictures.plotting import png_bytes
 
 _RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
@@ -29,6 +30,6 @@ def sky_plot(light_directions: NDArray[np.float64], title: str) -> bytes:
     axes.scatter(x, y, s=30, color="#D55E00", zorder=3)
     for number, place in enumerate(zip(x, y, strict=True), start=1):
         axes.annotate(str(number), place, xytext=(4, 4), textcoords="offset points", fontsize=7, zorder=3)
-    axes.set_title(title)
+    axes.set_title(printable(title), parse_math=False)
     axes.set_axis_off()
     return png_bytes(figure, 120)
