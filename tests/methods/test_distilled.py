@@ -17,6 +17,8 @@ from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.methods.pupil_size import PupilSize, pupil_sizes
+from splinecli.methods.refiner import Refiner
+from splinecli.networks.refine_net import RefineNet
 from splinecli.normals import angle_between_deg, unit
 
 Floats = NDArray[np.floating]
@@ -196,12 +198,15 @@ def test_progress_counts_the_sample_twice_and_each_pixel_once() -> None:
     assert sum(estimating) == 3000
 
 
-def test_its_map_is_refined_as_that_of_its_teacher() -> None:
+def test_its_map_is_refined_by_the_net_of_its_teacher_without_turns() -> None:
     normals, observations = glossy(3000)
     teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
     assert refiner_of(distil(teacher, observations, LIGHTS, SMALL)) is None
-    teacher.refiner = refiner = object()  # type: ignore[attr-defined]
-    assert refiner_of(distil(teacher, observations, LIGHTS, SMALL)) is refiner
+    teacher.refiner = Refiner(RefineNet(), "float32")  # type: ignore[attr-defined]
+    refiner = refiner_of(distil(teacher, observations, LIGHTS, SMALL))
+    assert refiner is not None
+    assert refiner.network is teacher.refiner.network  # type: ignore[attr-defined]
+    assert refiner.turns == 1
 
 
 def test_too_few_pixels() -> None:

@@ -88,6 +88,32 @@ def test_dark_pixels_stay() -> None:
     assert (normals[21] != before[21]).any()
 
 
+def test_a_turned_capture_gets_turned_normals() -> None:
+    """The mean over four turns does not depend on how the camera was held."""
+    rng = np.random.default_rng(3)
+    mask = rng.random((24, 32)) < 0.9
+    normals = unit(rng.normal((0, 0, 3), 1, (*mask.shape, 3))).astype(np.float32)
+    net = lively(RefineNet())
+    assert isinstance(net, RefineNet)
+
+    def refined(turns: int) -> NDArray[np.float32]:
+        """Refine the map turned counterclockwise by quarters, and turn the result back."""
+        turn = np.round(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])) if turns else np.eye(3)
+        seen, lights = np.rot90(mask, turns), LIGHTS @ turn.T
+        found = (np.rot90(normals, turns)[seen] @ turn.T).astype(np.float32)
+        observations = (found @ lights.T).clip(0).astype(np.float32)
+        errors = np.tile(np.float32((-3, 1)), (len(found), 1))
+        Refiner(net, "float32").refine(
+            seen, observations, lambda rows: LampLight(observations[rows], lights), found, errors
+        )
+        result = np.zeros((*seen.shape, 3), np.float32)
+        result[seen] = found @ turn
+        return np.rot90(result, -turns)
+
+    # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them in this test.
+    np.testing.assert_allclose(refined(1), refined(0), atol=1e-3)
+
+
 def estimator(*, refines: bool) -> NetworkEstimator:
     tiny = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width": 16, "error_head": True, "refines": True}
     network = lively(SplineNet(NetworkConfig.from_dict(tiny)))

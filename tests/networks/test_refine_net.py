@@ -6,7 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from splinecli.networks.refine_features import CHANNELS, refine_features, split_features, turn_features
+from splinecli.networks.refine_features import (
+    CHANNELS,
+    Turn,
+    refine_features,
+    split_features,
+    turn_features,
+    turn_maps,
+)
 from splinecli.networks.refine_net import COARSEST, REACH, RefineNet
 
 HEIGHT, WIDTH = 6, 9
@@ -62,11 +69,14 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
         return (maps.flip(-1) if mirror else maps).rot90(quarters, (-2, -1))
 
     expected = features_of(moved(observations), turned(lights.T).T, turned(moved(normals)), moved(error))
-    found, found_normals = turn_features(
-        features_of(observations, lights, normals, error), normals, quarters, mirror
-    )
+    turn = Turn(quarters, mirror)
+    features = features_of(observations, lights, normals, error)
+    found = turn_features(features, turn)
+    found_normals = turn_maps(normals, turn, vectors=((0, 1),))
     torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-4)
     torch.testing.assert_close(found_normals, turned(moved(normals)))
+    torch.testing.assert_close(turn_features(found, turn.back), features)
+    torch.testing.assert_close(turn_maps(found_normals, turn.back, vectors=((0, 1),)), normals)
 
 
 def test_a_new_net_changes_nothing() -> None:

@@ -79,7 +79,9 @@ class DistilledEstimator:
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
-        self.refiner = refiner_of(teacher)
+        refiner = refiner_of(teacher)
+        # Its turns would take most of the time of the capture.
+        self.refiner = None if refiner is None else refiner.without_turns()
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 

@@ -65,11 +65,13 @@ class NetworkEstimator:
         self.weights = {"name": loaded.name, "sha256": loaded.sha256}
         self.device = str(device)
         self.precision = str(precision)
-        self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         self.batch_size = batch_size
         self.network = loaded.network.to(device)
         refine_net = self.network.refine_net
         self.refiner = Refiner(refine_net, self.precision) if refines and refine_net is not None else None
+        self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
+        if self.refiner is not None:
+            self.fingerprint += f", refined in {self.refiner.turns} turns"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._layers = LayerProgress(self.network)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from splinecli.methods.estimator import Progress
 from splinecli.methods.lamp_light import LampLight
-from splinecli.networks.refine_features import CHANNELS, brightness, refine_features
+from splinecli.networks.refine_features import (
+    CHANNELS,
+    Turn,
+    brightness,
+    refine_features,
+    turn_features,
+    turn_maps,
+)
 from splinecli.networks.refine_net import COARSEST, REACH, Part, RefineNet
 
 TILE = 768
@@ -33,7 +40,7 @@ class _Tile:
     """A part of the map with a margin.
 
     Args:
-        mask: (h, w), with the margin.
+        mask: (h, w), with the margin; h and w are multiples of COARSEST, so that a turned tile has the same cells.
         rows: (h, w), the rows of its pixels in the capture.
         inner: the part without the margin.
     """
@@ -49,15 +56,21 @@ class Refiner:
     Args:
         network: the refinement net, on its device.
         precision: the number format of the convolutions.
+        turns: the results of this many quarter turns of the map are averaged. Mirror images gain nothing beside them.
         tile: see TILE.
     """
 
-    def __init__(self, network: RefineNet, precision: str, *, tile: int = TILE) -> None:
+    def __init__(self, network: RefineNet, precision: str, *, turns: int = 4, tile: int = TILE) -> None:
         assert tile % COARSEST == 0 == REACH % COARSEST
         assert tile >= REACH, "the margin of a tile must be within its neighbours"
         self.network = network
         self.precision = precision
+        self.turns = turns
         self.tile = tile
+
+    def without_turns(self) -> Refiner:
+        """Return the refiner that sees the map once, for captures whose pixels are estimated quickly."""
+        return Refiner(self.network, self.precision, turns=1, tile=self.tile)
 
     @torch.inference_mode()
     def refine(
@@ -82,6 +95,7 @@ class Refiner:
             progress: called after each tile with the number of its pixels.
         """
         reference = brightness(torch.from_numpy(observations))
+        mask = _around_object(mask)
         above: list[tuple[NDArray[np.integer], Floats, Floats]] = []
         for tiles in self._rows_of_tiles(mask):
             found = []
@@ -138,12 +152,46 @@ class Refiner:
                 reference,
             )
         mask = torch.from_numpy(tile.mask).to(device, torch.float32)
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            maps = self.network(features.permute(2, 0, 1)[None], mask[None, None], tile.inner)
+        maps = self._average_turns(features.permute(2, 0, 1), mask[None], tile.inner)
         inside = tile.mask[tile.inner]
-        refined, refined_errors = (values[0].permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
+        refined, refined_errors = (values.permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
         own = tile.rows[tile.inner][inside]
         return np.asarray(light_of(own).in_frame_of_capture(refined), np.float32), refined_errors
+
+    def _average_turns(
+        self, features: torch.Tensor, mask: torch.Tensor, inner: Part
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return normals (3, h, w) and errors (2, h, w) of the inner part, averaged over the turns of the map."""
+        normals = errors = torch.zeros((), device=mask.device)
+        for turn in map(Turn, range(self.turns)):
+            seen, seen_mask = turn_features(features, turn), turn_maps(mask, turn)
+            part = _turned_part(inner, mask.shape[-2:], turn.quarters)
+            with torch.autocast(mask.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+                found, found_errors = self.network(seen[None], seen_mask[None], part)
+            normals = normals + turn_maps(found[0], turn.back, vectors=((0, 1),))
+            errors = errors + turn_maps(found_errors[0], turn.back)
+        return torch.nn.functional.normalize(normals, dim=0), errors / self.turns
+
+
+def _around_object(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the part of a mask that has pixels, between multiples of COARSEST. Behind the map it has a margin."""
+    bounds = []
+    for axis in (1, 0):
+        places = np.flatnonzero(mask.any(axis=axis))
+        bounds.append(slice(places[0] // COARSEST * COARSEST, -(-(places[-1] + 1) // COARSEST) * COARSEST))
+    part = mask[tuple(bounds)]
+    missing = [(0, side.stop - side.start - length) for side, length in zip(bounds, part.shape, strict=True)]
+    return np.pad(part, missing)
+
+
+def _turned_part(part: Part, shape: Sequence[int], quarters: int) -> Part:
+    """Return where a part of a map of this shape is when the map is turned counterclockwise by quarters."""
+    rows, columns = (slice(*side.indices(length)) for side, length in zip(part, shape, strict=True))
+    height, width = shape
+    for _ in range(quarters):
+        rows, columns = slice(width - columns.stop, width - columns.start), rows
+        height, width = width, height
+    return rows, columns
 
 
 def _replace(

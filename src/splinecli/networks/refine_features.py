@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -91,28 +93,40 @@ def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
     return features[:, :3], features[:, MEDIAN : SHAPE + 1] + offset
 
 
-def turn_features(features: Tensor, normals: Tensor, quarters: int, mirror: bool) -> tuple[Tensor, Tensor]:
-    """Turn maps of features (..., CHANNELS, H, W) and normals (..., 3, H, W) counterclockwise by quarters.
+class Turn(NamedTuple):
+    """A mirror image (x is flipped) if `mirror`, then a turn counterclockwise by `quarters` of 360 degrees."""
 
-    With `mirror`, x is flipped first.
-    """
-    if mirror:
-        features, normals = features.flip(-1).clone(), normals.flip(-1).clone()
-        for first, _ in VECTORS:
-            features[..., first, :, :].neg_()
-        features[..., TENSOR[2], :, :].neg_()
-        normals[..., 0, :, :].neg_()
-    for _ in range(quarters % 4):
-        features, normals = features.rot90(1, (-2, -1)), normals.rot90(1, (-2, -1))
-        old = features
-        features = features.clone()
-        for first, second in VECTORS:
-            features[..., first, :, :], features[..., second, :, :] = (
-                -old[..., second, :, :],
-                old[..., first, :, :],
-            )
-        xx, yy, xy = TENSOR
-        features[..., xx, :, :], features[..., yy, :, :] = old[..., yy, :, :], old[..., xx, :, :]
-        features[..., xy, :, :] = -old[..., xy, :, :]
-        normals = torch.stack((-normals[..., 1, :, :], normals[..., 0, :, :], normals[..., 2, :, :]), dim=-3)
-    return features, normals
+    quarters: int
+    mirror: bool = False
+
+    @property
+    def back(self) -> Turn:
+        """The turn that undoes this one. A turned mirror image undoes itself."""
+        return self if self.mirror else Turn(-self.quarters % 4)
+
+
+def turn_features(features: Tensor, turn: Turn) -> Tensor:
+    """Turn maps of features (..., CHANNELS, H, W)."""
+    return turn_maps(features, turn, VECTORS, (TENSOR,))
+
+
+def turn_maps(
+    maps: Tensor,
+    turn: Turn,
+    vectors: Sequence[tuple[int, int]] = (),
+    tensors: Sequence[tuple[int, int, int]] = (),
+) -> Tensor:
+    """Turn maps (..., C, H, W), of which some channels are x and y of vectors, or xx, yy and xy of tensors."""
+    if turn.mirror:
+        maps = maps.flip(-1)
+        for odd in (*(x for x, _ in vectors), *(xy for _, _, xy in tensors)):
+            maps[..., odd, :, :].neg_()
+    for _ in range(turn.quarters % 4):
+        old = maps.rot90(1, (-2, -1))
+        maps = old.clone()
+        for x, y in vectors:
+            maps[..., x, :, :], maps[..., y, :, :] = -old[..., y, :, :], old[..., x, :, :]
+        for xx, yy, xy in tensors:
+            maps[..., xx, :, :], maps[..., yy, :, :] = old[..., yy, :, :], old[..., xx, :, :]
+            maps[..., xy, :, :] = -old[..., xy, :, :]
+    return maps

@@ -12,7 +12,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splinecli.networks.error_head import error_negative_log_likelihood
-from splinecli.networks.refine_features import brightness, refine_features, split_features, turn_features
+from splinecli.networks.refine_features import (
+    Turn,
+    brightness,
+    refine_features,
+    split_features,
+    turn_features,
+    turn_maps,
+)
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.background import add_background
@@ -244,11 +251,12 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
 
 def _turned(example: SceneMaps, generator: torch.Generator) -> SceneMaps:
     draw = torch.rand(2, generator=generator, device=generator.device).tolist()
-    quarters, mirror = int(4 * draw[0]), draw[1] < 0.5
-    features, normals = turn_features(example.features, example.normals, quarters, mirror)
-    mask = example.mask
-    mask = (mask.flip(-1) if mirror else mask).rot90(quarters, (-2, -1))
-    return SceneMaps(features, normals, mask)
+    turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
+    return SceneMaps(
+        turn_features(example.features, turn),
+        turn_maps(example.normals, turn, vectors=((0, 1),)),
+        turn_maps(example.mask, turn),
+    )
 
 
 class RefinementLosses(NamedTuple):
