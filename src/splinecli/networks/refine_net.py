@@ -9,7 +9,7 @@ from types import EllipsisType
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, interpolate, max_pool2d, pad
+from torch.nn.functional import interpolate, max_pool2d, pad
 
 from splinecli.networks.refine_features import CHANNELS, split_features
 
@@ -80,18 +80,24 @@ class RefineNet(nn.Module):
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
         border = (0, -width % COARSEST, 0, -height % COARSEST)
-        masks = [pad(mask, border)]
+        layers = _type_of_layers(features)
+        # In training, the sums over the blocks stay in float32.
+        stream = features.dtype if torch.is_grad_enabled() else layers
+        masks = [pad(mask, border).to(layers)]
         for _ in self.down:
             masks.append(max_pool2d(masks[-1], 2))
         normals, error = (part.contiguous() for part in split_features(features))
         towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
         # In place where possible: a tile's maps of 32 channels decide how much memory is needed.
-        x = self.enter(_joined((features, *towards, mask), border)).to(normals.dtype).mul_(masks[0])
+        x = self.enter(_joined((features, *towards, mask), border, layers)).mul_(masks[0]).to(stream)
+        mask, normals, error, *towards = (
+            maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards)
+        )
         passed = []
         for scale, blocks in enumerate(self.encode):
             if scale:
                 passed.append(x)
-                x = self.down[scale - 1](x).to(normals.dtype).mul_(masks[scale])
+                x = self.down[scale - 1](x).mul_(masks[scale]).to(stream)
             for block in blocks:  # type: ignore[attr-defined]
                 x = block(x, masks[scale])
         origin = (0, 0)
@@ -99,24 +105,36 @@ class RefineNet(nn.Module):
             wanted = _grown(inner, _DECODED << scale)
             within = masks[scale][_cells(wanted, (0, 0), scale)]
             x = self.up[scale](x[_cells(wanted, origin, scale + 1)])
-            x = passed.pop()[_cells(wanted, (0, 0), scale)] + interpolate(x, scale_factor=2, mode="nearest")
-            x.mul_(within)
+            x = interpolate(x, scale_factor=2, mode="nearest").mul_(within)
+            x = passed.pop()[_cells(wanted, (0, 0), scale)] + x
             origin = wanted[0].start, wanted[1].start
             for block in self.decode[scale]:  # type: ignore[attr-defined]
                 x = block(x, within)
         change = self.out(torch.relu(x))[_cells(inner, origin, 0)].to(normals.dtype).contiguous()
-        mask, normals, error = (maps[..., *inner] for maps in (mask, normals, error))
         corrected = normals + change[:, :3]
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
-            corrected = corrected + weight * difference[..., *inner]
+            corrected = corrected + weight * difference
         return _unit(corrected) * mask, (error + change[:, 3:5]) * mask
 
 
-def _joined(maps: Sequence[Tensor], border: tuple[int, ...]) -> Tensor:
+def _type_of_layers(maps: Tensor) -> torch.dtype:
+    """Return the number format in which layers compute on these maps."""
+    device = maps.device.type
+    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps.dtype
+
+
+def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """Return maps as the channels of one, with a border of zeros, in the layout that is fastest for the layers."""
-    joined = torch.cat(list(maps), dim=1)
-    joined = pad(joined, border) if any(border) else joined
-    return joined.contiguous(memory_format=torch.channels_last)
+    batch, _, height, width = maps[0].shape
+    size = batch, sum(part.shape[1] for part in maps), height + border[3], width + border[1]
+    joined = torch.empty(size, dtype=dtype, device=maps[0].device, memory_format=torch.channels_last)
+    if any(border):
+        joined.zero_()
+    start = 0
+    for part in maps:
+        joined[:, start : start + part.shape[1], :height, :width] = part
+        start += part.shape[1]
+    return joined
 
 
 def _grown(part: Part, margin: int) -> Part:
@@ -150,15 +168,20 @@ def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
     """
     weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
     found = []
-    # In float32 whatever the layers compute in: differences of normals are small.
-    with torch.autocast(normals.device.type, enabled=False):
-        for sigma in SIGMAS:
-            reach = math.ceil(3 * sigma)
-            place = torch.arange(-reach, reach + 1, dtype=normals.dtype, device=normals.device)
-            kernel = (-0.5 * (place / sigma).square()).exp().expand(3, 1, 1, -1)
-            across = conv2d(normals * weight, kernel, padding=(0, reach), groups=3)
-            both = conv2d(across, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
-            found.append(_unit(both) * mask)
+    for sigma in SIGMAS:
+        reach = math.ceil(3 * sigma)
+        kernel = [math.exp(-0.5 * (place / sigma) ** 2) for place in range(-reach, reach + 1)]
+        found.append(_unit(_filtered(_filtered(normals * weight, kernel, -1), kernel, -2)) * mask)
+    return found
+
+
+def _filtered(maps: Tensor, kernel: Sequence[float], axis: int) -> Tensor:
+    """Filter maps along an axis: faster than a convolution of so few channels."""
+    reach, size = len(kernel) // 2, maps.shape[axis]
+    padded = pad(maps, (reach, reach) if axis == -1 else (0, 0, reach, reach))
+    found = kernel[0] * padded.narrow(axis, 0, size)
+    for start, weight in enumerate(kernel[1:], 1):
+        found.add_(padded.narrow(axis, start, size), alpha=weight)
     return found
 
 
@@ -174,5 +197,5 @@ class _MaskedBlock(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         hidden = self.first(torch.relu(x)).mul_(mask).relu_()
-        out: Tensor = (x + self.second(hidden)).mul_(mask)
-        return out
+        change: Tensor = self.second(hidden).mul_(mask)
+        return change.add_(x) if change.dtype == x.dtype else x + change
