@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 def printable(text: object) -> str:
@@ -41,6 +42,16 @@ class SplinecliError(Exception):
         self.hint = hint
         place = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
         super().__init__(printable(f"{place}{problem}." + (f" {hint}." if hint else "")))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _copy, (type(self), self.problem, self.path, self.line, self.hint)
+
+
+def _copy(
+    kind: type[SplinecliError], problem: str, path: Path | None, line: int | None, hint: str | None
+) -> SplinecliError:
+    """Return an error that another process raised."""
+    return kind(problem, path=path, line=line, hint=hint)
 
 
 class UsageError(SplinecliError):

@@ -477,3 +477,30 @@ def test_as_stored_is_named_and_a_white_level_is_used(capture, run):
     assert restored["white_level"] == {"value": 57_000, "origin": "given"}
     assert restored["angular_error_deg"]["mean"] < 0.1 < stored["angular_error_deg"]["mean"]
     assert restored["options"]["white_level"] == 57_000
+
+
+def test_shards_give_the_results_of_the_whole(capture, make_capture, run):
+    names = ["sphere", *map(str, (make_capture(name) for name in ("Second", "third", "\u00e9")))]
+    assert run("infer", *names, "--method", "ls", "-o", "whole").code == 0
+    for number in (3, 1, 2, 5, 4):
+        result = run("infer", *names, "--method", "ls", "--shard", f"{number}/5")
+        assert result.code == 0
+        assert result.out.count("\n") == (number < 5)
+    for name in names:
+        parts = [Path(place, name, "normals.npy").read_bytes() for place in ("out", "whole")]
+        assert parts[0] == parts[1]
+    links = re.findall(r'href="([^"]+normals.npy)"', Path("out/index.html").read_text("utf-8"))
+    assert sorted(unquote(link) for link in links) == sorted(f"{name}/normals.npy" for name in names)
+
+
+def test_json_lines(capture, make_capture, run):
+    """Each line is there when its capture ends, also where an error ends the batch."""
+    make_capture("second")
+    Path("broken").mkdir()
+    call = ("infer", "sphere", "broken", "second", "--method", "ls")
+    lines = run(*call, "--jsonl").out.splitlines()
+    assert lines == [json.dumps(document) for document in json.loads(run(*call, "--json").out)]
+    for arguments in (("--jsonl", "--json"), ("--jsonl", "--method", "magic"), ("--jsonl", "--strange")):
+        result = run(*call, *arguments)
+        document = json.loads(result.out)
+        assert (result.code, document["capture"], document["exit_code"]) == (2, None, 2)

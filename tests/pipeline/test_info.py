@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.pipeline.info import ORIGINS, REFINED_PIXELS, InfoOptions, summary_lines
+from splinecli.pipeline.capture_memory import REFINED_PIXELS
+from splinecli.pipeline.info import ORIGINS, InfoOptions, summary_lines
 
 REPORT = {
     "capture": "cat",

@@ -13,7 +13,7 @@ from browser import OpenPage
 from splinecli.evaluation.outcome import Evaluation, Result
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.report import html_report
-from splinecli.results.index import index_page
+from splinecli.results.index import Entry, index_page
 
 ASSETS = resources.files("splinecli") / "assets"
 PAGES = ("index.html", "page.html", "report.html")
@@ -37,7 +37,9 @@ def test_the_index_shows_its_pictures(open_page: OpenPage, tmp_path):
         "capture": "a & b", "n_lights": 10, "n_pixels": 48, "angular_error_deg": {"mean": 2.5},
         "expected_under_5": 0.9, "warnings": [], "seconds": {"read": 1.0}, "files": ["normals.png", "report.json"],
     }  # fmt: skip
-    page = open_page(index_page([report, {"capture": "x" * 200, "error": "y" * 200}]), width=400)
+    page = open_page(
+        index_page([Entry.of(report), Entry.of({"capture": "x" * 200, "error": "y" * 200})]), width=400
+    )
     picture = page.locator("img")
     picture.scroll_into_view_if_needed()
     shot = cv2.imdecode(np.frombuffer(picture.screenshot(), np.uint8), cv2.IMREAD_COLOR)

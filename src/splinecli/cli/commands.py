@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from splinecli.cli.choices import fill_in
-from splinecli.cli.failures import ParserError, print_error_document
+from splinecli.cli.failures import ParserError, batch_error_document, print_error_document
 from splinecli.cli.panels import sort_into_panels
 from splinecli.memory import check_address_space, keep_freed_memory
 
@@ -25,7 +26,7 @@ ARGUMENTS = "Arguments"
 INFER = "infer"
 """The command whose JSON is a list of documents."""
 
-JSON = "--json"
+JSON, JSON_LINES = "--json", "--jsonl"
 
 _RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"
 
@@ -46,6 +47,8 @@ class Command(TyperCommand):
                 error.ctx = ctx  # type: ignore[attr-defined]
             if wants_json and isinstance(error, ParserError):
                 print_error_document(error, as_list=ctx.info_name == INFER)
+            elif JSON_LINES in args and ctx.info_name == INFER and isinstance(error, ParserError):
+                print(json.dumps(batch_error_document(error)))
             raise
 
     def invoke(self, ctx: Any) -> Any:

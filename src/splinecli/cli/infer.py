@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.cli import choices
 from splinecli.cli.console import Messages, print_lines
-from splinecli.cli.failures import batch_error_document
-from splinecli.cli.options import computing, inputs, outputs
+from splinecli.cli.documents import Documents, printed_documents
+from splinecli.cli.options import computing, distribution, inputs, outputs
 from splinecli.cli.options.values import (
     Device,
     LightForm,
     NormalConvention,
     Precision,
+    parse_cluster,
     parse_indices,
     split_commas,
 )
@@ -27,7 +26,7 @@ from splinecli.surface.surface_files import MESH_FILES
 
 if TYPE_CHECKING:
     from splinecli.pipeline.batch import Outcome, Redo
-    from splinecli.pipeline.infer_options import InferOptions
+    from splinecli.results.index import Row
 
 
 _WORDS = {
@@ -86,7 +85,12 @@ def infer(
     overwrite: bool = outputs.OVERWRITE,
     update: bool = outputs.UPDATE,
     strict: bool = outputs.STRICT,
+    workers: str = distribution.WORKERS,
+    cluster: str | None = distribution.CLUSTER,
+    retries: int | None = distribution.RETRIES,
+    shard: str | None = distribution.SHARD,
     as_json: bool = outputs.JSON_LIST,
+    as_json_lines: bool = outputs.JSON_LINES,
     quiet: bool = outputs.QUIET,
 ) -> int:
     """Estimate the normal map of each CAPTURE.
@@ -99,9 +103,13 @@ def infer(
     keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
     The exit code is that of the most serious failure.
     """
+    from splinecli.pipeline.batch import infer_batch
+    from splinecli.pipeline.capture_list import Shard
     from splinecli.pipeline.infer_options import InferOptions
 
-    with _json_documents(as_json) as documents:
+    with printed_documents(as_list=as_json, as_lines=as_json_lines) as documents:
+        if as_json and as_json_lines:
+            raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
         if overwrite and update:
             raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
         limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
@@ -147,46 +155,46 @@ def infer(
             lights_format=lights_format.value,
             strict=strict,
         )
+        messages = Messages(quiet=quiet)
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"
-        return _run(
-            captures, options, Messages(quiet=quiet), redo, documents, summaries=not (quiet or as_json)
+        batch = infer_batch(
+            captures,
+            options,
+            messages,
+            redo=redo,
+            shard=None if shard is None else Shard.parse(shard),
+            cluster=parse_cluster(workers, cluster, retries, gpu=device is Device.cuda),
+        )
+        return _show_all(
+            batch, output, messages, documents, summaries=not (quiet or as_json or as_json_lines)
         )
 
 
-@contextmanager
-def _json_documents(wanted: bool) -> Iterator[list[dict[str, Any]]]:
-    """Yield a list of documents and print it at the end, also after an error, if it is wanted."""
-    documents: list[dict[str, Any]] = []
-    try:
-        yield documents
-    except Exception as error:
-        documents.append(batch_error_document(error))
-        raise
-    finally:
-        if wanted:
-            print(json.dumps(documents, indent=2))
-
-
-def _run(
-    captures: Sequence[Path],
-    options: InferOptions,
+def _show_all(
+    outcomes: Iterable[Outcome],
+    output: Path,
     messages: Messages,
-    redo: Redo,
-    documents: list[dict[str, Any]],
+    documents: Documents,
     *,
     summaries: bool,
 ) -> int:
-    """Run the batch, print what becomes of each capture, and return the exit code."""
-    from splinecli.pipeline.batch import infer_batch, worst_exit_code
+    """Print what becomes of each capture, and return the exit code."""
+    from splinecli.pipeline.batch import worst_exit_code
+    from splinecli.results.index import row_of
 
-    outcomes, output = [], Path(options.output)
-    for outcome in infer_batch(captures, options, messages, redo=redo):
-        outcomes.append(outcome)
-        documents.append(outcome.report)
+    statuses: Counter[str] = Counter()
+    codes: set[int] = set()
+    rows: list[Row] = []
+    for outcome in outcomes:
+        documents.add(outcome.report)
         _show(outcome, output, messages, with_summary=summaries)
-    if len(outcomes) > 1:
-        _show_table(outcomes, output, messages)
-    return worst_exit_code(outcome.exit_code for outcome in outcomes)
+        statuses[outcome.status] += 1
+        codes.add(outcome.exit_code)
+        if outcome.status in ("done", "skipped"):
+            rows.append(row_of(outcome.report))
+    if statuses.total() > 1:
+        _show_table(rows, statuses, output, messages)
+    return worst_exit_code(codes)
 
 
 def _indices(text: str) -> tuple[int, ...]:
@@ -210,16 +218,14 @@ def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: b
         messages.error(outcome.report["error"])
 
 
-def _show_table(outcomes: Sequence[Outcome], output: Path, messages: Messages) -> None:
-    from splinecli.results.index import HEADER, INDEX, row_of
+def _show_table(rows: Sequence[Row], statuses: Mapping[str, int], output: Path, messages: Messages) -> None:
+    from splinecli.results.index import HEADER, INDEX
 
-    good = [row_of(outcome.report) for outcome in outcomes if outcome.status in ("done", "skipped")]
-    if good:
-        columns = [column for column in zip(HEADER, *good, strict=True) if any(column[1:])]
+    if rows:
+        columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
         messages.table(list(zip(*columns, strict=True)))
-    counts = Counter(_WORDS[outcome.status] for outcome in outcomes)
-    text = ", ".join(f"{counts[word]} {word}" for word in _WORDS.values() if counts[word])
-    messages.say(f"{len(outcomes)} captures: {text}; see {output / INDEX}")
+    text = ", ".join(f"{statuses[status]} {words}" for status, words in _WORDS.items() if statuses[status])
+    messages.say(f"{sum(statuses.values())} captures: {text}; see {output / INDEX}")
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:

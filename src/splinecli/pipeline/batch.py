@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splinecli.errors import InputError, OutputError, SplinecliError, UsageError
+from splinecli.errors import InputError, OutputError, SplinecliError
 from splinecli.memory import is_out_of_memory
+from splinecli.pipeline.capture_list import Member, Shard, list_captures
 from splinecli.pipeline.finished import find_earlier
 from splinecli.pipeline.infer import infer_capture, make_method
 from splinecli.pipeline.infer_options import InferOptions
@@ -18,6 +19,8 @@ from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
     from splinecli.methods import Estimator
+    from splinecli.pipeline.connection import ClusterOptions
+    from splinecli.results.index import Entry
 
 Redo = Literal["nothing", "changed", "all"]
 """What to do with captures that have results: keep them all, redo what changed, or redo everything."""
@@ -48,9 +51,17 @@ class Outcome:
 
 
 def infer_batch(
-    folders: Sequence[Path], options: InferOptions, observer: Observer = SILENT, *, redo: Redo = "nothing"
+    folders: Sequence[Path],
+    options: InferOptions,
+    observer: Observer = SILENT,
+    *,
+    redo: Redo = "nothing",
+    shard: Shard | None = None,
+    cluster: ClusterOptions | None = None,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield its outcome, in order.
+    """Run `infer_capture` on each folder and yield its outcome.
+
+    The outcomes come in order, or on other processes as they end.
 
     With several captures, or where OUT/index.html is there already, that page is written at the end.
 
@@ -58,6 +69,9 @@ def infer_batch(
         folders: the captures. A folder that is given twice counts once.
         options, observer: see infer_capture.
         redo: which captures that have results are computed again.
+        shard: the part of the captures that is computed; None for all.
+        cluster: the processes or machines that compute; None for this process. A number of workers of 0 means as many
+            as the machine's cores and memory allow.
 
     Raises:
         UsageError: two captures have the same name, the options do not fit the method, or a "folder" that does not
@@ -65,39 +79,93 @@ def infer_batch(
         InputError: a file that the options name does not exist.
         ModelError: the weights cannot be used.
         OutputError: the output folder cannot be written, or the disk is full.
+        SplinecliError: the connection to a Dask scheduler was lost.
     """
     from splinecli.files import check_writable
-    from splinecli.results.index import check_index_free, has_index
+    from splinecli.results.index import Entry, check_index_free, has_index
 
-    folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
-    missing = _missing(folders)
-    names = [_name(folder) for folder in folders]
-    _check_names({folder: name for folder, name in zip(folders, names, strict=True) if folder not in missing})
+    members = list_captures(folders, shard)
     options.check_files()
     output = Path(options.output)
     check_writable(output)
-    with_index = len(folders) > 1 or has_index(output)
+    with_index = len(members) > 1 or shard is not None or has_index(output)
     if with_index:
         check_index_free(output, overwrite=redo == "all")
-    estimator: Estimator | None = None
-    outcomes = []
-    for folder, name in zip(folders, names, strict=True):
-        try:
-            outcome = missing.get(folder) or _earlier_outcome(folder, name, options, observer, redo)
-        except Exception as error:
-            outcome = _failure(name, folder, error)
-        if outcome is None:
-            # A wrong method or wrong weights end the batch: they are wrong for every capture.
-            estimator = estimator or make_method(options)
-            try:
-                report = infer_capture(folder, options, observer, estimator=estimator)
-                outcome = Outcome(name, "done", report)
-            except Exception as error:
-                outcome = _failure(name, folder, error)
-        outcomes.append(outcome)
+    entries: dict[int, Entry] = {}
+    for number, outcome in _outcomes(members, options, observer, redo, cluster):
+        if outcome.status != "changed":
+            entries[number] = Entry.of(outcome.report)
         yield outcome
-    if with_index:
-        _write_index(outcomes, output, observer)
+    if with_index and members:
+        _write_index([entries[number] for number in sorted(entries)], output, observer)
+
+
+def _outcomes(
+    members: Sequence[Member],
+    options: InferOptions,
+    observer: Observer,
+    redo: Redo,
+    cluster: ClusterOptions | None,
+) -> Iterator[tuple[int, Outcome]]:
+    """Yield the number and the outcome of each capture."""
+    if cluster is not None and cluster.address is None:
+        from splinecli.pipeline.capture_memory import choose_workers
+
+        wanted = cluster.workers or choose_workers(members, options)
+        cluster = replace(cluster, workers=min(wanted, len(members)))
+    if cluster is None or (cluster.address is None and cluster.workers < 2):
+        yield from enumerate(_one_by_one(members, options, observer, redo))
+        return
+    from splinecli.pipeline.batch_on_workers import infer_on_workers
+
+    yield from infer_on_workers(members, options, observer, redo=redo, cluster=cluster)
+
+
+def _one_by_one(
+    members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo
+) -> Iterator[Outcome]:
+    """Yield the outcomes of captures that this process computes."""
+    estimator: Estimator | None = None
+
+    def method() -> Estimator:
+        nonlocal estimator
+        estimator = estimator or make_method(options)
+        return estimator
+
+    for member in members:
+        yield run_member(member, options, redo, method, observer)
+
+
+def run_member(
+    member: Member, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
+) -> Outcome:
+    """Compute one capture of a batch, unless its results are up to date or are to be kept.
+
+    Args:
+        member: the capture.
+        options, observer: see infer_capture.
+        redo: see infer_batch.
+        method: returns the estimator; it is called if the capture is computed.
+
+    Raises:
+        UsageError, ModelError: what `method` raises. It is wrong for every capture.
+        OutputError: the output folder cannot be written, or the disk is full.
+    """
+    if member.missing is not None:
+        return replace(failed(member.name, member.missing), status="missing")
+    try:
+        outcome = _earlier_outcome(member, options, observer, redo)
+    except Exception as error:
+        outcome = _failure(member, error)
+    if outcome is not None:
+        return outcome
+    estimator = method()
+    try:
+        return Outcome(
+            member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator)
+        )
+    except Exception as error:
+        return _failure(member, error)
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
@@ -111,76 +179,19 @@ def _error_document(error: SplinecliError, capture: str) -> dict[str, Any]:
     return {"capture": capture, "error": str(error), "exit_code": error.exit_code}
 
 
-def _own_path(folder: Path) -> Path:
-    """Return one path for all spellings of a folder. A link keeps its name, because its results have it."""
-    from splinecli.capture.paths import resolve
-
-    try:
-        return resolve(folder) if ".." in folder.parts else folder.absolute()
-    except InputError:
-        return folder  # what is wrong with it is reported when its turn comes
-
-
-def _missing(folders: Sequence[Path]) -> dict[Path, Outcome]:
-    """Return a failure for each folder that does not exist. Raises UsageError for a word of another option."""
-    from splinecli.capture.paths import find_mode
-    from splinecli.methods import method_names
-    from splinecli.results.files import MAPS, NORMALS
-
-    outcomes = {}
-    for folder in folders:
-        try:
-            exists = find_mode(folder) is not None
-        except InputError:
-            exists = True  # what is wrong with it is reported when its turn comes
-        if exists:
-            continue
-        if str(folder) in (*MAPS, *NORMALS, *method_names()):
-            raise UsageError(
-                "the folder does not exist",
-                path=folder,
-                hint="Write lists with commas, such as --maps albedo,confidence",
-            )
-        error = InputError("the folder does not exist", path=folder)
-        outcomes[folder] = replace(_failed(folder.name or str(folder), error), status="missing")
-    return outcomes
-
-
-def _name(folder: Path) -> str:
-    from splinecli.capture import capture_name
-
-    try:
-        return capture_name(folder)
-    except InputError:
-        return folder.name  # what is wrong with it is reported when its turn comes
-
-
-def _check_names(names: Mapping[Path, str]) -> None:
-    seen: dict[str, Path] = {}
-    for folder, name in names.items():
-        other = seen.setdefault(name, folder)
-        if other is not folder:
-            raise UsageError(
-                f"{other} and {folder} have the same name, so their results would overwrite each other",
-                hint="Run them one by one with different -o",
-            )
-
-
-def _earlier_outcome(
-    folder: Path, name: str, options: InferOptions, observer: Observer, redo: Redo
-) -> Outcome | None:
+def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, redo: Redo) -> Outcome | None:
     """Return the outcome of a capture that is not to be computed, or None."""
     from splinecli.files import check_writable
     from splinecli.publishing import held_folder
 
-    target = Path(options.output) / name
+    target = Path(options.output) / member.name
     check_writable(target)
     if redo == "all":
         return None
     with held_folder(target, observer.warn):
-        earlier = find_earlier(target, folder, options)
+        earlier = find_earlier(target, member.folder, options)
     if earlier.report is not None:
-        return Outcome(name, "skipped", earlier.report)
+        return Outcome(member.name, "skipped", earlier.report)
     if not earlier.changed or (redo == "changed" and earlier.ours):
         return None
     update = "--update to redo what changed, " if earlier.ours else ""
@@ -189,42 +200,43 @@ def _earlier_outcome(
         path=target,
         hint=f"Add {update}--overwrite to redo everything, or choose another place with -o",
     )
-    return Outcome(name, "changed", _error_document(error, name), error.exit_code)
+    return Outcome(member.name, "changed", _error_document(error, member.name), error.exit_code)
 
 
-def _failure(name: str, folder: Path, error: Exception) -> Outcome:
+def _failure(member: Member, error: Exception) -> Outcome:
     """Return what became of a capture that failed. Raises OutputError again, but for BusyError: it ends the batch."""
     from splinecli.locks import BusyError
 
+    name = member.name
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     if isinstance(error, SplinecliError):
-        return _failed(name, error)
+        return failed(name, error)
     if isinstance(error, OSError) and not is_out_of_memory(error):
         reason = error.strerror or str(error)
         if error.errno in _NO_ROOM:
             raise OutputError(f"cannot be written ({reason})", path=error.filename) from error
-        return _failed(name, InputError(f"cannot be read ({reason})", path=error.filename or folder))
+        return failed(name, InputError(f"cannot be read ({reason})", path=error.filename or member.folder))
     if is_out_of_memory(error):
         hint = "Use smaller images, or lower --batch-size"
-        return _failed(name, SplinecliError("there is not enough memory", path=folder, hint=hint))
+        return failed(name, SplinecliError("there is not enough memory", path=member.folder, hint=hint))
     defect = SplinecliError(
         f"{name}: {type(error).__name__}: {error}. This is a defect of splinecli",
         hint="Please report it with the lines above",
     )
-    return _failed(name, defect, "".join(traceback.format_exception(error)))
+    return failed(name, defect, "".join(traceback.format_exception(error)))
 
 
-def _failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
+def failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
+    """Return the outcome of a capture that failed."""
     return Outcome(name, "failed", _error_document(error, name), error.exit_code, trace)
 
 
-def _write_index(outcomes: Sequence[Outcome], output: Path, observer: Observer) -> None:
+def _write_index(entries: Sequence[Entry], output: Path, observer: Observer) -> None:
     """Write the page of all captures. Of those that changed it shows the results that were kept."""
     from splinecli.files import write_text
     from splinecli.publishing import held_folder
     from splinecli.results.index import INDEX, index_page, with_earlier
 
-    reports = [outcome.report for outcome in outcomes if outcome.status != "changed"]
     with held_folder(output, observer.warn, wait=True):
-        write_text(output / INDEX, index_page(with_earlier(reports, output)))
+        write_text(output / INDEX, index_page(with_earlier(entries, output)))

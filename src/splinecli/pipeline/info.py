@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions
 from splinecli.errors import UsageError
+from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
 from splinecli.pipeline.infer_options import LightForm, radiometric_calibration
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.transfer import AUTOMATIC
@@ -27,12 +28,6 @@ DISTILLED_PER_SECOND = 130_000
 
 STARTING_SECONDS = 3
 """Time that infer takes besides the pixels."""
-
-BASE_MIB = 500
-"""Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
-
-REFINED_PIXELS, REFINED_BYTES = 960**2, 1100
-"""The most pixels that are refined at once: a tile with its margin. Bytes of each."""
 
 ORIGINS = {
     "given": "given by --white-level",
@@ -258,9 +253,6 @@ def _seconds(summary: CaptureSummary) -> float:
 def _memory_mib(summary: CaptureSummary) -> float:
     import numpy as np
 
-    from splinecli.capture.capture_size import capture_bytes
-
     first = summary.images[0]
     largest = first.shape, np.dtype(first.dtype).itemsize
-    refined = REFINED_BYTES * min(summary.n_pixels, REFINED_PIXELS)
-    return BASE_MIB + (capture_bytes(largest, summary.n_pixels, summary.source.n_lights) + refined) / 2**20
+    return (BASE_BYTES + infer_bytes(largest, summary.n_pixels, summary.source.n_lights)) / 2**20

@@ -50,37 +50,50 @@ def row_of(report: Mapping[str, Any]) -> Row:
     )
 
 
-def index_page(reports: Sequence[Mapping[str, Any]]) -> str:
+class Entry(NamedTuple):
+    """What the page shows of one capture: its row, and the names of its files."""
+
+    row: Row
+    files: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> Entry:
+        """Return the entry of a report, or of a document with `capture` and `error`."""
+        return cls(row_of(report), tuple(report.get("files", ())))
+
+
+def index_page(entries: Sequence[Entry]) -> str:
     """Return the page that shows the normal maps and links the files. It belongs beside the captures' folders."""
     rows = []
-    for report in reports:
+    for row, files in entries:
         # As bytes, because a folder's name may not be valid text.
-        folder, files = quote(os.fsencode(report["capture"])), report.get("files", [])
+        folder = quote(os.fsencode(row.capture))
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
         rows.append(
             {
-                **row_of(report)._asdict(),
+                **row._asdict(),
                 "page": f"{folder}/{PAGE}" if PAGE in files else None,
                 "picture": None if picture is None else f"{folder}/{picture}",
                 "files": [(name, f"{folder}/{quote(name)}") for name in files],
             }
         )
-    return render("index.html", title=f"{len(reports)} captures", header=HEADER, rows=rows)
+    return render("index.html", title=f"{len(entries)} captures", header=HEADER, rows=rows)
 
 
-def with_earlier(reports: Sequence[Mapping[str, Any]], folder: Path) -> list[Mapping[str, Any]]:
-    """Return the reports, followed by those of other captures that have results in the folder, sorted by name."""
-    names = {report["capture"] for report in reports}
+def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
+    """Return the entries, followed by those of other captures that have results in the folder, sorted by name."""
+    names = {entry.row.capture for entry in entries}
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
+        if path.parent.name in names:
+            continue
         try:
-            report = read_json(path)
-            row_of(report)  # raises if this is not a report
+            entry = Entry.of(read_json(path))
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
-        if report["capture"] == path.parent.name not in names:
-            earlier.append(report)
-    return [*reports, *earlier]
+        if entry.row.capture == path.parent.name:
+            earlier.append(entry)
+    return [*entries, *earlier]
 
 
 def has_index(folder: Path) -> bool:

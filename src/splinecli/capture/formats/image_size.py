@@ -44,6 +44,11 @@ def limit_pixels(count: int) -> None:
     _max_pixels = count
 
 
+def most_pixels() -> int:
+    """Return the largest number of pixels of an image for this process."""
+    return _max_pixels
+
+
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:

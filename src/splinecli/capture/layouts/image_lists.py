@@ -34,6 +34,11 @@ def allow_images_elsewhere(allowed: bool) -> None:
     _elsewhere_allowed = allowed
 
 
+def images_elsewhere_allowed() -> bool:
+    """Return whether they may in this process."""
+    return _elsewhere_allowed
+
+
 def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.

@@ -110,4 +110,7 @@ STRICT = Option(
 
 JSON = Option(False, "--json", help="Print one JSON document on stdout, and nothing else.")
 JSON_LIST = Option(False, "--json", help="Print a JSON list of the reports on stdout, and nothing else.")
+JSON_LINES = Option(
+    False, "--jsonl", help="Print each report as one line of JSON on stdout when its capture ends."
+)
 QUIET = Option(False, "--quiet", "-q", help="Print nothing but errors.")

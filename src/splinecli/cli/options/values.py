@@ -12,6 +12,7 @@ from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
     from splinecli.calibration.circle import Circle
+    from splinecli.pipeline.connection import ClusterOptions
 
 
 _MOST_DIGITS = 18  # of a number of images
@@ -84,6 +85,29 @@ def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
     if not items:
         raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
     return items
+
+
+def parse_cluster(
+    workers: str, address: str | None, retries: int | None, *, gpu: bool = False
+) -> ClusterOptions | None:
+    """Return where --workers and --cluster let tasks be done; None for this process. Raises UsageError."""
+    from splinecli.pipeline.connection import RETRIES, ClusterOptions
+
+    if workers != "auto" and (not workers.isdecimal() or len(workers) > 4 or int(workers) < 1):
+        raise UsageError(f"--workers is {workers!r}; expected a number from 1, or auto")
+    if address is not None and workers != "1":
+        raise UsageError(
+            "--workers and --cluster contradict each other",
+            hint="Leave --workers out: the cluster has its workers",
+        )
+    if address is None and workers == "1":
+        if retries is not None:
+            raise UsageError("--retries concerns lost workers", hint="Add --workers or --cluster")
+        return None
+    number = 0 if workers == "auto" else int(workers)
+    return ClusterOptions(
+        workers=number, address=address, retries=RETRIES if retries is None else retries, gpu=gpu
+    )
 
 
 def parse_indices(text: str, option: str) -> list[int]:

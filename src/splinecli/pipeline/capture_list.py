@@ -1,0 +1,130 @@
+"""The captures of a batch: each folder once, with its name, and which of them belong to a shard."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splinecli.errors import InputError, UsageError
+
+_SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of `count` parts of a batch. `number` counts from 1.
+
+    Raises:
+        UsageError: there is no such part.
+    """
+
+    number: int
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.number <= self.count:
+            raise UsageError(
+                f"--shard is {self.number}/{self.count}; expected I/N with I from 1 to N",
+                hint="If your job numbers count from 0, add 1",
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Return the shard of "3/8". Raises UsageError."""
+        found = _SHARD.fullmatch(text)
+        if found is None:
+            raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
+        return cls(int(found[1]), int(found[2]))
+
+    def choose(self, folders: Sequence[Path]) -> list[Path]:
+        """Return every N-th folder, in the order given.
+
+        The folders are counted in the order of their bytes. A shell sorts captures/* by its language, and the machines
+        of a cluster may differ in that.
+        """
+        chosen = set(sorted(folders, key=os.fsencode)[self.number - 1 :: self.count])
+        return [folder for folder in folders if folder in chosen]
+
+
+@dataclass(frozen=True)
+class Member:
+    """A capture of a batch.
+
+    Args:
+        folder: its folder.
+        name: the name of the capture, also if the folder does not exist.
+        missing: why the capture cannot be read, if there is no such folder.
+    """
+
+    folder: Path
+    name: str
+    missing: InputError | None = None
+
+
+def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
+    """Return the captures in the order given. A folder that is given twice counts once.
+
+    Raises:
+        UsageError: two captures have the same name, or a "folder" that does not exist is the name of a map, format or
+            method.
+    """
+    folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
+    chosen = folders if shard is None else shard.choose(folders)
+    # Also of the other shards, because their results go to the same place.
+    members = {folder: _member(folder) for folder in folders}
+    _check_names({folder: member.name for folder, member in members.items() if member.missing is None})
+    return [members[folder] for folder in chosen]
+
+
+def _own_path(folder: Path) -> Path:
+    """Return one path for all spellings of a folder. A link keeps its name, because its results have it."""
+    from splinecli.capture.paths import resolve
+
+    try:
+        return resolve(folder) if ".." in folder.parts else folder.absolute()
+    except InputError:
+        return folder  # what is wrong with it is reported when its turn comes
+
+
+def _member(folder: Path) -> Member:
+    """Return the capture in the folder. Raises UsageError for a word of another option."""
+    from splinecli.capture.paths import find_mode
+    from splinecli.methods import method_names
+    from splinecli.results.files import MAPS, NORMALS
+
+    try:
+        exists = find_mode(folder) is not None
+    except InputError:
+        exists = True  # what is wrong with it is reported when its turn comes
+    if exists:
+        return Member(folder, _name(folder))
+    if str(folder) in (*MAPS, *NORMALS, *method_names()):
+        raise UsageError(
+            "the folder does not exist",
+            path=folder,
+            hint="Write lists with commas, such as --maps albedo,confidence",
+        )
+    return Member(folder, folder.name or str(folder), InputError("the folder does not exist", path=folder))
+
+
+def _name(folder: Path) -> str:
+    from splinecli.capture import capture_name
+
+    try:
+        return capture_name(folder)
+    except InputError:
+        return folder.name  # what is wrong with it is reported when its turn comes
+
+
+def _check_names(names: Mapping[Path, str]) -> None:
+    seen: dict[str, Path] = {}
+    for folder, name in names.items():
+        other = seen.setdefault(name, folder)
+        if other is not folder:
+            raise UsageError(
+                f"{other} and {folder} have the same name, so their results would overwrite each other",
+                hint="Run them one by one with different -o",
+            )

@@ -1,0 +1,72 @@
+"""The memory that `infer` takes for a capture, known before its images are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from splinecli.errors import SplinecliError
+
+if TYPE_CHECKING:
+    from splinecli.capture.capture_size import StoredSize
+    from splinecli.pipeline.capture_list import Member
+    from splinecli.pipeline.infer_options import InferOptions
+
+BASE_BYTES = 500 * 2**20
+"""Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
+
+REFINED_PIXELS, REFINED_BYTES = 960**2, 1100
+"""The most pixels that are refined at once: a tile with its margin. Bytes of each."""
+
+_WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
+_ASKED = 16  # captures that stand for a batch
+
+
+def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
+    """Return the bytes of memory that spline-net takes for a capture, beside BASE_BYTES.
+
+    Args:
+        largest: the size of the largest image.
+        n_pixels: the number of the mask's pixels.
+        n_lights: the number of images that are read.
+    """
+    from splinecli.capture.capture_size import capture_bytes
+
+    return capture_bytes(largest, n_pixels, n_lights) + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+
+
+def expected_bytes(member: Member, options: InferOptions) -> float:
+    """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
+
+    A capture that cannot be read takes none: it will fail soon.
+    """
+    import numpy as np
+
+    from splinecli.capture.formats.decoding import stored_size
+
+    try:
+        source = options.open(member.folder)
+        size = stored_size(source.files.images[0])
+        n_lights = options.n_lights or len(options.light_indices or ()) or source.n_lights
+        n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
+        n_bytes = infer_bytes(size, n_pixels, n_lights)
+        if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):
+            n_bytes = infer_bytes(size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights)
+    except (SplinecliError, OSError, MemoryError):
+        return 0.0
+    return float(n_bytes)
+
+
+def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
+    """Return how many captures this machine can compute side by side: by its cores, and by its memory.
+
+    A GPU computes one at a time.
+    """
+    from splinecli.devices import choose_device, count_available_cores
+    from splinecli.memory import available_memory
+
+    if choose_device(options.device).type == "cuda":
+        return 1
+    asked = members[:: max(1, len(members) // _ASKED)]
+    each = BASE_BYTES + max((expected_bytes(member, options) for member in asked), default=0.0)
+    return int(max(1, min(count_available_cores(), len(members), available_memory() / each)))

@@ -1,0 +1,126 @@
+"""The connection to a Dask cluster: one that runs already, or one of processes of this machine."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splinecli.errors import UsageError
+from splinecli.extras import import_extra
+from splinecli.files import read_json
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+RETRIES = 2
+"""How often a task is done again whose worker was lost, unless the user says otherwise."""
+
+_CONNECT_SECONDS = 8.0
+_CLOSE_SECONDS = 5.0
+_LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterOptions:
+    """Where tasks are done.
+
+    Args:
+        workers: the number of processes of this machine, if there is no `address`.
+        address: the address of a Dask scheduler, or its scheduler file.
+        retries: how often a task is done again whose worker was lost.
+        gpu: whether only workers with the Dask resource GPU are used.
+    """
+
+    workers: int = 1
+    address: str | None = None
+    retries: int = RETRIES
+    gpu: bool = False
+
+
+@contextmanager
+def connected(options: ClusterOptions) -> Iterator[Client]:
+    """Yield a Dask client: of a new cluster of this machine's processes, or of a running one.
+
+    Raises:
+        UsageError: Dask is not installed, or there is no scheduler at the address.
+        InputError: the scheduler file cannot be read.
+    """
+    distributed = import_extra("distributed", "cluster")
+    for name in _LOGGERS:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", category=distributed.versions.VersionMismatchWarning)
+    if options.address is None:
+        with _local_cluster(options) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+            yield client
+        return
+    address = _address(options.address)
+    try:
+        client = distributed.Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(
+            f"no Dask scheduler answers at {address}",
+            hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
+        ) from error
+    try:
+        yield client
+    finally:
+        with suppress(OSError, TimeoutError):
+            client.close(timeout=_CLOSE_SECONDS)
+
+
+@contextmanager
+def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
+    """Yield a Dask cluster of processes of this machine, each with its share of the cores."""
+    import dask
+    from distributed import LocalCluster
+
+    from splinecli.devices import count_available_cores
+
+    threads = max(1, min(count_available_cores() // options.workers, _threads_of_user()))
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    settings = {
+        "distributed.nanny.pre-spawn-environ": {
+            **dict.fromkeys(names, threads),
+            "OMP_WAIT_POLICY": "passive",
+        },
+        "logging": dict.fromkeys(_LOGGERS, "critical"),
+    }
+    with dask.config.set(settings):
+        cluster = LocalCluster(
+            n_workers=options.workers,
+            threads_per_worker=1,
+            memory_limit=0,  # what is free on the machine is shared out by Distributor
+            resources={"GPU": 1} if options.gpu else None,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        )
+        try:
+            yield cluster
+        finally:
+            cluster.close(timeout=_CLOSE_SECONDS)
+
+
+def _threads_of_user() -> float:
+    """Return the threads that OMP_NUM_THREADS allows."""
+    number = os.environ.get("OMP_NUM_THREADS", "")
+    return int(number) if number.isdecimal() else math.inf
+
+
+def _address(text: str) -> str:
+    """Return the address of a scheduler, which may be in a scheduler file. Raises UsageError."""
+    if "://" in text:
+        return text
+    try:
+        return str(read_json(Path(text))["address"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(
+            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a scheduler file",
+            hint="'dask scheduler --scheduler-file FILE' writes such a file",
+        ) from None

@@ -1,0 +1,254 @@
+"""Tasks on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many captures."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import worker_tasks
+from splinecli.cli.main import main
+from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
+from splinecli.pipeline import batch_on_workers, connection
+from splinecli.pipeline.batch import infer_batch
+from splinecli.pipeline.capture_list import list_captures
+from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
+from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.observer import SILENT
+
+distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+from splinecli.pipeline.worker import Work  # noqa: E402 - it may be imported without Dask, too
+
+GB = 10**9
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two worker processes of 4 GB. A worker that is killed is replaced."""
+    with connection._local_cluster(ClusterOptions(workers=2)) as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def client(cluster: Any) -> Iterator[Any]:
+    with distributed.Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+@pytest.fixture
+def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Work]:
+    monkeypatch.chdir(tmp_path)
+
+    def make(do: Callable[..., Any]) -> Work:
+        return Work.of_this_process(str(tmp_path), worker_tasks.get_ready, do, tmp_path / "probe")
+
+    return make
+
+
+def run(client: Any, work: Work, tasks: list[Task], **options: Any) -> dict[int, Any]:
+    distributor = Distributor(client, work, ClusterOptions(**options), SILENT)
+    return {task.args[0]: result for task, result in distributor.run(tasks)}
+
+
+def numbered(numbers: range, memory: float = 0) -> list[Task]:
+    return [Task((number,), f"task{number}", memory) for number in numbers]
+
+
+@pytest.mark.parametrize("retries", [0, 2])
+def test_a_task_that_kills_its_workers(client, work, tmp_path, retries):
+    results = run(client, work(worker_tasks.die_of_thirteen), numbered(range(20)), retries=retries)
+    error = results.pop(13)
+    assert isinstance(error, LostError) and error.exit_code == 1
+    times = "once" if retries == 0 else "3 times"
+    assert str(error).startswith(f"task13: its worker was lost {times}, the last one tcp://")
+    assert (tmp_path / "begun-13").read_text() == "x" * (retries + 1)
+    assert results == {number: 2 * number for number in range(20) if number != 13}
+    assert all((tmp_path / f"begun-{number}").read_text() == "x" for number in results)
+
+
+def test_tasks_share_the_memory_of_a_machine(client, work, monkeypatch):
+    """Two tasks of two thirds of the memory run one after the other, small ones side by side."""
+    two_thirds = batch_on_workers_memory(client, work) * 2 / 3
+    alone = run(client, work(worker_tasks.count_neighbours), numbered(range(6), two_thirds))
+    assert set(alone.values()) == {1}
+    beside = run(client, work(worker_tasks.count_neighbours), numbered(range(20), two_thirds / 4))
+    assert 2 in beside.values()
+    # A machine without any task takes one that seems too large: the capture itself checks its memory.
+    assert set(run(client, work(worker_tasks.count_neighbours), numbered(range(2), 1e18)).values()) == {1}
+
+
+def batch_on_workers_memory(client: Any, work: Callable[..., Work]) -> float:
+    distributor = Distributor(client, work(worker_tasks.double), ClusterOptions(), SILENT)
+    list(distributor.run(numbered(range(1))))
+    return min(distributor._free_memory.values())
+
+
+def test_a_task_for_no_worker(client, work):
+    """A limit that Dask holds a worker to is known before the task kills the worker."""
+    client.run(worker_tasks.set_resources, MEMORY=4 * GB)
+    try:
+        results = run(client, work(worker_tasks.double), [*numbered(range(2), GB), Task((2,), "big", 5 * GB)])
+    finally:
+        client.run(worker_tasks.set_resources, MEMORY=1000 * GB)
+    assert str(results.pop(2)).startswith(
+        "big: it takes about 5.0 GB of memory, but the largest worker has 4.0 GB."
+    )
+    assert results == {0: 0, 1: 2}
+
+
+def test_workers_that_do_not_fit(client, work, tmp_path):
+    good = work(worker_tasks.double)
+    cases = {
+        "found splinecli [0-9.]+, expected 9.9 as on this machine": (
+            UsageError, replace(good, versions={**good.versions, "splinecli": "9.9"}),
+        ),
+        "nowhere: the folder cannot be entered": (InputError, replace(good, folder="nowhere")),
+        "elsewhere: the folder is not the one of this machine": (
+            InputError, replace(good, probe=str(tmp_path / "elsewhere/probe")),
+        ),
+    }  # fmt: skip
+    for message, (kind, other) in cases.items():
+        (tmp_path / "elsewhere").mkdir(exist_ok=True)
+        distributor = Distributor(client, other, ClusterOptions(), SILENT)
+        distributor._make_probe = lambda: None
+        with pytest.raises(kind, match=rf"{message}.* \(on the worker tcp://"):
+            list(distributor.run(numbered(range(3))))
+
+
+def test_gpu_workers_only(client, work):
+    with pytest.raises(UsageError, match="no worker has the Dask resource GPU"):
+        run(client, work(worker_tasks.double), numbered(range(3)), gpu=True)
+    client.run(worker_tasks.set_resources, GPU=1)
+    try:
+        assert run(client, work(worker_tasks.double), numbered(range(3)), gpu=True) == {0: 0, 1: 2, 2: 4}
+    finally:
+        client.run(worker_tasks.set_resources, GPU=0)
+
+
+def write_captures(names: list[str]) -> list[str]:
+    """Write small captures of different content into the working folder; `broken` has no images."""
+    lights = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    for seed, name in enumerate(names):
+        Path(name).mkdir()
+        np.savetxt(Path(name) / "lights.txt", lights)
+        for number in range(len(lights) if name != "broken" else 0):
+            image = np.random.default_rng([seed, number]).integers(20_000, 50_000, (12, 15), np.uint16)
+            cv2.imwrite(f"{name}/{number}.png", image)
+    return names
+
+
+def results_in(folder: str) -> dict[str, bytes]:
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in Path(folder).glob("*/*")}
+    measured = rb'"(seconds": \{[^}]*\}|peak_memory_mib": [0-9.]+)'
+    return {name: re.sub(measured, b"", files[name]) for name in files}
+
+
+def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    names = [*write_captures(["b", "broken", "a", "c", "d"]), "missing"]
+    call = ["infer", *names, "--maps", "albedo", "--method", "ls"]
+
+    def documents(*more: str) -> list[dict[str, Any]]:
+        assert main([*call, *more, "--jsonl"]) == 3
+        lines = capfd.readouterr().out.splitlines()
+        return sorted(map(json.loads, lines), key=lambda document: document["capture"])
+
+    def comparable(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{**document, "seconds": None, "peak_memory_mib": None} for document in found]
+
+    alone = documents("-o", "out")
+    expected = results_in("out")
+    Path("out").rename("alone")
+    together = documents("-o", "out", "--cluster", cluster.scheduler_address)
+    assert comparable(together) == comparable(alone)
+    assert results_in("out") == expected
+    rows = [
+        re.findall(r'<th scope="row">.*', Path(f"{place}/index.html").read_text())
+        for place in ("out", "alone")
+    ]
+    assert rows[0] == rows[1] and len(rows[0]) == len(names)
+    assert sorted(path.name for path in Path("out").iterdir()) == ["a", "b", "c", "d", "index.html"]
+    # What is done is skipped: the reports have the seconds of the first run.
+    Path("scheduler.json").write_text(json.dumps({"address": cluster.scheduler_address}))
+    assert documents("-o", "out", "--cluster", "scheduler.json") == together
+
+
+def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    call = ["infer", *write_captures(["a", "b", "c", "d"]), "--method", "ls"]
+    assert main([*call, "-o", "out", "-q"]) == 0
+    expected = results_in("out")
+    Path("out").rename("alone")
+    assert main([*call, "-o", "out", "--workers", "2"]) == 0
+    assert results_in("out") == expected
+    out, err = capfd.readouterr()
+    assert out.count("\n") == 4 and err.endswith("4 captures: 4 done; see out/index.html\n")
+
+
+def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = [Path(name) for name in write_captures(["a"])]
+    weights = SimpleNamespace(weights={"sha256": "1234"})
+    monkeypatch.setattr(batch_on_workers, "make_method", lambda options: weights)
+    options = ClusterOptions(address=cluster.scheduler_address)
+    with pytest.raises(ModelError, match="expected 1234 as on the machine of the command"):
+        list(infer_batch(folders, InferOptions(method="cnn-ps"), cluster=options))
+    assert not Path("out").exists()
+
+
+def test_an_output_that_cannot_be_written_ends_the_batch(cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = [Path(name) for name in write_captures(["a", "b"])]
+    Path("out").mkdir()
+    Path("out/a").write_text("a file")
+    options = ClusterOptions(address=cluster.scheduler_address)
+    with pytest.raises(OutputError, match=r"out/a: .*\(on the worker tcp://"):
+        list(infer_batch(folders, InferOptions(method="ls"), cluster=options))
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:1", "strange://x", "none.json", "broken.json", "tcp://"]
+)
+def test_no_scheduler(address, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("broken.json").write_text("{}")
+    monkeypatch.setattr(connection, "_CONNECT_SECONDS", 0.2)
+    with (
+        pytest.raises(UsageError, match=r"no Dask scheduler answers at|expected an address such as"),
+        connection.connected(ClusterOptions(address=address)),
+    ):
+        pass
+
+
+def test_errors_travel(client):
+    for error in (
+        InputError("wrong", path="a", line=3, hint="Do it"),
+        OutputError("full"),
+        SplinecliError("x"),
+    ):
+        found = client.submit(lambda error: error, error, pure=False).result()
+        assert (type(found), str(found), vars(found)) == (type(error), str(error), vars(error))
+
+
+def test_the_number_of_workers(tmp_path, monkeypatch):
+    """Captures of 12 x 15 pixels take little; the machine of the test has four cores and memory for three."""
+    monkeypatch.chdir(tmp_path)
+    members = list_captures([Path(name) for name in write_captures(["a", "broken", "c", "d", "e"])])
+    options = InferOptions(method="ls")
+    assert 0 < expected_bytes(members[0], options) < 10**6
+    assert expected_bytes(members[1], options) == 0
+    monkeypatch.setattr("splinecli.devices.count_available_cores", lambda: 4)
+    monkeypatch.setattr("splinecli.memory.available_memory", lambda: 1.7e9)
+    assert choose_workers(members, options) == 3
+    assert choose_workers(members[:2], options) == 2

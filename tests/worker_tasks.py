@@ -1,0 +1,40 @@
+"""Tasks for workers in other processes, which import this file. They note in a folder what happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+
+def get_ready(folder: str) -> None:
+    (Path(folder) / f"ready-{os.getpid()}").touch()
+
+
+def double(folder: str, number: int) -> int:
+    return 2 * number
+
+
+def die_of_thirteen(folder: str, number: int) -> int:
+    """Return the double; a task of number 13 kills its worker."""
+    with (Path(folder) / f"begun-{number}").open("a") as file:
+        file.write("x")
+    if number == 13:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 2 * number
+
+
+def count_neighbours(folder: str, number: int) -> int:
+    """Return how many tasks run now, this one among them."""
+    mark = Path(folder) / f"running-{number}"
+    mark.touch()
+    time.sleep(0.05)
+    running = len(list(Path(folder).glob("running-*")))
+    mark.unlink()
+    return running
+
+
+async def set_resources(dask_worker: Any, **resources: float) -> None:
+    await dask_worker.set_resources(**resources)
