@@ -40,6 +40,7 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
         wants_json = JSON in args and any(JSON in parameter.opts for parameter in self.params)
+        wants_lines = JSON_LINES in args and ctx.info_name == INFER
         try:
             return super().parse_args(ctx, args)
         except Exception as error:
@@ -47,7 +48,7 @@ class Command(TyperCommand):
                 error.ctx = ctx  # type: ignore[attr-defined]
             if wants_json and isinstance(error, ParserError):
                 print_error_document(error, as_list=ctx.info_name == INFER)
-            elif JSON_LINES in args and ctx.info_name == INFER and isinstance(error, ParserError):
+            elif wants_lines and isinstance(error, ParserError):
                 print(json.dumps(batch_error_document(error)))
             raise
 
