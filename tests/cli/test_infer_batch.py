@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import json
 import os
@@ -208,6 +209,12 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
     assert all((Path("out") / unquote(link)).is_file() for link in links)
     assert "found neither PNG, TIFF nor JPEG" in index
+    pages = re.findall(r'<img src="data:image/jpeg;base64,([^"]+)" alt="Normal map of ([^"]+)"', index)
+    assert [name for _, name in pages] == ["sphere", "a b"]
+    normals = cv2.imread("out/sphere/normals.png", cv2.IMREAD_UNCHANGED) / 257
+    small = cv2.imdecode(np.frombuffer(base64.b64decode(pages[0][0]), np.uint8), cv2.IMREAD_COLOR)
+    assert small.shape == normals.shape  # it is small already
+    assert np.abs(small - normals).mean() < 7  # JPEG halves the resolution of colours; exchanged channels: 40
     assert run("infer", *captures).code == 3  # our own index is replaced
     # Later results in the same place join it, and those of a single capture, too.
     make_capture("fourth")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -16,7 +17,7 @@ from html_page import HtmlPage
 from splinecli.normals import angle_between_deg, unit
 from splinecli.pictures.maps import albedo_picture
 from splinecli.results import page as page_module
-from splinecli.results.page import LONGEST_SIDE, result_page
+from splinecli.results.page import result_page
 from splinecli.transfer import decode_transfer, encode_srgb
 
 REPORT: dict[str, Any] = {
@@ -38,6 +39,7 @@ REPORT: dict[str, Any] = {
 }
 HOSTILE = """</script><script>document.title = "x"</script>'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
 SIDE = 256  # pixels, of the sphere
+LONGEST_SIDE = 1600  # of a reduced map
 
 
 def sphere(side: int = SIDE) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -167,9 +169,10 @@ def test_the_normals_survive() -> None:
     assert angle_between_deg(decoded, normals)[mask].max() < 0.02
 
 
-def test_large_maps_are_reduced() -> None:
+def test_large_maps_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flat faces side by side keep their normals and colours: the background does not change the means."""
-    width, height = 2 * LONGEST_SIDE, 301
+    monkeypatch.setattr(page_module, "LARGEST_MAP", LONGEST_SIDE * 150)
+    width, height = 2 * LONGEST_SIDE, 300
     faces = unit(np.array([[0.6, 0.2, 0.5], [-0.9, 0.1, 0.3]], np.float32))
     mask = np.ones((height, width), bool)
     mask[:101] = False
@@ -180,6 +183,7 @@ def test_large_maps_are_reduced() -> None:
     decoded = page.normals()
     assert decoded.shape == (150, LONGEST_SIDE, 3)
     assert page.facts["Size on this page"] == "1600 × 150"
+    assert "This page shows 1600 × 150 of the 3200 × 300 pixels." in " ".join(page.text["p"])
     for face, half in zip(faces, np.split(decoded, 2, axis=1), strict=True):
         shown = half.any(axis=2)
         assert shown[51:].all()
@@ -191,18 +195,39 @@ def test_large_maps_are_reduced() -> None:
         assert np.ptp(colours, axis=0).max() <= 1  # rounding alone, no background
 
 
-def view(open_page: OpenPage, html: str, fragment: str, *, webgl: bool = True) -> NDArray[np.uint8]:
-    """A screenshot of the view, (SIDE, SIDE, 3) RGB, one screen pixel for each pixel of the map."""
+CHANGE = """
+async (fragment) => {
+  const changed = new Promise((resolve) => addEventListener("hashchange", resolve, { once: true }));
+  location.hash = fragment;
+  await changed;
+  for (let frame = 0; frame < 2; frame++) await new Promise(requestAnimationFrame);
+}
+"""
+
+
+def views(
+    open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bool = True
+) -> list[NDArray[np.int64]]:
+    """Screenshots of the view, (SIDE, SIDE, 3) RGB, one screen pixel for each pixel of the map."""
     # At the window's edge the view would be under the place where a headless browser's pointer rests.
     edge = 64
-    style = f"#view {{ position: fixed; left: {edge}px; top: {edge}px; width: {SIDE}px; border-radius: 0 }}"
-    page = open_page(html.replace("</head>", f"<style>{style}</style></head>"), fragment, webgl=webgl)
+    style = (
+        f".surface {{ position: fixed !important; left: {edge}px; top: {edge}px; width: {SIDE}px !important }}"
+        "#view { border-radius: 0 }"
+    )
+    page = open_page(html.replace("</head>", f"<style>{style}</style></head>"), fragments[0], webgl=webgl)
     page.evaluate("splinecli.ready")
     assert page.evaluate("document.getElementById('view').dataset.renderer") == (
         "webgl" if webgl else "software"
     )
-    png = page.screenshot(clip={"x": edge, "y": edge, "width": SIDE, "height": SIDE})
-    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
+    seen = []
+    for fragment in fragments:
+        if fragment != fragments[0]:
+            page.evaluate(CHANGE, fragment)
+        png = page.screenshot(clip={"x": edge, "y": edge, "width": SIDE, "height": SIDE})
+        picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        seen.append(np.asarray(picture[..., ::-1], np.int64))
+    return seen
 
 
 def light_at(x: float, y: float) -> NDArray[np.float64]:
@@ -213,8 +238,9 @@ def light_at(x: float, y: float) -> NDArray[np.float64]:
 def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = sphere()
     html = result_page(REPORT, normals, mask)
-    for x, y in ((-0.7, 0.5), (0.6, -0.3)):
-        seen = view(open_page, html, f"light={x},{y}&specular=0", webgl=webgl).astype(int)
+    lights = ((-0.7, 0.5), (0.6, -0.3), (0.1, 0.9))
+    pictures = views(open_page, html, [f"light={x},{y}&specular=0" for x, y in lights], webgl=webgl)
+    for (x, y), seen in zip(lights, pictures, strict=True):
         expected = encode_srgb(np.maximum(normals @ light_at(x, y), 0)).astype(int)
         # Half a level each for the screen and the picture, and one where sRGB is steep: 13 bits of the normal there.
         assert np.abs(seen - expected[..., None]).max() <= 2
@@ -226,7 +252,7 @@ def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -
 def test_an_enlarged_view_interpolates_normals(open_page: OpenPage) -> None:
     """The view interpolates normals, not the two bytes that store them, which would be off by up to 25 levels."""
     html = result_page(REPORT, *sphere(SIDE // 4))
-    seen = view(open_page, html, "light=-0.7,0.5&specular=0").astype(int)
+    [seen] = views(open_page, html, ["light=-0.7,0.5&specular=0"])
     normals, _ = sphere()
     expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
     # Away from the outline and the terminator, whose bends four pixels cannot follow.
@@ -242,9 +268,8 @@ def test_the_script_decodes_what_the_page_encodes(
     expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
     for webgl in (True, False):
         monkeypatch.setattr(page_module, "LOW_BITS", 3)
-        seen = view(
-            open_page, result_page(REPORT, normals, mask), "light=-0.7,0.5&specular=0", webgl=webgl
-        ).astype(int)
+        html = result_page(REPORT, normals, mask)
+        [seen] = views(open_page, html, ["light=-0.7,0.5&specular=0"], webgl=webgl)
         bright = expected > 100  # 11 bits are too few for the steep part of sRGB's curve
         assert np.abs(seen - expected[..., None])[bright].max() <= 2
 
@@ -267,57 +292,198 @@ def test_a_glossy_sphere_of_two_colours(open_page: OpenPage) -> None:
 
     html = result_page(REPORT, normals, mask, albedo=albedo)
     fragment = f"light=-0.5,0.4&specular={gain}&shininess={shininess}"
-    for base, choice in ((stored, ""), (1, "&albedo=0")):
-        seen = view(open_page, html, fragment + choice)
+    for base, seen in zip(
+        (stored, 1), views(open_page, html, [fragment, f"{fragment}&albedo=0"]), strict=True
+    ):
         expected = encode_srgb(((1 - gain) * base + gain * lobe) * cosine)
-        assert np.abs(seen.astype(int) - expected).max() <= 3
+        assert np.abs(seen - expected).max() <= 3
 
 
-INTERACTION = """
-async () => {
-  await splinecli.ready;
-  const view = document.getElementById("view"), box = view.getBoundingClientRect(), seen = {};
-  const radius = Math.min(box.width, box.height) / 2;
-  const note = (name) => { seen[name] = splinecli.light; };
-  const point = (type, x, y, pointerType) => view.dispatchEvent(new PointerEvent(type, {
-    clientX: box.left + box.width / 2 + x * radius, clientY: box.top + box.height / 2 - y * radius, pointerType,
-  }));
-  const press = (key) => view.dispatchEvent(new KeyboardEvent("keydown", { key }));
-  note("first");
-  point("pointermove", 0, 0, "mouse"); note("centre");
-  press("ArrowRight"); press("ArrowUp"); press("ArrowUp"); note("arrows");
-  point("pointermove", 3, 4, "mouse"); note("beyond");
-  point("pointerdown", 0.3, 0.3, "mouse"); point("pointermove", -0.5, 0, "mouse"); note("held");
-  point("pointermove", -0.2, 0.1, "touch"); note("touch");
-  splinecli.setLight(NaN, 0); note("nonsense");
-  splinecli.setLight(0.1, -0.2); note("set");
-  return seen;
-}
-"""
+def glossy(n: NDArray[np.floating], light: NDArray[np.floating], exponent: float) -> NDArray[np.floating]:
+    return np.maximum(n @ unit(light + np.array((0, 0, 1))), 0) ** exponent
 
 
 @pytest.mark.parametrize("webgl", [True, False])
-def test_pointer_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
+def test_views_ambient_light_and_confidence(open_page: OpenPage, webgl: bool) -> None:
+    normals, mask = sphere()
+    light, ambient = light_at(0.8, -0.1), 0.4
+    confidence = np.where(np.arange(SIDE) < SIDE // 2, np.float32(1), np.float32(0.2)) * mask
+    html = result_page(REPORT, normals, mask, confidence_map=confidence)
+    cosine = np.maximum(normals @ light, 0)
+    sky = (1 + normals[..., 2]) / 2
+    expected = {
+        "view=shaded&specular=0": encode_srgb(cosine),
+        "view=normals": np.rint(255 * (normals + 1) / 2) * mask[..., None],
+        "view=specular&shininess=32": encode_srgb(0.4 * cosine + 0.7 * glossy(normals, light, 32)),
+        f"view=shaded&ambient={ambient}": encode_srgb((1 - ambient) * cosine + ambient * sky),
+        "ambient=0&confidence=1": encode_srgb(cosine),
+    }
+    pictures = views(open_page, html, [f"light=0.8,-0.1&{choice}" for choice in expected], webgl=webgl)
+    sure = mask & (np.arange(SIDE) < SIDE // 2 - 1)
+    for (choice, picture), seen in zip(expected.items(), pictures, strict=True):
+        picture = picture if picture.ndim == 3 else picture[..., None]
+        assert np.abs(seen - picture)[sure].max() <= 3, choice
+        assert not seen[~mask].any()
+    share = 0.8 * 0.8  # the strongest overlay, of which the pixels with a confidence of 0.2 get 0.8
+    red = encode_srgb(cosine[..., None] * (1 - share) + np.array((0.9, 0.25, 0.1)) * share)
+    doubtful = mask & (np.arange(SIDE) > SIDE // 2)
+    assert np.abs(pictures[-1] - red)[doubtful].max() <= 3
+
+
+@pytest.mark.parametrize("webgl", [True, False])
+def test_zoom_shows_a_part_of_the_same_picture(open_page: OpenPage, webgl: bool) -> None:
+    """Zoom 2 around (80, 100) shows the map's pixels 16 to 144 and 36 to 164; the sphere is known at any place."""
+    html = result_page(REPORT, *sphere())
+    [seen] = views(open_page, html, ["light=-0.7,0.5&specular=0&zoom=2,80,100"], webgl=webgl)
+    whole, _ = sphere(2 * SIDE)
+    normals = whole[2 * 36 : 2 * 164, 2 * 16 : 2 * 144]
+    expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
+    smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
+    # Without WebGL, the nearest pixel of the map is shown: at most 1/4 of a pixel away, where shading has this slope.
+    assert np.abs(seen - expected[..., None])[smooth].max() <= (3 if webgl else 6)
+
+
+def test_a_reduced_view_is_a_reduced_picture(open_page: OpenPage) -> None:
+    """Where the map is larger than the view, its shaded pixels are averaged, not its normals."""
+    random = np.random.default_rng(0)
+    normals = unit(random.normal(size=(4 * SIDE, 4 * SIDE, 3)) * (1, 1, 0.2) + (0, 0, 1)).astype(np.float32)
+    html = result_page(REPORT, normals, np.ones(normals.shape[:2], bool))
+    [seen] = views(open_page, html, ["light=0.5,0.5&specular=0"])
+    shaded = np.maximum(normals @ light_at(0.5, 0.5), 0).reshape(SIDE, 4, SIDE, 4).mean((1, 3))
+    assert np.abs(seen - encode_srgb(shaded)[..., None]).max() <= 2
+
+
+def wait_until(page: Any, condition: str) -> None:
+    """Wait in the page; its policy refuses the polling of Playwright."""
+    page.evaluate(f"async () => {{ while (!({condition})) await new Promise(requestAnimationFrame); }}")
+
+
+def lights_are(page: Any, x: float, y: float, note: str) -> None:
+    np.testing.assert_allclose(page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note)
+
+
+@pytest.mark.parametrize("webgl", [True, False])
+def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
     normals, mask = sphere()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
     errors = np.where(mask, np.float32(3), np.nan)
-    html = result_page(report, normals, mask, albedo=normals + 1, error_map_deg=errors)
-    page = open_page(html, width=400, height=800, webgl=webgl)
-    seen = page.evaluate(INTERACTION)
-    assert page.evaluate("document.getElementById('view').dataset.renderer") == (
-        "webgl" if webgl else "software"
+    confidence = mask.astype(np.float32)
+    html = result_page(
+        report, normals, mask, albedo=normals + 1, confidence_map=confidence, error_map_deg=errors
     )
+    page = open_page(html, width=400, height=800, webgl=webgl)
+    page.evaluate("splinecli.ready")
+    canvas = page.locator("#view")
+    assert canvas.get_attribute("data-renderer") == ("webgl" if webgl else "software")
     assert page.locator("#notice").is_visible() is not webgl
+    assert not page.locator("#loading").is_visible()
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
-    lights = {
-        "first": (-0.72, 0.48),  # the preview's raking light, from the upper left
-        "centre": (0, 0),
-        "arrows": (0.05, 0.1),
-        "beyond": (0.6 * 0.995, 0.8 * 0.995),
-        "held": (0.3, 0.3),
-        "touch": (-0.2, 0.1),
-        "nonsense": (-0.2, 0.1),
-        "set": (0.1, -0.2),
-    }
-    for name, (x, y) in lights.items():
-        np.testing.assert_allclose(seen[name], light_at(x, y), atol=2e-3, err_msg=name)
+    lights_are(page, -0.72, 0.48, "the preview's raking light, from the upper left")
+
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    assert box is not None
+    radius = box["width"] / 2
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        return box["x"] + radius * (1 + x), box["y"] + radius * (1 - y)
+
+    page.mouse.move(*at(0, 0))
+    lights_are(page, 0, 0, "centre")
+    canvas.focus()
+    for key in ("ArrowRight", "ArrowUp", "ArrowUp"):
+        page.keyboard.press(key)
+    lights_are(page, 0.05, 0.1, "arrows")
+    page.mouse.move(*at(0.95, 0.95))
+    lights_are(page, 0.995 * 0.5**0.5, 0.995 * 0.5**0.5, "beyond the disc")
+    page.mouse.move(*at(0.3, 0.3))
+    page.mouse.down()
+    page.mouse.up()
+    page.mouse.move(*at(-0.5, 0))
+    lights_are(page, 0.3, 0.3, "held")
+    page.evaluate("splinecli.setLight(NaN, 0)")
+    lights_are(page, 0.3, 0.3, "nonsense")
+
+    # The wheel zooms around the pointer, which is over a quarter of the map.
+    page.mouse.wheel(0, -300)
+    wait_until(page, "splinecli.region[2] < 200")
+    left, top, width, height = page.evaluate("splinecli.region")
+    np.testing.assert_allclose((left, top, width, height), (32, 64, 128, 128), atol=1)
+    # The picture follows the drag, an eighth of the view to the left and a quarter up; the light stays.
+    page.mouse.down()
+    page.mouse.move(*at(-0.75, 0.5), steps=3)
+    page.mouse.up()
+    np.testing.assert_allclose(page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2)
+    lights_are(page, 0.3, 0.3, "dragged")
+    page.keyboard.press("Shift+ArrowLeft")
+    np.testing.assert_allclose(page.evaluate("splinecli.region")[0], 48 - 12.8, atol=2)
+    page.keyboard.press("+")
+    np.testing.assert_allclose(page.evaluate("splinecli.region")[2], 128 / 1.25, atol=1)
+    page.keyboard.press("0")
+    assert page.evaluate("splinecli.region") == [0, 0, SIDE, SIDE]
+    page.evaluate("splinecli.show(1e9, -50, 1e9)")
+    left, top, width, height = page.evaluate("splinecli.region")
+    assert left == 0 and width > 1 and abs(top + height - SIDE) < 1e-9  # never outside the map
+
+
+TOUCH = "Input.dispatchTouchEvent"
+
+
+def test_fingers(open_page: OpenPage) -> None:
+    """One finger moves the light, two move and zoom the picture about what they touch."""
+    page = open_page(result_page(REPORT, *sphere()), width=400, height=800)
+    page.evaluate("splinecli.ready")
+    page.locator("#view").scroll_into_view_if_needed()
+    box = page.locator("#view").bounding_box()
+    assert box is not None
+    client = page.context.new_cdp_session(page)
+    client.send("Emulation.setTouchEmulationEnabled", {"enabled": True, "maxTouchPoints": 2})
+
+    def touch(kind: str, *shares: tuple[float, float]) -> None:
+        points = [
+            {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"], "id": number}
+            for number, (x, y) in enumerate(shares)
+        ]
+        client.send(TOUCH, {"type": kind, "touchPoints": points})
+
+    touch("touchStart", (0.4, 0.5))
+    touch("touchMove", (0.6, 0.4))
+    lights_are(page, 0.2, 0.2, "one finger")
+    touch("touchEnd")
+    touch("touchStart", (0.4, 0.5))
+    touch("touchStart", (0.4, 0.5), (0.6, 0.5))
+    lights = page.evaluate("splinecli.light")
+    touch("touchMove", (0.3, 0.4), (0.7, 0.4))
+    wait_until(page, "splinecli.region[2] < 200")
+    assert page.evaluate("splinecli.light") == lights
+    # The fingers are twice as far apart, and what was between them, the middle, is a tenth of the view higher.
+    np.testing.assert_allclose(page.evaluate("splinecli.region"), (64, 76.8, 128, 128), atol=2)
+    touch("touchEnd")
+
+
+@pytest.mark.parametrize("millimetres", [None, 0.25])
+def test_the_ruler_has_the_unit_of_the_surface(
+    open_page: OpenPage, monkeypatch: pytest.MonkeyPatch, millimetres: float | None
+) -> None:
+    """A line over half the width of a reduced map is 128 pixels of the whole map, also where the view is zoomed."""
+    monkeypatch.setattr(page_module, "LARGEST_MAP", (SIDE // 2) ** 2)
+    report = {**REPORT, "surface": {"pixel_size_mm": millimetres}}
+    page = open_page(result_page(report, *sphere()), width=400, height=800)
+    page.evaluate("splinecli.ready")
+    page.locator("#measure").check()
+    for zoom, share in ((1, 0.5), (2, 1)):
+        page.evaluate(f"splinecli.show({zoom}, 64, 64)")
+        page.locator("#view").scroll_into_view_if_needed()
+        box = page.locator("#view").bounding_box()
+        assert box is not None
+        start, end = (box["x"] + (1 + side * share) / 2 * box["width"] for side in (-1, 1))
+        before = page.evaluate("splinecli.light")
+        page.mouse.move(start + 0.5, box["y"] + 99)
+        page.mouse.down()
+        page.mouse.move(end - 0.5, box["y"] + 99, steps=2)
+        page.mouse.up()
+        wait_until(page, "!document.getElementById('ruler').hidden")
+        length, unit_name = page.locator("#length").inner_text().split()
+        assert unit_name == ("pixels" if millimetres is None else "mm")
+        assert abs(float(length) - 128 * (millimetres or 1)) < 1.5 * (millimetres or 1)
+        assert page.evaluate("splinecli.light") == before

@@ -29,17 +29,25 @@ def test_heads_colours_and_lists_are_written_once(name):
     assert not re.findall(r"(?<![&\w'\"])#[0-9a-f]{3,8}\b", template), "colours belong into base.html"
 
 
-def test_the_index_shows_its_pictures(open_page: OpenPage, tmp_path):
-    """Its security policy lets it load the pictures beside it."""
-    (tmp_path / "a & b").mkdir()
-    cv2.imwrite(str(tmp_path / "a & b/normals.png"), RED)
+def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):
+    """It contains them, also after the results have moved, and leaves out what cannot be read."""
+    for name, content in (
+        ("a & b", cv2.imencode(".png", np.tile(RED, (100, 100, 1)))[1]),
+        ("cut", b"\x89PNG"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "normals.png").write_bytes(bytes(content))
     report = {
         "capture": "a & b", "n_lights": 10, "n_pixels": 48, "angular_error_deg": {"mean": 2.5},
-        "expected_under_5": 0.9, "warnings": [], "seconds": {"read": 1.0}, "files": ["normals.png", "report.json"],
+        "expected_under_5": 0.9, "warnings": [{"code": "c", "text": "It is <dark>."}], "seconds": {"read": 1.0},
+        "files": ["normals.png", "report.json"],
     }  # fmt: skip
-    page = open_page(
-        index_page([Entry.of(report), Entry.of({"capture": "x" * 200, "error": "y" * 200})]), width=400
-    )
+    failed = {"capture": "x" * 200, "error": "y" * 200}
+    html = index_page([Entry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path)
+    (tmp_path / "a & b/normals.png").unlink()
+    page = open_page(html, width=400)
+    assert page.locator("img").evaluate("image => [image.naturalWidth, image.naturalHeight]") == [256, 192]
+    assert page.locator("td.words p").all_text_contents() == ["It is <dark>."] * 2
     picture = page.locator("img")
     picture.scroll_into_view_if_needed()
     shot = cv2.imdecode(np.frombuffer(picture.screenshot(), np.uint8), cv2.IMREAD_COLOR)

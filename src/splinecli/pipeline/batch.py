@@ -239,4 +239,4 @@ def _write_index(entries: Sequence[Entry], output: Path, observer: Observer) -> 
     from splinecli.results.index import INDEX, index_page, with_earlier
 
     with held_folder(output, observer.warn, wait=True):
-        write_text(output / INDEX, index_page(with_earlier(entries, output)))
+        write_text(output / INDEX, index_page(with_earlier(entries, output), output))

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from splinecli.errors import OutputError
+from splinecli.errors import InputError, OutputError
 from splinecli.files import read_json
 from splinecli.results.files import NORMALS, PAGE, REPORT
 from splinecli.results.templates import render
 
 INDEX = "index.html"
+
+THUMBNAIL = 256, 192
+"""Largest width and height of a small normal map in pixels: twice its size on the page, for sharp screens."""
+
 _OURS = b'<meta name="generator" content="splinecli">'
 _START = 1 << 16  # bytes of a page, which contain this mark
 
@@ -51,21 +56,28 @@ def row_of(report: Mapping[str, Any]) -> Row:
 
 
 class Entry(NamedTuple):
-    """What the page shows of one capture: its row, and the names of its files."""
+    """What the page shows of one capture: its row, the names of its files, and its warnings."""
 
     row: Row
     files: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> Entry:
         """Return the entry of a report, or of a document with `capture` and `error`."""
-        return cls(row_of(report), tuple(report.get("files", ())))
+        words = tuple(warning["text"] for warning in report.get("warnings", ()))
+        return cls(row_of(report), tuple(report.get("files", ())), words)
 
 
-def index_page(entries: Sequence[Entry]) -> str:
-    """Return the page that shows the normal maps and links the files. It belongs beside the captures' folders."""
+def index_page(entries: Sequence[Entry], output: Path) -> str:
+    """Return the page that shows small normal maps and links the files. It belongs beside the captures' folders.
+
+    Args:
+        entries: one of each capture.
+        output: the folder that has the captures' folders.
+    """
     rows = []
-    for row, files in entries:
+    for row, files, words in entries:
         # As bytes, because a folder's name may not be valid text.
         folder = quote(os.fsencode(row.capture))
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
@@ -74,10 +86,31 @@ def index_page(entries: Sequence[Entry]) -> str:
                 **row._asdict(),
                 "page": f"{folder}/{PAGE}" if PAGE in files else None,
                 "picture": None if picture is None else f"{folder}/{picture}",
+                "thumbnail": None if picture is None else _thumbnail(output / row.capture / picture),
+                "words": words,
                 "files": [(name, f"{folder}/{quote(name)}") for name in files],
             }
         )
     return render("index.html", title=f"{len(entries)} captures", header=HEADER, rows=rows)
+
+
+def _thumbnail(path: Path) -> str | None:
+    """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None where it cannot be read."""
+    import cv2
+    import numpy as np
+
+    from splinecli.capture.formats.decoding import decode_image
+
+    try:
+        picture = decode_image(path)
+    except InputError:
+        return None
+    height, width = picture.shape[:2]
+    shrink = min(1, THUMBNAIL[0] / width, THUMBNAIL[1] / height)
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) / np.iinfo(picture.dtype).max
+    done, jpeg = cv2.imencode(".jpg", np.rint(255 * small[..., ::-1]).astype(np.uint8))
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode('ascii')}" if done else None
 
 
 def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:

@@ -15,8 +15,14 @@ from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_pi
 from splinecli.pictures.png import Picture, encode_png
 from splinecli.results.templates import render
 
-LONGEST_SIDE = 1600
-"""Largest width or height of the maps on a page in pixels: a screen shows no more, and the file stays small."""
+LARGEST_MAP = 8_000_000
+"""Largest number of pixels of the maps on a page. Larger maps are reduced, so that browsers can open the file."""
+
+LONGEST_SIDE = 8192
+"""Largest width or height of the maps on a page in pixels: most devices draw pictures up to this side."""
+
+QUICK_MAP, FIRST_MAP = 500_000, 100_000
+"""A page with maps of more than QUICK_MAP pixels has maps of FIRST_MAP pixels, too, which are shown first."""
 
 LOW_BITS = 5
 """Bits of a normal's component below the 8 bits of a picture.
@@ -39,12 +45,13 @@ def result_page(
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
 
-    Maps with a side over LONGEST_SIDE pixels are reduced to it, with their proportions kept. A pixel of a reduced map
-    is the mean of the values that are in the mask (or have an error) in its area; mean normals are scaled to unit
-    length. The page states its size then. The figures on the page are those of the report, over all pixels.
+    Maps over LARGEST_MAP or LONGEST_SIDE are reduced, with their proportions kept. A pixel of a reduced map is the mean
+    of the values that are in the mask (or have an error) in its area; mean normals are scaled to unit length. The page
+    states its size then. The figures on the page are those of the report, over all pixels.
 
     Args:
-        report: a report of `infer` (docs/infer.md); `seconds.write` and `files` may be missing.
+        report: a report of `infer` (docs/infer.md); `seconds.write`, `files` and `surface` may be missing. Lengths on
+            the page are in millimetres if its surface is, else in pixels of the whole maps.
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
         albedo: (H, W, 3), linear, from albedo_map.
@@ -54,32 +61,37 @@ def result_page(
     Raises:
         OutputError: a picture cannot be encoded.
     """
-    normals, shown = _reduce(normal_map, mask)
-    high, low = split_normals(unit(normals), shown)
-    albedo_png = confidence_png = error_png = None
+    normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
+    maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
+    error_png = None
     if albedo is not None:
-        albedo_png = _data_url(albedo_picture(_reduce(albedo, mask)[0], shown))
+        maps["albedo"] = albedo_picture(_reduce(albedo, mask, LARGEST_MAP)[0], shown)
     if confidence_map is not None:
-        confidence_png = _data_url(confidence_picture(_reduce(confidence_map[..., None], mask)[0][..., 0]))
+        reduced = _reduce(confidence_map[..., None], mask, LARGEST_MAP)[0][..., 0]
+        maps["confidence"] = confidence_picture(reduced)
     if error_map_deg is not None:
-        errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg))
+        errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
         error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan), TOP_DEG))
+    first = _first_pictures(maps, normals, shown) if shown.size > QUICK_MAP else {}
     height, width = shown.shape
+    is_reduced = shown.shape != mask.shape
+    millimetres = (report.get("surface") or {}).get("pixel_size_mm")
     return render(
         "page.html",
         title=report["capture"],
         report=report,
-        facts=_facts(report, reduced=(width, height) if shown.shape != mask.shape else None),
+        facts=_facts(report, reduced=(width, height) if is_reduced else None),
+        reduced=_reduction(mask.shape, shown.shape) if is_reduced else None,
+        unit="pixels" if millimetres is None else "mm",
+        units_per_pixel=mask.shape[1] / width * (millimetres or 1),
         errors=_errors(report),
         width=width,
         height=height,
         light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
         low_scale=2**LOW_BITS,
         largest_code=_largest_code(),
-        high=_data_url(high),
-        low=_data_url(low),
-        albedo=albedo_png,
-        confidence=confidence_png,
+        first={name: _data_url(picture) for name, picture in first.items()},
+        maps={name: _data_url(picture) for name, picture in maps.items()},
         error_map=error_png,
         error_colours=_error_colours(),
         error_ticks=[f"{TOP_DEG * third / 3:g}°" for third in range(4)],
@@ -102,17 +114,31 @@ def _largest_code() -> int:
     return int(2 ** (8 + LOW_BITS) - 1)
 
 
+def _first_pictures(
+    maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> dict[str, Picture]:
+    """Return the pictures of the maps in few pixels, which a browser shows while it reads the others."""
+    import cv2
+
+    small, known = _reduce(normals, mask, FIRST_MAP)
+    first = dict(zip(("high", "low"), split_normals(unit(small), known), strict=True))
+    for name in maps.keys() - first.keys():
+        reduced = cv2.resize(maps[name], known.shape[::-1], interpolation=cv2.INTER_AREA)
+        first[name] = np.asarray(reduced, np.uint8)
+    return first
+
+
 def _reduce(
-    values: NDArray[np.float32], known: NDArray[np.bool_]
+    values: NDArray[np.float32], known: NDArray[np.bool_], largest: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return values (H, W, C) and their mask, both reduced until no side is over LONGEST_SIDE pixels.
+    """Return values (H, W, C) and their mask, reduced to `largest` pixels and sides of LONGEST_SIDE.
 
     A reduced value is the mean of the known values in its area, and is known if one of them is.
     """
     import cv2
 
     height, width = known.shape
-    shrink = LONGEST_SIDE / max(height, width)
+    shrink = min(LONGEST_SIDE / max(height, width), (largest / known.size) ** 0.5)
     if shrink >= 1:
         return values, known
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
@@ -136,6 +162,12 @@ def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> lis
         ("Seconds", ", ".join(f"{step} {seconds:g}" for step, seconds in report["seconds"].items())),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
+
+
+def _reduction(whole: tuple[int, ...], shown: tuple[int, ...]) -> str:
+    """Return the sentence that says that the maps (H, W) were reduced."""
+    sizes = [_TIMES.join(map(str, reversed(shape))) for shape in (shown, whole)]
+    return f"This page shows {sizes[0]} of the {sizes[1]} pixels. The other files have all of them."
 
 
 def _errors(report: Mapping[str, Any]) -> list[tuple[str, str]]:
