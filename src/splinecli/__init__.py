@@ -42,7 +42,9 @@ def estimate_normals(
 ) -> NormalEstimate:
     """Estimate surface normals from images of one object under different lights.
 
-    The images are prepared and the normals estimated exactly as `splinecli infer` does.
+    The images are prepared, checked against the lights, and the normals estimated exactly as `splinecli infer` does.
+    Warnings that an input is probably wrong, such as light directions in another frame, are also issued with Python's
+    module `warnings`.
 
     The first call limits PyTorch's threads to the cores that the process may use. If other processes keep the machine
     busy, also set the environment variable OMP_WAIT_POLICY to passive before PyTorch is imported.
@@ -87,11 +89,14 @@ def estimate_normals(
         networks, ICCV 2019.
     """
     from dataclasses import replace
+    from warnings import warn
 
     from splinecli.capture.arrays import capture_from_arrays
+    from splinecli.capture.capture_warnings import PROBABLY_WRONG
     from splinecli.inference import estimate_normals
     from splinecli.methods import MethodOptions, check_method, make_estimator
     from splinecli.pipeline.distillation import distil_for
+    from splinecli.pipeline.input_checks import check_arrays, check_confidence
 
     check_method(method)
     capture = capture_from_arrays(
@@ -105,10 +110,14 @@ def estimate_normals(
     )
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)
-    distilled, warnings = distil_for(capture, estimator, distil)
-    if warnings:
-        capture = replace(capture, warnings=(*capture.warnings, *warnings))
-    return estimate_normals(capture, distilled or estimator, progress=progress)
+    warnings = [*capture.warnings, *check_arrays(capture, intensities_measured=light_intensities is not None)]
+    distilled, found = distil_for(capture, estimator, distil)
+    estimate = estimate_normals(capture, distilled or estimator, progress=progress)
+    warnings += [*found, *check_confidence(estimate.expected_under_5)]
+    for warning in warnings:
+        if warning.code in PROBABLY_WRONG:
+            warn(str(warning), stacklevel=2)
+    return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))
 
 
 def integrate_normals(

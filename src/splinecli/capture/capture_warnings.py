@@ -42,6 +42,7 @@ GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
 IMAGE_ODD = "image_odd"
 IMAGES_LEFT_OUT = "images_left_out"
+IMAGES_SHIFTED = "images_shifted"
 LIGHTS_CROWDED = "lights_crowded"
 KEPT_LIGHTS = "kept_lights"
 LAMP_DISTANCE = "lamp_distance"
@@ -64,6 +65,7 @@ PROBABLY_WRONG = frozenset(
         ENCODED_VALUES,
         GROUND_TRUTH_Z,
         IMAGE_ODD,
+        IMAGES_SHIFTED,
         LAMP_DISTANCE,
         LIGHT_FRAME,
         LIGHT_ORDER,

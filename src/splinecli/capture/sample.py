@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 MAX_PIXELS = 20_000
 """Of larger captures, every second or third row and column is taken, and so on."""
 
+CLOSEUP_SIDE = 192
+"""The side of a closeup in pixels."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
@@ -40,3 +43,18 @@ def sample_observations(observations: NDArray[np.floating], mask: NDArray[np.boo
     rows[mask] = np.arange(len(observations))
     rows = rows[::step, ::step]
     return Sample(observations[rows[rows >= 0]], rows >= 0, step)
+
+
+def closeup_window(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns of a square of CLOSEUP_SIDE around the middle of a mask (H, W) with pixels."""
+    middles = (int(np.median(places)) for places in np.nonzero(mask))
+    row, column = (max(0, middle - CLOSEUP_SIDE // 2) for middle in middles)
+    return slice(row, row + CLOSEUP_SIDE), slice(column, column + CLOSEUP_SIDE)
+
+
+def take_closeup(observations: NDArray[np.floating], mask: NDArray[np.bool_]) -> Sample:
+    """Return observations (P, F) of the pixels of a mask (H, W) in its closeup, every pixel."""
+    window = closeup_window(mask)
+    chosen = np.zeros_like(mask)
+    chosen[window] = True
+    return Sample(observations[chosen[mask]], mask[window], 1)

@@ -18,7 +18,7 @@ from splinecli.capture.linearise import Lineariser
 from splinecli.capture.observations import observe
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
-from splinecli.capture.sample import Sample, grid_step
+from splinecli.capture.sample import Sample, closeup_window, grid_step
 from splinecli.capture.source import CaptureSource
 
 DARK = 0.05
@@ -61,6 +61,7 @@ class CaptureSummary:
         n_pixels: number of the mask's pixels.
         white_level: as in Capture.
         sample: some of the pixels of all images, on a grid; None where images have different sizes.
+        closeup: every pixel of the middle, or None.
         lamp_warnings: about near lamps over this mask.
     """
 
@@ -69,6 +70,7 @@ class CaptureSummary:
     n_pixels: int
     white_level: WhiteLevel | None
     sample: Sample | None = None
+    closeup: Sample | None = None
     lamp_warnings: tuple[CaptureWarning, ...] = ()
 
     @property
@@ -116,16 +118,19 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
             step = grid_step(mask)
             on_grid = np.zeros_like(mask)
             on_grid[::step, ::step] = mask[::step, ::step]
+            seen_closely = closeup_window(mask)
+            taken = on_grid.copy()
+            taken[seen_closely] = mask[seen_closely]
             # It refuses ambient images and flat fields that do not fit.
-            linearise = Lineariser(source.radiometry, on_grid, n_images, source.window)
+            linearise = Lineariser(source.radiometry, taken, n_images, source.window)
             shape = stored.shape[:2]
-            observations = np.zeros((int(np.count_nonzero(on_grid)), n_images), np.float32)
+            observations = np.zeros((int(np.count_nonzero(taken)), n_images), np.float32)
         fits = shape == stored.shape[:2]
         seen = source.window.of(stored) if fits else stored
         pixels = seen[mask] if fits else seen.reshape(-1, seen.shape[2])
         if fits:
             finder.add(position, pixels, path, stated=stated_white_level(path))
-            linear = linearise(seen[on_grid], path, position)
+            linear = linearise(seen[taken], path, position)
             observations[:, position] = observe(linear, source.light_intensities[position])
         images.append(
             ImageSummary(
@@ -141,11 +146,16 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
             progress()
     assert mask is not None, "a capture has images"
     level, summaries = _by_white_level(finder, images, shape)
-    sample = None
+    sample = closeup = None
     if all(image.shape[:2] == shape for image in images):
-        sample = Sample(observations, mask[::step, ::step], step)
+        sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
+        inside = np.zeros_like(mask)
+        inside[seen_closely] = True
+        closeup = Sample(observations[inside[taken]], mask[seen_closely], 1)
     _, of_lamps = source.near_lamps(mask)
-    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample, tuple(of_lamps))
+    return CaptureSummary(
+        source, summaries, int(np.count_nonzero(mask)), level, sample, closeup, tuple(of_lamps)
+    )
 
 
 def _by_white_level(

@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     from splinecli.methods import Estimator
 
 
-LEAST_EXPECTED = 0.1
-"""Smallest expected share of normals within 5 degrees without a warning."""
-
-
 def infer_capture(
     folder: Path, options: InferOptions, observer: Observer = SILENT, *, estimator: Estimator | None = None
 ) -> dict[str, Any]:
@@ -60,9 +56,9 @@ def _infer_into(
     folder: Path, target: Path, options: InferOptions, observer: Observer, estimator: Estimator | None
 ) -> dict[str, Any]:
     """Do the work of infer_capture in the folder of results, which the caller holds."""
-    from splinecli.capture.capture_warnings import ROUGH_LIGHTS, low_confidence
+    from splinecli.capture.capture_warnings import ROUGH_LIGHTS
     from splinecli.pipeline.distillation import distil_for
-    from splinecli.pipeline.input_checks import check_capture, refuse_if_strict
+    from splinecli.pipeline.input_checks import check_capture, check_confidence, refuse_if_strict
     from splinecli.results.files import write_estimate
     from splinecli.results.report import report_of
 
@@ -85,10 +81,8 @@ def _infer_into(
     warnings += found
     estimate = _estimate(capture, distilled or estimator, observer)
     warnings += _method_warnings(estimator, capture)
-    expected = estimate.expected_under_5
-    if expected is not None and expected < LEAST_EXPECTED:
-        warnings.append(low_confidence(expected))
-        refuse_if_strict(warnings, capture.name, strict=options.strict)
+    warnings += check_confidence(estimate.expected_under_5)
+    refuse_if_strict(warnings, capture.name, strict=options.strict)
     for warning in warnings:
         observer.warn(f"{capture.name}: {warning}")
     report = report_of(

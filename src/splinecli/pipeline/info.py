@@ -113,7 +113,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
     from splinecli.capture.lights.light_advice import candidate_rows
     from splinecli.capture.summary import summarise_capture
     from splinecli.files import write_bytes
-    from splinecli.pipeline.input_checks import check_sample
+    from splinecli.pipeline.input_checks import StatedLights, check_sample
 
     source = options.open()
     if options.plot is not None:
@@ -125,8 +125,9 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
 
         write_bytes(options.plot, sky_plot(source.light_directions, source.files.name))
     check, warnings = None, summary.warnings()
-    if summary.sample is not None:
-        check, found = check_sample(source, summary.sample, range(source.n_lights), strict=options.strict)
+    if summary.sample is not None and summary.closeup is not None:
+        lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
+        check, found = check_sample(lights, summary.sample, summary.closeup, strict=options.strict)
         warnings += found
     for warning in warnings:
         observer.warn(str(warning))

@@ -1,0 +1,117 @@
+"""Warnings about a capture, from the files to the messages and exit codes of `infer` and `info`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import splinecli
+from splinecli.pipeline import input_checks
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
+
+
+@pytest.fixture
+def medallion(tmp_path, monkeypatch):
+    """A copy of the example, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(EXAMPLE, tmp_path / "medallion")
+    return tmp_path / "medallion"
+
+
+def move(path: Path, right: int, down: int) -> None:
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), np.roll(picture, (down, right), axis=(0, 1)))
+
+
+def codes() -> list[str]:
+    report = json.loads(Path("out/medallion/report.json").read_text())
+    return [warning["code"] for warning in report["warnings"]]
+
+
+def refused(run, *command: object) -> str:
+    """Run infer with --strict, which must refuse the capture and write nothing; return the message."""
+    result = run("infer", "medallion", *command, "--strict", "-o", "refused")
+    assert (result.code, result.out) == (3, "")
+    assert not Path("refused/medallion").exists()
+    return result.err
+
+
+def test_shifted_images_are_named(run, medallion):
+    move(medallion / "04.png", 2, -1)
+    move(medallion / "09.png", 0, 4)
+    words = "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4 down."
+    result = run("infer", medallion, "--method", "ls")
+    assert result.code == 0 and words in result.err
+    assert "images_shifted" in codes()
+    info = run("info", medallion, "--json")
+    assert words in info.err and "images_shifted" in json.loads(info.out)["warning_codes"]
+    assert words.removesuffix(".") in refused(run, "--method", "ls")
+
+
+def test_ground_truth_that_points_away(run, medallion):
+    (medallion / "normals_gt.png").rename("truth.png")
+    picture = cv2.imread("truth.png", cv2.IMREAD_UNCHANGED)[..., ::-1]
+    normals = picture / np.iinfo(picture.dtype).max * 2 - 1
+    np.save(medallion / "normals_gt.npy", normals * (1, 1, -1))
+    result = run("infer", medallion, "--method", "ls")
+    assert result.code == 0
+    assert "The normals of the ground truth point away from the camera (z < 0)" in result.err
+    assert codes() == ["ground_truth_z"]
+    assert "its z is probably negated" in refused(run, "--method", "ls")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ((0.1, 0.1, 1), "The lights lie in a narrow cone"),
+        ((1, 0.05, 1), "The lights lie nearly in one plane"),
+    ],
+)
+def test_lights_that_crowd(run, medallion, change, words):
+    lights = np.loadtxt(medallion / "light_directions.txt") * change
+    np.savetxt(medallion / "light_directions.txt", lights)
+    for command in (("infer", medallion, "--method", "ls"), ("info", medallion)):
+        assert words in run(*command).err
+    assert "lights_crowded" in codes()
+
+
+def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
+    """Noise in place of photographs, on an object of few pixels. The usual limit is nearer to what the network says."""
+    monkeypatch.setattr(input_checks, "LEAST_EXPECTED", 0.3)
+    rng = np.random.default_rng(0)
+    for path in medallion.glob("[01]*.png"):
+        shape = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape
+        cv2.imwrite(str(path), (65_535 * rng.uniform(size=shape) ** 4).astype(np.uint16))
+    mask = np.zeros(shape[:2], np.uint8)
+    mask[60:68, 60:68] = 255
+    cv2.imwrite(str(medallion / "mask.png"), mask)
+    result = run("infer", medallion)
+    assert result.code == 0 and "of the normals to be within 5 degrees" in result.err
+    assert "low_confidence" in codes()
+    assert "of the normals to be within 5 degrees" in refused(run)
+
+
+def test_python_gives_the_same_warnings(medallion):
+    paths = sorted(medallion.glob("[01]*.png"))
+    move(paths[3], 2, -1)
+    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] for path in paths]
+    lights = np.loadtxt(medallion / "light_directions.txt") * (1, -1, 1)
+    intensities = np.loadtxt(medallion / "light_intensities.txt")
+    mask = cv2.imread(str(medallion / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        estimate = splinecli.estimate_normals(
+            images, lights, mask, light_intensities=intensities, method="ls"
+        )
+    assert [warning.code for warning in estimate.capture.warnings] == ["images_shifted", "light_frame"]
+    assert [str(warning.message) for warning in caught] == [str(w) for w in estimate.capture.warnings]
+    assert all(warning.filename == __file__ for warning in caught)
+    assert "images[3] 2 right 1 up" in str(caught[0].message)
+    assert "run again with --light-frame y-down" in str(caught[1].message)
