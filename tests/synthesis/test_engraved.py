@@ -48,3 +48,15 @@ def test_detail_has_the_size_of_pixels() -> None:
         steps.append((normals[:, 4:] - normals[:, :-4]).norm(dim=-1).mean())
     # Waves of 0.3 frames with slopes of 0.3 change by up to 2 pi 4 / 15 x 0.3 x 0.64 = 0.3 in the mean, few by 0.1.
     assert torch.stack(steps).median() > 0.1
+
+
+def test_a_third_of_the_pieces_are_smooth() -> None:
+    """Without detail, the normals of a plate change by less than 0.1 from pixel to pixel, and evenly."""
+    smooth = []
+    for seed in range(90):
+        generator = torch.Generator().manual_seed(seed)
+        normals = draw_engraved(SIZE, LIGHTS, generator, round_share=0.0)[0].view(SIZE, SIZE, 3)
+        bends = normals[:, 2:] - 2 * normals[:, 1:-1] + normals[:, :-2]
+        smooth.append(bends.norm(dim=-1).mean() < 0.01)
+    # Three standard deviations of a share of 1/3 among 90.
+    assert abs(sum(smooth) / 90 - 1 / 3) < 0.15

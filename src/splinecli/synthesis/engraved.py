@@ -1,4 +1,4 @@
-"""Plates and half ellipsoids with detail of a few pixels, such as engraved, woven or faceted surfaces.
+"""Plates and half ellipsoids, smooth or with detail of a few pixels, such as engraved, woven or faceted surfaces.
 
 Rendered scenes have few bends of a pixel's size. These pieces have, but no cast shadows or interreflection.
 """
@@ -6,14 +6,19 @@ Rendered scenes have few bends of a pixel's size. These pieces have, but no cast
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 from splinecli.synthesis.random_numbers import draw_number
 from splinecli.synthesis.scenes import CLASSES, draw_class
+
+_SMOOTH_SHARE = 1 / 3
+"""A share of the pieces has no detail: smooth things must stay smooth, whatever they are made of."""
 
 
 def draw_engraved(
@@ -25,7 +30,8 @@ def draw_engraved(
     a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has one kind of
     detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or bent; facets of 3 to 20 pixels; or a
     random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third of it
-    for the texture. The material is that of draw_class, with 1 to 300 patches.
+    for the texture. A third of the pieces are smooth. The material is that of draw_class, or as often that of
+    draw_material, with 1 to 300 patches; in half of the pieces these differ in their base alone.
 
     Args:
         lights: (F, 3), unit.
@@ -33,17 +39,28 @@ def draw_engraved(
     """
 
     uniform = partial(draw_number, generator)
-    base, mask = _draw_base(size, round_share, generator)
-    detail = _draw_detail(size, generator)
-    normals = base - base[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
-    normals = torch.nn.functional.normalize(normals, dim=1)
+    normals, mask = _draw_base(size, round_share, generator)
+    if uniform() >= _SMOOTH_SHARE:
+        detail = _draw_detail(size, generator)
+        normals = normals - normals[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
+        normals = torch.nn.functional.normalize(normals, dim=1)
     patches = int(300 ** uniform())
-    material = draw_class(
-        CLASSES[int(len(CLASSES) * uniform())], patches, generator, one_gloss=uniform() < 0.5
-    ).take(_cells(patches, size, generator)[mask])
+    material = _draw_patches(patches, generator).take(_cells(patches, size, generator)[mask])
     normals = normals[mask]
     cosines = (normals @ lights.T).clamp(min=0)
     return normals, material.shade(cosines, normals[:, 2:], lights[:, 2]), mask.view(size, size)
+
+
+def _draw_patches(count: int, generator: torch.Generator) -> PrincipledMaterial:
+    """Draw the materials of `count` patches: of rendered scenes, or of generated pixels, which have more kinds."""
+    uniform = partial(draw_number, generator)
+    one_gloss = uniform() < 0.5
+    if uniform() < 0.5:
+        return draw_class(CLASSES[int(len(CLASSES) * uniform())], count, generator, one_gloss=one_gloss)
+    material = draw_material(count, generator)
+    if not one_gloss:
+        return material
+    return replace(material.take(torch.zeros(count, dtype=torch.long)), base=material.base)
 
 
 def _draw_base(size: int, round_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

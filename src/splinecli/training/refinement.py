@@ -29,7 +29,7 @@ from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_l
 from splinecli.synthesis.whole_capture import photograph_scene
 from splinecli.training.losses import angles
 
-FIRST_EXAMPLES = 16
+FIRST_EXAMPLES = 64
 """Captures that are photographed before the first step."""
 
 STEPS_PER_EXAMPLE = 8
