@@ -253,6 +253,21 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
     )
 
 
+def test_workers_render_the_same_set(run, cube):
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    arguments = ("prepare", "--mesh", cube, "--scenes", 2, "--size", 16, "--n-lights", 20)
+    alone = run(*arguments, "-o", "alone")
+    # The set has one of the scenes already.
+    assert run(*arguments[:3], "--scenes", 1, *arguments[5:], "-o", "set", "-q").code == 0
+    together = run(*arguments, "-o", "set", "--workers", 2)
+    assert (together.code, together.err) == (0, alone.err)
+    files = [
+        {path.relative_to(folder): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
+        for folder in ("alone", "set")
+    ]
+    assert files[0] == files[1]
+
+
 def test_a_mesh_that_the_camera_cannot_see(run, cube):
     Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
     result = run("prepare", "--mesh", "back.obj", "--size", 16, "--n-lights", 20, "-o", "set")

@@ -140,7 +140,7 @@ def write_captures(names: list[str]) -> list[str]:
     lights = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
     for seed, name in enumerate(names):
-        Path(name).mkdir()
+        Path(name).mkdir(parents=True)
         np.savetxt(Path(name) / "lights.txt", lights)
         for number in range(len(lights) if name != "broken" else 0):
             image = np.random.default_rng([seed, number]).integers(20_000, 50_000, (12, 15), np.uint16)
@@ -229,6 +229,30 @@ def test_no_scheduler(address, tmp_path, monkeypatch):
         connection.connected(ClusterOptions(address=address)),
     ):
         pass
+
+
+def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    names = write_captures(["data/b", "data/damaged", "data/a", "data/without"])
+    for name in names[:3]:
+        np.save(f"{name}/normals_gt.npy", np.float32(np.broadcast_to([0, 0, 1], (12, 15, 3))))
+    Path("data/damaged/2.png").write_bytes(b"no picture")
+    call = ["evaluate", "data", "--method", "ls", "--method", "iw12", "--n-lights", "3", "--n-lights", "all"]
+
+    def results(output: str, *more: str) -> Any:
+        assert main([*call, "-o", output, *more]) == 3
+        document = json.loads(Path(output, "results.json").read_text())
+        text = re.sub(r'"seconds[a-z_]*": [0-9.e-]+', "", json.dumps(document))
+        return text, capfd.readouterr().err, Path(output, "trials.jsonl").read_text().count("\n")
+
+    alone = results("alone", "--trials", "3", "--jobs", "1")
+    # What an earlier command has scored is not scored again.
+    results("out", "--trials", "2", "--cluster", cluster.scheduler_address)
+    first = Path("out/trials.jsonl").read_text()
+    assert results("out", "--trials", "3", "--cluster", cluster.scheduler_address) == alone
+    assert Path("out/trials.jsonl").read_text().startswith(first)
+    assert alone[2] == 2 * 2 * (3 + 1) and "data/damaged" in alone[1]
+    assert results("out", "--trials", "3", "--cluster", cluster.scheduler_address) == alone
 
 
 def test_errors_travel(client):

@@ -7,8 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splinecli.cli.console import Messages
-from splinecli.cli.options import computing, inputs, outputs
-from splinecli.cli.options.values import Device, Precision, parse_light_count, parse_pixel, parse_skip
+from splinecli.cli.options import computing, distribution, inputs, outputs
+from splinecli.cli.options.values import (
+    Device,
+    Precision,
+    parse_cluster,
+    parse_light_count,
+    parse_pixel,
+    parse_skip,
+)
 from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import InputError
 
@@ -39,6 +46,9 @@ def evaluate(
     device: Device = computing.DEVICE,
     precision: Precision = computing.PRECISION,
     jobs: int | None = computing.JOBS,
+    workers: str = distribution.TRIAL_WORKERS,
+    cluster: str | None = distribution.TRIAL_CLUSTER,
+    retries: int | None = distribution.TRIAL_RETRIES,
     figures: bool = outputs.FIGURES,
     pixel: list[str] | None = outputs.FIGURE_PIXELS,
     output: Path = outputs.EVALUATION_FOLDER,
@@ -81,6 +91,7 @@ def evaluate(
         pixels=tuple(parse_pixel(text) for text in pixel or []),
         output=str(output),
         overwrite=overwrite,
+        cluster=parse_cluster(workers, cluster, retries, gpu=device is Device.cuda),
     )
     talk = Messages(quiet=quiet)
     outcome = evaluate_captures(datasets, options, talk)

@@ -79,11 +79,13 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Method": ("--method", "--weights", "--rotations"),
         "Output": ("--output", "--figures", "--pixel", *REPEAT),
         "Speed": ("--jobs", *SPEED),
+        "Processes and machines": ("--workers", "--cluster", "--retries"),
     },
     "prepare": {
         "Input": ("--as-stored", "--update", "--white-level", *LIMITS),
         "Scenes": ("--scenes", "--mesh", "--size", "--n-lights", "--measured", "--measured-share", "--seed"),
         "Output": ("--output", *REPEAT),
+        "Speed": ("--workers",),
     },
     "train": {
         "Settings": ("--preset", "--config", "--param", "--start-from", "--seed"),

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.options import inputs, outputs, training
+from splinecli.cli.options import distribution, inputs, outputs, training
+from splinecli.cli.options.values import parse_cluster
 from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import UsageError
 
@@ -30,6 +31,7 @@ def prepare(
     measured: Path | None = training.MEASURED,
     measured_share: float = training.MEASURED_SHARE,
     seed: int = inputs.SEED,
+    workers: str = distribution.SCENE_WORKERS,
     as_json: bool = outputs.JSON,
     quiet: bool = outputs.QUIET,
 ) -> int:
@@ -55,6 +57,7 @@ def prepare(
         as_stored=as_stored,
         white_level=white_level,
         update=update,
+        cluster=parse_cluster(workers),
     )
     summary = prepare_pixel_set(options, Messages(quiet=quiet))
     print_report(summary, *_in_words(summary), as_json=as_json, quiet=quiet)

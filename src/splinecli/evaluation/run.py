@@ -12,6 +12,7 @@ from pathlib import Path
 from threading import Lock
 
 from splinecli.errors import InputError, UsageError
+from splinecli.evaluation.draws_elsewhere import DrawScores, DrawTask
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import CaptureJob, Task, Unit, check_skip_first, distinct_names
 from splinecli.evaluation.protocol import Protocol
@@ -20,6 +21,9 @@ from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
+
+Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, DrawScores]]]
+"""Scores draws in other processes, and yields each with its scores as it ends."""
 
 OnProgress = Callable[[float, int, str], object]
 """Called with the trials done, the total, and a short text. A running trial counts by the share of its pixels."""
@@ -37,6 +41,7 @@ def evaluate_all(
     *,
     store: TrialStore | None = None,
     jobs: int = 1,
+    elsewhere: Elsewhere | None = None,
     on_progress: OnProgress | None = None,
 ) -> list[Evaluation]:
     """Score every estimator on every capture under every protocol.
@@ -51,6 +56,7 @@ def evaluate_all(
         protocols: at least one.
         store: where finished trials are stored; those that it has are not computed again.
         jobs: number of trials at a time, each on its share of the cores.
+        elsewhere: scores the draws in other processes, in place of `jobs`.
         on_progress: see OnProgress. It is called by one thread at a time.
 
     Raises:
@@ -71,7 +77,11 @@ def evaluate_all(
         check_skip_first(protocol, names)
     store = TrialStore() if store is None else store
     planned = [CaptureJob.plan(folder, name, estimators, tasks) for folder, name in names_by_folder.items()]
-    _Run([job for job in planned if job is not None], store, on_progress).run(jobs)
+    run = _Run([job for job in planned if job is not None], store, on_progress)
+    if elsewhere is None:
+        run.run(jobs)
+    else:
+        run.run_elsewhere(elsewhere)
     settings = {
         e.name: {
             "weights": e.weights,
@@ -112,6 +122,24 @@ class _Run:
             except BaseException:
                 workers.shutdown(cancel_futures=True)
                 raise
+
+    def run_elsewhere(self, elsewhere: Elsewhere) -> None:
+        """Let other processes score the trials. Raises what a trial raises."""
+        captures = {job.name: (job, draws) for job, draws in self._captures}
+        failed: set[str] = set()
+        for task, result in elsewhere([task for job, draws in self._captures for task in _tasks(job, draws)]):
+            job, draws = captures[task.name]
+            draw = [] if task.draw is None else draws[task.draw]
+            if result.error is not None:
+                for planned in job.tasks if task.name not in failed else ():
+                    planned.fail(job.name, result.error)
+                failed.add(task.name)
+            else:
+                for planned, notes in zip(job.tasks, result.notes, strict=True):
+                    planned.notes[job.name] = notes
+                for (trial, _), score in zip(draw, result.scores, strict=True):
+                    self._store.add(trial, score)
+            self._progress.skip(len(draw))
 
     def _submit_all(self, workers: ThreadPoolExecutor, jobs: int) -> None:
         running: set[Future[None]] = set()
@@ -200,6 +228,16 @@ class _Progress:
     def _show(self, text: str) -> None:
         if self._on_progress is not None:
             self._on_progress(self._finished + sum(self._running.values()), self._total, text)
+
+
+def _tasks(job: CaptureJob, draws: Sequence[Sequence[Unit]]) -> list[DrawTask]:
+    """Return the tasks of a capture: one for each draw, or one for the notes on it."""
+    numbers = {
+        trial: (number, unit) for number, draw in enumerate(job.draws) for unit, (trial, _) in enumerate(draw)
+    }
+    missing = tuple((numbers[draw[0][0]][0], tuple(numbers[trial][1] for trial, _ in draw)) for draw in draws)
+    positions: Sequence[int | None] = range(len(draws)) if draws else [None]
+    return [DrawTask(job.source.files.folder, job.name, missing, position) for position in positions]
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:

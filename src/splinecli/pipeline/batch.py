@@ -111,9 +111,10 @@ def _outcomes(
     if cluster is not None and cluster.address is None:
         from splinecli.pipeline.capture_memory import choose_workers
 
-        wanted = cluster.workers or choose_workers(members, options)
-        cluster = replace(cluster, workers=min(wanted, len(members)))
-    if cluster is None or (cluster.address is None and cluster.workers < 2):
+        if not cluster.workers:
+            cluster = replace(cluster, workers=choose_workers(members, options))
+        cluster = cluster.on_cores(len(members))
+    if cluster is None:
         yield from enumerate(_one_by_one(members, options, observer, redo))
         return
     from splinecli.pipeline.batch_on_workers import infer_on_workers

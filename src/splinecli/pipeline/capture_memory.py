@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from splinecli.errors import SplinecliError
 
 if TYPE_CHECKING:
+    from splinecli.capture import CaptureSource
     from splinecli.capture.capture_size import StoredSize
     from splinecli.pipeline.capture_list import Member
     from splinecli.pipeline.infer_options import InferOptions
@@ -36,18 +37,28 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
 
 
 def expected_bytes(member: Member, options: InferOptions) -> float:
+    """Return about how many bytes `infer` takes for a capture; see source_bytes."""
+    n_lights = options.n_lights or len(options.light_indices or ())
+    return source_bytes(lambda: options.open(member.folder), n_lights)
+
+
+def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
     """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
 
     A capture that cannot be read takes none: it will fail soon.
+
+    Args:
+        open_source: returns the capture.
+        n_lights: the number of images that are read; 0 for all.
     """
     import numpy as np
 
     from splinecli.capture.formats.decoding import stored_size
 
     try:
-        source = options.open(member.folder)
+        source = open_source()
         size = stored_size(source.files.images[0])
-        n_lights = options.n_lights or len(options.light_indices or ()) or source.n_lights
+        n_lights = n_lights or source.n_lights
         n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
         n_bytes = infer_bytes(size, n_pixels, n_lights)
         if n_bytes > _WORTH_A_MASK and (source.files.mask is not None or source.files.boundaries):

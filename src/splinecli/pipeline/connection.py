@@ -8,10 +8,11 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splinecli.devices import count_available_cores
 from splinecli.errors import UsageError
 from splinecli.extras import import_extra
 from splinecli.files import read_json
@@ -32,7 +33,7 @@ class ClusterOptions:
     """Where tasks are done.
 
     Args:
-        workers: the number of processes of this machine, if there is no `address`.
+        workers: the number of processes of this machine, if there is no `address`. 0 for as many as it can use.
         address: the address of a Dask scheduler, or its scheduler file.
         retries: how often a task is done again whose worker was lost.
         gpu: whether only workers with the Dask resource GPU are used.
@@ -42,6 +43,18 @@ class ClusterOptions:
     address: str | None = None
     retries: int = RETRIES
     gpu: bool = False
+
+    def on_cores(self, n_tasks: int | None = None) -> ClusterOptions | None:
+        """Return these options with a process for each core in place of 0, and at most one for each task.
+
+        Return None where this process can do the tasks as well.
+        """
+        if self.address is not None:
+            return self
+        workers = self.workers or count_available_cores()
+        if n_tasks is not None:
+            workers = min(workers, n_tasks)
+        return None if workers < 2 else replace(self, workers=workers)
 
 
 @contextmanager
@@ -80,8 +93,6 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     """Yield a Dask cluster of processes of this machine, each with its share of the cores."""
     import dask
     from distributed import LocalCluster
-
-    from splinecli.devices import count_available_cores
 
     threads = max(1, min(count_available_cores() // options.workers, _threads_of_user()))
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")

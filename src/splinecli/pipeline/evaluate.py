@@ -19,10 +19,11 @@ from splinecli.evaluation.files import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate_all
+from splinecli.evaluation.run import Elsewhere, evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.files import check_writable
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
+from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.publishing import held_folder
 
@@ -49,6 +50,7 @@ class EvaluateOptions:
         pixels: (row, column) of the pixels whose observation maps the figures show.
         output: folder for the results.
         overwrite: whether to compute again what the folder has.
+        cluster: the processes or machines that score trials; None for this process.
 
     Raises:
         UsageError: a value is out of its range, or two options contradict each other.
@@ -72,6 +74,7 @@ class EvaluateOptions:
     pixels: tuple[tuple[int, int], ...] = ()
     output: str = "evaluation"
     overwrite: bool = False
+    cluster: ClusterOptions | None = None
 
     def __post_init__(self) -> None:
         if self.white_level is not None and not 0 < self.white_level < math.inf:
@@ -88,6 +91,11 @@ class EvaluateOptions:
             )
         if self.light_error_deg is not None:
             check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
+        if self.cluster is not None and self.jobs is not None:
+            raise UsageError(
+                "--jobs contradicts --workers and --cluster",
+                hint="Leave it out: a worker scores one trial at a time",
+            )
         for name in self.methods:
             check_method(name)
         if self.pixels and not (self.figures and "spline-net" in self.methods):
@@ -166,6 +174,7 @@ def evaluate_captures(
                 protocols,
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
                 jobs=options.jobs or _default_jobs(estimators),
+                elsewhere=_elsewhere(options, estimators, protocols, observer),
                 on_progress=_follow(advance),
             )
         plots = make_plots(evaluations)
@@ -175,6 +184,21 @@ def evaluate_captures(
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
         document = write_results(output, evaluations, plots, figures)
     return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
+
+
+def _elsewhere(
+    options: EvaluateOptions,
+    estimators: Sequence[Estimator],
+    protocols: Sequence[Protocol],
+    observer: Observer,
+) -> Elsewhere | None:
+    """Return what scores trials in other processes, if the options ask for it."""
+    cluster = None if options.cluster is None else options.cluster.on_cores()
+    if cluster is None:
+        return None
+    from splinecli.pipeline.evaluate_on_workers import OnWorkers
+
+    return OnWorkers(estimators, options.method_options, protocols, cluster, Path(options.output), observer)
 
 
 def _make_estimators(options: EvaluateOptions) -> list[Estimator]:

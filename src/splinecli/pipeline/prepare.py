@@ -10,6 +10,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.files import check_writable, write_bytes
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
+from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.observer import SILENT, Advance, Observer
 from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
 from splinecli.pixel_sets.rendered import ScenePlan, add_scene
@@ -31,6 +32,7 @@ class PrepareOptions:
         as_stored: use the stored values of captures alone, see add_capture.
         white_level: stored value from which a pixel of a capture counts as saturated; None to find it.
         update: read captures again that changed since they were added.
+        cluster: the processes that render scenes; None for this process.
 
     Raises:
         UsageError: there is nothing to prepare.
@@ -42,6 +44,7 @@ class PrepareOptions:
     as_stored: bool = False
     white_level: float | None = None
     update: bool = False
+    cluster: ClusterOptions | None = None
 
     def __post_init__(self) -> None:
         if not self.captures and not self.scenes.names:
@@ -71,7 +74,7 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         captures = name_captures(options.captures, writer)
         with observer.progress("preparing", len(captures) + len(options.scenes.names)) as advance:
             skipped = _add_captures(writer, captures, options, observer, advance)
-            _add_scenes(writer, options.scenes, observer, advance)
+            _add_scenes(writer, options, observer, advance)
         if not len(writer):
             return _summary(PixelSet(options.output, ()), skipped)
         # Before the set counts as finished, so that a finished set has its own overview.
@@ -120,7 +123,21 @@ def _add_capture(
     return None
 
 
-def _add_scenes(writer: PixelSetWriter, plan: ScenePlan, observer: Observer, advance: Advance) -> None:
+def _add_scenes(
+    writer: PixelSetWriter, options: PrepareOptions, observer: Observer, advance: Advance
+) -> None:
+    plan = options.scenes
+    cluster = None if options.cluster is None else options.cluster.on_cores(len(plan.names))
+    if cluster is not None:
+        from splinecli.pipeline.prepare_on_workers import render_on_workers
+
+        def show(position: int) -> None:
+            for name in plan.entry_names(position).values():
+                observer.say(writer.describe(name))
+            advance(1)
+
+        render_on_workers(writer, plan, cluster, observer, show)
+        return
     for position in range(len(plan.names)):
         done = 0.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from splinecli.errors import InputError, OutputError
 from splinecli.extras import import_extra
 from splinecli.files import file_sha256
 from splinecli.pixel_sets.captures import free_name
-from splinecli.pixel_sets.store import Pixels
+from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.measured import MeasuredLibrary
 from splinecli.synthesis.measured_files import read_measured
@@ -127,17 +127,52 @@ def add_scene(
         OutputError: an entry cannot be written.
         UsageError: the packages of the extra `render` are not installed.
     """
-    names = plan.entry_names(position)
-    if not all(name in writer for name in names.values()):
-        rendered = _render(plan, position, progress)
-        recipe = plan.recipe(position)
-        for kind, name in names.items():
-            source = f"rendered: {rendered.shape}"
-            writer.add(name, plan.names[position], source, recipe, _pixels(rendered, kind))
-    return list(names.values())
+    if not has_scene(writer, plan, position):
+        rendered = render_planned(plan, position, progress)
+        add_rendered(writer, plan, position, rendered.shape, partial(_pixels, rendered))
+    return list(plan.entry_names(position).values())
 
 
-def _render(plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None) -> RenderedScene:
+def has_scene(writer: PixelSetWriter, plan: ScenePlan, position: int) -> bool:
+    """Return whether the set has all entries of a scene."""
+    return all(name in writer for name in plan.entry_names(position).values())
+
+
+def add_rendered(
+    writer: PixelSetWriter, plan: ScenePlan, position: int, shape: str, pixels: Callable[[str], Pixels]
+) -> None:
+    """Add the entries of a rendered scene.
+
+    Args:
+        writer, plan, position: see add_scene.
+        shape: what was rendered.
+        pixels: returns the pixels of a class of materials.
+
+    Raises:
+        OutputError: an entry cannot be written.
+    """
+    recipe = plan.recipe(position)
+    for kind, name in plan.entry_names(position).items():
+        writer.add(name, plan.names[position], f"rendered: {shape}", recipe, pixels(kind))
+
+
+def save_rendered(rendered: RenderedScene, path: Path) -> None:
+    """Write the pixels of all classes of materials to a file, for load_rendered. Raises OSError."""
+    arrays = {f"{kind}.{name}": getattr(_pixels(rendered, kind), name) for kind in CLASSES for name in ARRAYS}
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def load_rendered(path: Path, kind: str) -> Pixels:
+    """Return the pixels of a class of materials from a file that save_rendered wrote. Raises OSError."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS})
+
+
+def render_planned(
+    plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None
+) -> RenderedScene:
+    """Render a scene of the plan. Raises what add_scene raises."""
     mesh_file = plan.meshes[position] if position < len(plan.meshes) else None
     mesh = None if mesh_file is None else read_mesh(mesh_file)
     index = position - len(plan.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position

@@ -10,6 +10,34 @@ WORKERS = Option(
     help="Compute N captures side by side, in processes of this machine (needs the extra 'cluster'). auto chooses by"
     " cores and memory.",
 )
+TRIAL_WORKERS = Option(
+    "1",
+    "--workers",
+    metavar="N|auto",
+    help="Score trials in N processes of this machine, in place of --jobs threads (needs the extra 'cluster'). auto is"
+    " the number of cores.",
+)
+TRIAL_CLUSTER = Option(
+    None,
+    "--cluster",
+    metavar="ADDRESS|FILE",
+    help="Score trials on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file"
+    " (needs the extra 'cluster').",
+)
+TRIAL_RETRIES = Option(
+    None,
+    "--retries",
+    metavar="N",
+    min=0,
+    help="Repeat a draw N times whose worker was lost, on other workers. [default: 2]",
+)
+SCENE_WORKERS = Option(
+    "1",
+    "--workers",
+    metavar="N|auto",
+    help="Render N scenes side by side, in processes of this machine (needs the extra 'cluster'). auto is the number"
+    " of cores.",
+)
 CLUSTER = Option(
     None,
     metavar="ADDRESS|FILE",

@@ -88,7 +88,7 @@ def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
 
 
 def parse_cluster(
-    workers: str, address: str | None, retries: int | None, *, gpu: bool = False
+    workers: str, address: str | None = None, retries: int | None = None, *, gpu: bool = False
 ) -> ClusterOptions | None:
     """Return where --workers and --cluster let tasks be done; None for this process. Raises UsageError."""
     from splinecli.pipeline.connection import RETRIES, ClusterOptions

@@ -1,0 +1,106 @@
+"""The trials of `evaluate` on several processes or machines: one task a draw of lights."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splinecli.capture import open_capture
+from splinecli.errors import ModelError
+from splinecli.evaluation.draws_elsewhere import DrawScorer, DrawScores, DrawTask
+from splinecli.evaluation.protocol import Protocol
+from splinecli.methods import Estimator, MethodOptions, make_estimator
+from splinecli.pipeline.batch_on_workers import shared_probe
+from splinecli.pipeline.capture_memory import source_bytes
+from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.connection import ClusterOptions, connected
+from splinecli.pipeline.observer import Observer
+from splinecli.pipeline.worker import Work
+
+
+@dataclass(frozen=True)
+class _Settings:
+    command: str
+    methods: tuple[str, ...]
+    method_options: MethodOptions
+    fingerprints: tuple[str, ...]
+    protocols: tuple[Protocol, ...]
+
+
+@dataclass(frozen=True)
+class OnWorkers:
+    """Scores draws on workers. The process of the command alone writes the store of trials.
+
+    Args:
+        estimators, method_options: the methods.
+        protocols: those of the evaluation.
+        cluster: where draws are scored.
+        output: a folder that all workers see.
+        observer: receives messages.
+    """
+
+    estimators: Sequence[Estimator]
+    method_options: MethodOptions
+    protocols: Sequence[Protocol]
+    cluster: ClusterOptions
+    output: Path
+    observer: Observer
+
+    def __call__(self, draws: Sequence[DrawTask]) -> Iterator[tuple[DrawTask, DrawScores]]:
+        """Yield the draws with their scores as they end.
+
+        Raises:
+            LostError: the workers of a draw were lost. All others are scored.
+            SplinecliError: what a trial or Distributor.run raises.
+        """
+        settings = _Settings(
+            uuid.uuid4().hex,
+            tuple(estimator.name for estimator in self.estimators),
+            self.method_options,
+            tuple(estimator.fingerprint for estimator in self.estimators),
+            tuple(self.protocols),
+        )
+        lost: LostError | None = None
+        with shared_probe(self.output) as probe, connected(self.cluster) as client:
+            work = Work.of_this_process(settings, _scorer, _score, probe)
+            distributor = Distributor(client, work, self.cluster, self.observer)
+            for task, result in distributor.run(_tasks(draws)):
+                if isinstance(result, LostError):
+                    lost = result
+                else:
+                    yield task.args[0], result
+        if lost is not None:
+            raise lost
+
+
+def _tasks(draws: Iterable[DrawTask]) -> Iterator[Task]:
+    folder, memory = None, 0.0
+    for draw in draws:
+        if draw.folder != folder:
+            folder, memory = draw.folder, source_bytes(lambda: open_capture(draw.folder))  # noqa: B023 - called here
+        yield Task((draw,), draw.name, memory)
+
+
+_scorers: dict[str, DrawScorer] = {}
+"""That of the command that this worker serves."""
+
+
+def _scorer(settings: _Settings) -> DrawScorer:
+    if settings.command not in _scorers:
+        estimators = [make_estimator(name, settings.method_options) for name in settings.methods]
+        for estimator, expected in zip(estimators, settings.fingerprints, strict=True):
+            if estimator.fingerprint != expected:
+                raise ModelError(
+                    f"{estimator.name} is {estimator.fingerprint} here, expected {expected} as on the machine of the"
+                    " command",
+                    hint="Use the same weight file everywhere, and the same --precision",
+                )
+        _scorers.clear()
+        _scorers[settings.command] = DrawScorer(estimators, settings.protocols)
+    return _scorers[settings.command]
+
+
+def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
+    return _scorer(settings).score(draw)

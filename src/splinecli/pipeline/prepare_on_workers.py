@@ -1,0 +1,99 @@
+"""The scenes of `prepare` on several processes: one task a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from splinecli.files import UNFINISHED
+from splinecli.pipeline.batch_on_workers import shared_probe
+from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.connection import ClusterOptions, connected
+from splinecli.pipeline.observer import Observer
+from splinecli.pipeline.worker import Work
+from splinecli.pixel_sets.rendered import (
+    ScenePlan,
+    add_rendered,
+    has_scene,
+    load_rendered,
+    render_planned,
+    save_rendered,
+)
+from splinecli.pixel_sets.writer import PixelSetWriter
+
+
+@dataclass(frozen=True)
+class _Settings:
+    plan: ScenePlan
+    folder: Path
+
+
+def render_on_workers(
+    writer: PixelSetWriter,
+    plan: ScenePlan,
+    cluster: ClusterOptions,
+    observer: Observer,
+    on_scene: Callable[[int], object],
+) -> None:
+    """Render the scenes that the set does not have, and add them in the order of the plan, as one process does.
+
+    A worker writes a scene to a hidden file of the set. This process alone adds it to the set.
+
+    Args:
+        writer, plan: see add_scene.
+        cluster: where the scenes are rendered.
+        observer: receives messages.
+        on_scene: called with the number of each scene that the set has then.
+
+    Raises:
+        LostError: the workers of a scene were lost. The other scenes are in the set.
+        SplinecliError: what add_scene or Distributor.run raises.
+    """
+    missing = [position for position in range(len(plan.names)) if not has_scene(writer, plan, position)]
+    settings = _Settings(replace(plan), writer.folder)  # a copy without what the plan has read from files
+    rendered: dict[int, str | LostError] = {}
+    position = 0
+
+    def add_those_in_order() -> None:
+        nonlocal position
+        while position < len(plan.names) and (position in rendered or position not in missing):
+            shape = rendered.get(position)
+            if isinstance(shape, str):
+                path = _path(settings, position)
+                add_rendered(writer, plan, position, shape, partial(load_rendered, path))
+                path.unlink()
+            if not isinstance(shape, LostError):
+                on_scene(position)
+            position += 1
+
+    try:
+        with shared_probe(writer.folder) as probe, connected(cluster) as client:
+            work = Work.of_this_process(settings, _prepare, _render, probe)
+            tasks = (Task((number,), plan.names[number]) for number in missing)
+            add_those_in_order()
+            for task, result in Distributor(client, work, cluster, observer).run(tasks):
+                rendered[task.args[0]] = result
+                add_those_in_order()
+    finally:
+        for number in missing:
+            _path(settings, number).unlink(missing_ok=True)
+    for result in rendered.values():
+        if isinstance(result, LostError):
+            raise result
+
+
+def _path(settings: _Settings, position: int) -> Path:
+    return settings.folder / f".scene{position}{UNFINISHED}"
+
+
+def _prepare(settings: _Settings) -> None:
+    settings.plan.check_inputs()
+
+
+def _render(settings: _Settings, position: int) -> str:
+    """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
+    rendered = render_planned(settings.plan, position)
+    save_rendered(rendered, _path(settings, position))
+    return rendered.shape
