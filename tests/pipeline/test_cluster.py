@@ -19,7 +19,7 @@ from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.pipeline import batch_on_workers, connection
 from splinecli.pipeline.batch import infer_batch
-from splinecli.pipeline.capture_list import list_captures
+from splinecli.pipeline.capture_list import Member, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
 from splinecli.pipeline.cluster import Distributor, LostError, Task
 from splinecli.pipeline.connection import ClusterOptions
@@ -229,6 +229,16 @@ def test_no_scheduler(address, tmp_path, monkeypatch):
         connection.connected(ClusterOptions(address=address)),
     ):
         pass
+
+
+def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
+    """The command sees the folder, so it is not missing for it."""
+    monkeypatch.chdir(tmp_path)
+    settings = batch_on_workers._Settings(InferOptions(method="ls"), "nothing", None)
+    member = Member(tmp_path / "unseen", "unseen")
+    outcome, _ = client.submit(batch_on_workers._infer, settings, 0, member, pure=False).result()
+    expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
+    assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
 
 
 def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):

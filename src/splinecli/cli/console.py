@@ -90,10 +90,14 @@ class Messages(Observer):
             if now - shown >= LINE_SECONDS and done < total:
                 shown = now
                 speed = (done - start) / (now - began)
-                notes = [f"{speed:,.0f} {unit}/s", f"{(total - done) / speed:.0f} s left"] if unit else []
+                notes = [_in_words(speed, unit), f"{(total - done) / speed:.0f} s left"] if unit else []
                 self.say(", ".join((f"{label}: {100 * done / total:.0f} %", *notes, *filter(None, [note]))))
 
         return advance
+
+
+def _in_words(speed: float, unit: str) -> str:
+    return f"{speed:,.0f} {unit}/s" if speed >= 10 else f"{speed:.2g} {unit}/s"
 
 
 @contextmanager
@@ -109,14 +113,16 @@ def _bar(label: str, total: float, start: float, unit: str) -> Iterator[Advance]
         TextColumn("{task.fields[speed]}", markup=False),
         TextColumn("{task.fields[note]}", markup=False),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    # A summary that goes to a file or a pipe must not land in the bar's stream.
+    own = sys.stdout.isatty()
+    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=own) as bar:
         task = bar.add_task(printable(label), total=total, note="", speed="")
         bar.update(task, completed=start)
 
         def advance(amount: float, note: str = "") -> None:
             bar.update(task, advance=amount)
             if unit and (speed := bar.tasks[0].speed):
-                bar.update(task, speed=f"{speed:,.0f} {unit}/s")
+                bar.update(task, speed=_in_words(speed, unit))
             if note:
                 bar.update(task, note=note)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import uuid
 from collections.abc import Iterator, Sequence
@@ -10,7 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splinecli.errors import ModelError
+from splinecli.errors import InputError, ModelError
+from splinecli.extras import import_extra
 from splinecli.files import UNFINISHED, refusals_as_output_errors
 from splinecli.pipeline.batch import Outcome, Redo, failed, run_member
 from splinecli.pipeline.capture_list import Member
@@ -20,7 +22,7 @@ from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
-from splinecli.pipeline.worker import Work
+from splinecli.pipeline.worker import SAME_STORAGE, Work
 
 if TYPE_CHECKING:
     from splinecli.methods import Estimator, MethodOptions
@@ -68,9 +70,9 @@ def infer_on_workers(
             Task((number, member), str(member.folder), expected_bytes(member, options))
             for number, member in enumerate(members)
         )
-        with observer.progress("captures", len(members)) as advance:
-            began, n_pixels, n_failed = time.monotonic(), 0, 0
-            for task, result in distributor.run(tasks):
+        with observer.progress("captures", len(members), unit="captures") as advance:
+            began, n_failed, n_pixels = time.monotonic(), 0, 0
+            for n_ended, (task, result) in enumerate(distributor.run(tasks), start=1):
                 number, member = task.args
                 if isinstance(result, LostError):
                     outcome = failed(member.name, result)
@@ -80,8 +82,11 @@ def infer_on_workers(
                         observer.warn(warning)
                 n_failed += outcome.exit_code != 0
                 n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
-                speed = n_pixels / (time.monotonic() - began)
-                advance(1, f"{n_failed} failed, {distributor.running} running, {speed:,.0f} pixels/s")
+                advance(
+                    1,
+                    f"{n_ended - n_failed} done, {n_failed} failed, {distributor.running} running,"
+                    f" {n_pixels / (time.monotonic() - began):,.0f} pixels/s",
+                )
                 yield number, outcome
 
 
@@ -114,6 +119,14 @@ def _prepare(settings: _Settings) -> None:
 def _infer(settings: _Settings, number: int, member: Member) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return what became of it and the warnings."""
     observer = _Warnings()
+    if member.missing is None and not os.path.lexists(member.folder):
+        here = import_extra("distributed", "cluster").get_worker().address
+        member = replace(
+            member,
+            missing=InputError(
+                f"the folder does not exist on the worker {here}", path=member.folder, hint=SAME_STORAGE
+            ),
+        )
     outcome = run_member(member, settings.options, settings.redo, lambda: _method(settings), observer)
     return outcome, observer.found
 

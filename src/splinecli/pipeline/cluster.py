@@ -263,6 +263,15 @@ class Distributor:
             del self._workers[worker.address]
             self.observer.warn(f"{named} This worker gets no work")
             return
+        except Exception as error:
+            if worker.ready:
+                raise
+            # Even the first task cannot be read there.
+            reason = f"{type(error).__name__}: {error}"
+            raise UsageError(
+                f"the worker {worker.address}, or the scheduler, cannot run splinecli ({reason})",
+                hint="Install the same version of splinecli on all workers and the scheduler",
+            ) from error
         worker.future, task, worker.task = None, worker.task, None
         if task is not None:
             yield task, result

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 RETRIES = 2
 """How often a task is done again whose worker was lost, unless the user says otherwise."""
 
-_CONNECT_SECONDS = 8.0
+_CONNECT_SECONDS = 5.0
 _CLOSE_SECONDS = 5.0
 _LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
 
@@ -101,6 +101,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
             **dict.fromkeys(names, threads),
             "OMP_WAIT_POLICY": "passive",
         },
+        # The scheduler is in this process. What it remembers for a dashboard would grow for an hour.
+        "distributed.admin.low-level-log-length": 100,
+        "distributed.admin.system-monitor.log-length": 10,
         "logging": dict.fromkeys(_LOGGERS, "critical"),
     }
     with dask.config.set(settings):
