@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -239,6 +240,17 @@ def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     outcome, _ = client.submit(batch_on_workers._infer, settings, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
+
+
+def test_a_server_that_is_no_scheduler(monkeypatch):
+    monkeypatch.setattr(connection, "_ANSWER_SECONDS", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            pytest.raises(UsageError, match="no Dask scheduler answers"),
+            connection.connected(ClusterOptions(address=address)),
+        ):
+            pass
 
 
 def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):

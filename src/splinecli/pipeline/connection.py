@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from splinecli.devices import count_available_cores
@@ -24,6 +26,7 @@ RETRIES = 2
 """How often a task is done again whose worker was lost, unless the user says otherwise."""
 
 _CONNECT_SECONDS = 5.0
+_ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0
 _LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
 
@@ -73,19 +76,38 @@ def connected(options: ClusterOptions) -> Iterator[Client]:
         with _local_cluster(options) as cluster, distributed.Client(cluster, set_as_default=False) as client:
             yield client
         return
-    address = _address(options.address)
-    try:
-        client = distributed.Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(
-            f"no Dask scheduler answers at {address}",
-            hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
-        ) from error
+    client = _client(_address(options.address))
     try:
         yield client
     finally:
         with suppress(OSError, TimeoutError):
             client.close(timeout=_CLOSE_SECONDS)
+
+
+def _client(address: str) -> Client:
+    """Return a client of the scheduler at the address. Raises UsageError."""
+    from distributed import Client
+
+    answers: SimpleQueue[Client | Exception] = SimpleQueue()
+
+    def connect() -> None:
+        try:
+            answers.put(Client(address, timeout=_CONNECT_SECONDS, set_as_default=False))
+        except Exception as error:
+            answers.put(error)
+
+    # In another thread: Dask waits for ever for a server that is no scheduler.
+    Thread(target=connect, daemon=True).start()
+    try:
+        answer = answers.get(timeout=_ANSWER_SECONDS)
+    except Empty:
+        answer = TimeoutError()
+    if isinstance(answer, Exception):
+        raise UsageError(
+            f"no Dask scheduler answers at {address}",
+            hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
+        ) from answer
+    return answer
 
 
 @contextmanager
