@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
+from splinecli.memory import return_freed_memory
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
 from splinecli.methods.lamp_light import LampLight, rows_of
@@ -95,14 +96,17 @@ def estimate_normals(
         light_of = partial(_light_on, capture)
         with nullcontext() if refining is None else refining() as advance:
             refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
+    return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
-    normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
-    normal_map[capture.mask] = normals
     confidence_map = None
     if errors is not None:
         confidence_map = np.zeros(capture.mask.shape, np.float32)
-        confidence_map[capture.mask] = confidence(errors)
+        confidence_map[capture.mask] = _confidence(errors)
+    del errors
+    normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
+    normal_map[capture.mask] = normals
+    del normals
     if capture.ground_truth is None:
         return NormalEstimate(capture, normal_map, seconds, confidence_map=confidence_map)
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
@@ -117,6 +121,14 @@ def _light_on(capture: Capture, rows: slice | NDArray[np.integer]) -> LampLight:
     if capture.lamps is None:
         return LampLight(observations, capture.light_directions)
     return LampLight.of(observations, rows_of(capture.lamps, rows))
+
+
+def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the confidence (P,) from distributions of errors (P, 2), without further arrays of their size."""
+    found = np.empty(len(errors), np.float32)
+    for start in range(0, len(errors), TILE_PIXELS):
+        found[start : start + TILE_PIXELS] = confidence(errors[start : start + TILE_PIXELS])
+    return found
 
 
 def _check_unit(normals: NDArray[np.float32], method: str) -> None:

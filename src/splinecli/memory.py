@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from splinecli.errors import SplinecliError
@@ -53,14 +54,25 @@ def keep_freed_memory() -> None:
     By default it returns large blocks to the system, which then clears new pages for every array. That takes about a
     third of the time of networks and of reading. Blocks above _LARGEST_KEPT are still returned.
     """
+    mallopt = _of_c_library("mallopt")
+    for parameter, n_bytes in ((_MMAP_THRESHOLD, _LARGEST_KEPT), (_TRIM_THRESHOLD, _MOST_KEPT)):
+        mallopt(parameter, n_bytes)
+
+
+def return_freed_memory() -> None:
+    """Return freed blocks to the system between two stages, where the C library is glibc; see keep_freed_memory."""
+    _of_c_library("malloc_trim")(0)
+
+
+def _of_c_library(name: str) -> Callable[..., object]:
+    """Return a function of the C library, or one that does nothing where there is none of this name."""
     try:
         import ctypes
 
-        mallopt = ctypes.CDLL(None).mallopt
+        found: Callable[..., object] = getattr(ctypes.CDLL(None), name)
     except (ImportError, OSError, AttributeError, TypeError):  # another C library, or Windows
-        return
-    for parameter, n_bytes in ((_MMAP_THRESHOLD, _LARGEST_KEPT), (_TRIM_THRESHOLD, _MOST_KEPT)):
-        mallopt(parameter, n_bytes)
+        return lambda *_: None
+    return found
 
 
 def _free_memory() -> float:

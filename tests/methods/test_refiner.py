@@ -52,7 +52,7 @@ def refine(
     assert isinstance(net, RefineNet)
     refined = normals.copy()
     done: list[int] = []
-    Refiner(net, "float32", tile=tile).refine(
+    Refiner(net, "float32", tile=tile, margin=REACH).refine(
         mask,
         observations,
         lambda rows: LampLight(observations[rows], LIGHTS),

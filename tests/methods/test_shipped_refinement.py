@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
-from splinecli.methods import make_estimator
+from splinecli.methods import MethodOptions, make_estimator
+from splinecli.methods.estimator import refiner_of
+from splinecli.methods.lamp_light import LampLight
+from splinecli.methods.refiner import MARGIN, Refiner
 from splinecli.normals import angle_between_deg, unit
 
 SIZE = 64
@@ -21,18 +24,18 @@ ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
 PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
 
 
-def refined_and_not(
+def scene(
     normals: NDArray[np.floating], albedo: NDArray[np.floating] | float, *, noise: float, gloss: float = 0.0
-) -> tuple[NormalEstimate, NormalEstimate]:
-    """Estimate a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale."""
+) -> Capture:
+    """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale."""
     rng = np.random.default_rng(0)
     flat = normals.reshape(-1, 3)
     half = unit(LIGHTS + np.array((0, 0, 1)))
-    observations = np.broadcast_to(albedo, (SIZE, SIZE)).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
+    observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
     observations = observations + gloss * (flat @ half.T).clip(0) ** 60
     observations += noise * observations.max() * rng.normal(size=observations.shape)
-    mask = np.ones((SIZE, SIZE), np.bool_)
-    capture = Capture(
+    mask = np.ones(normals.shape[:2], np.bool_)
+    return Capture(
         "scene",
         observations.clip(0).astype(np.float32),
         LIGHTS,
@@ -40,6 +43,13 @@ def refined_and_not(
         mask,
         normals.astype(np.float32),
     )
+
+
+def refined_and_not(
+    normals: NDArray[np.floating], albedo: NDArray[np.floating] | float, *, noise: float, gloss: float = 0.0
+) -> tuple[NormalEstimate, NormalEstimate]:
+    """Estimate a scene with and without refinement; see `scene`."""
+    capture = scene(normals, albedo, noise=noise, gloss=gloss)
     refined, pixelwise = (
         estimate_normals(capture, make_estimator(name)) for name in ("spline-net", "spline-net-pixelwise")
     )
@@ -100,3 +110,30 @@ def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
         for estimate in refined_and_not(normals, np.where(sphere, 0.5, behind), noise=0.002)
     )
     assert refined < pixelwise + 0.3
+
+
+def test_seams_of_tiles_do_not_show() -> None:
+    """The margin of a tile is smaller than what the net can see. Its share of a normal is far below its error."""
+    rows, columns = np.mgrid[:144, :144]
+    slopes = np.stack((np.sin(columns / 9), np.cos((rows + columns) / 13)), axis=-1)
+    normals = unit(np.dstack((slopes, np.ones_like(slopes[..., :1]))))
+    capture = scene(normals, np.where(columns % 40 < 20, 0.8, 0.2), noise=0.01, gloss=0.5)
+    noise = np.random.default_rng(1).normal(scale=0.05, size=(capture.n_pixels, 3))
+    before = unit(normals.reshape(-1, 3) + noise).astype(np.float32)
+    errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
+    whole = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32")))
+    assert whole is not None
+    found = []
+    for refiner in (whole, Refiner(whole.network, "float32", tile=MARGIN)):
+        normals, errors = before.copy(), errors_before.copy()
+        refiner.refine(
+            capture.mask,
+            capture.observations,
+            lambda chosen: LampLight(capture.observations[chosen], LIGHTS),
+            normals,
+            errors,
+        )
+        found.append((normals, errors))
+    assert angle_between_deg(found[0][0], before).mean() > 0.2
+    assert angle_between_deg(found[0][0], found[1][0]).max() < 0.03
+    assert np.abs(found[0][1] - found[1][1]).max() < 0.03

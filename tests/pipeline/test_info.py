@@ -57,10 +57,9 @@ def test_lines_of_a_report() -> None:
 
 
 def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
-    from splinecli.methods.refiner import TILE
-    from splinecli.networks.refine_net import REACH
+    from splinecli.methods.refiner import MARGIN, TILE
 
-    assert REFINED_PIXELS == (TILE + 2 * REACH) ** 2
+    assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
 
 
 def test_every_origin_of_a_white_level_has_words() -> None:

@@ -127,7 +127,8 @@ class DistilledEstimator:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """Return the perceptron's normals and errors of some pixels, and which pixels are rare or unlike the sample."""
         inputs = self._perceptron.inputs(torch.as_tensor(observations).to(self.device))
-        normals, errors = (found.cpu().numpy() for found in self._perceptron(inputs))
+        found = self._perceptron(inputs, bfloat16=self.precision == "bfloat16")
+        normals, errors = (values.cpu().numpy() for values in found)
         dark = ~(observations > 0).any(axis=1)
         normals[dark | ~normals.any(axis=1)] = TOWARDS_CAMERA
         errors[dark] = UNKNOWN_ERROR
@@ -194,7 +195,8 @@ def distil(
             progress=count,
         )
     with torch.inference_mode():
-        angles = angle_between_deg(perceptron(inputs[:held])[0].cpu().numpy(), normals[:held].cpu().numpy())
+        learned, _ = perceptron(inputs[:held], bfloat16=teacher.precision == "bfloat16")
+        angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
     found = Distillation(
         sample=len(inputs),
         held_out=held,

@@ -49,9 +49,17 @@ class Perceptron(nn.Module):
         scaled = observations / map_scale(observations)
         return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
 
-    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return unit normals (P, 3) and the distributions of their errors (P, 2); see networks/error_head.py."""
-        found = self.last(self.hidden((inputs - self.mean) / self.spread))
+    def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
+        """Return unit normals (P, 3) and the distributions of their errors (P, 2); see networks/error_head.py.
+
+        Args:
+            inputs: (P, F + 3), see `inputs`.
+            bfloat16: whether the hidden layers compute in it. The rest is in float32.
+        """
+        scaled = (inputs - self.mean) / self.spread
+        with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            hidden = self.hidden(scaled)
+        found = self.last(hidden.to(inputs.dtype))
         return nn.functional.normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
 
     def learn(

@@ -34,9 +34,20 @@ class PixelSample:
 
     def unlike(self, features: Tensor) -> Tensor:
         """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
-        distance, group = torch.cdist(features, self.centres).min(dim=1)
+        from_rare, from_others = (
+            _nearest(features, self.centres[group]) for group in (self.rare, ~self.rare)
+        )
         # Rounding must not make a pixel unlike itself.
-        return self.rare[group] | (distance > 1.001 * self.reach + 1e-4)
+        return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
+
+
+def _nearest(features: Tensor, centres: Tensor) -> Tensor:
+    """Return the distances (P,) of features (P, C) from the nearest of centres (K, C); infinity if there are none."""
+    if not len(centres):
+        return torch.full_like(features[:, 0], torch.inf)
+    # Twice as fast as torch.cdist.
+    rest = torch.addmm(centres.square().sum(dim=1), features, centres.T, alpha=-2).amin(dim=1)
+    return (rest + features.square().sum(dim=1)).clamp(min=0).sqrt()
 
 
 def draw_sample(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 BASE_BYTES = 500 * 2**20
 """Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
 
-REFINED_PIXELS, REFINED_BYTES = 960**2, 1100
+REFINED_PIXELS, REFINED_BYTES = 736**2, 1100
 """The most pixels that are refined at once: a tile with its margin. Bytes of each."""
 
 _WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
