@@ -9,7 +9,7 @@ import pytest
 from splinecli.capture.image_shifts import ImageShift, find_shifts
 from splinecli.capture.sample import Sample
 
-SIDE, N_LIGHTS = 90, 8
+SIDE, N_LIGHTS = 90, 10
 
 
 def images(*, texture: float, seed: int = 0) -> np.ndarray:
@@ -72,7 +72,7 @@ def test_what_cannot_be_told_is_not_told() -> None:
     """Too few images, too small an object, and images without any detail."""
     pictures = images(texture=0.1)
     pictures[..., 3] = np.roll(pictures[..., 3], 3, axis=0)
-    assert find_shifts(sample_of(pictures[..., :4])) == []
+    assert find_shifts(sample_of(pictures[..., :9])) == []
     whole = sample_of(pictures)
     small = whole.mask.copy()
     small[:, 50:] = False

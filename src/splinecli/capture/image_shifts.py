@@ -19,18 +19,21 @@ from splinecli.capture.sample import Sample
 LARGEST = 8
 """The largest shift that is looked for, in pixels of the sample."""
 
-LEAST_CORRELATION, LEAST_GAIN = 0.15, 0.12
-"""A shift counts if detail correlates so well at it, and so much better than without it. Of right captures, a polished
-one reached 0.33 and 0.09."""
+LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
+"""A shift counts if detail correlates so well at it, and so much better than without it. On right captures of ten images
+and more, a polished metal reached 0.44 and 0.17."""
 
 LEAST_SHIFT = 0.8
 """The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel."""
+
+LEAST_IMAGES = 10
+"""The fewest images: from fewer, polished metals are predicted so badly that right ones would be named."""
 
 LEAST_PIXELS = 1000
 """The fewest pixels that must stay in the mask under every shift."""
 
 _MOST_NAMED = 4  # images in a sentence
-_MIN_IMAGES = 5  # one is predicted from three factors of four others or more
+_MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
 _DETAIL, _CONTRAST = 1.5, 4.0  # standard deviations of blurs in pixels: finer detail, local contrast
 _LIMIT = 4.0  # of detail, in local contrasts: highlights count no more
 _FAINT = 0.05  # share of the mean contrast below which detail fades out
@@ -48,12 +51,12 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
     values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
     inner = _inner(sample.mask)
-    if values.shape[1] < _MIN_IMAGES or np.count_nonzero(inner) < LEAST_PIXELS:
+    if values.shape[1] < LEAST_IMAGES or np.count_nonzero(inner) < LEAST_PIXELS:
         return []
     values = values / np.maximum(values.mean(axis=0), 1e-9)
     found = _shifts_against(values, range(values.shape[1]), sample.mask, inner)
     still = [place for place in range(values.shape[1]) if place not in found]
-    if found and len(still) >= _MIN_IMAGES:
+    if found and len(still) >= _MIN_PREDICTORS:
         # A shifted image also disturbs the prediction of others.
         found = _shifts_against(values, still, sample.mask, inner)
     return [
