@@ -26,6 +26,11 @@ def test_an_installed_module_is_returned() -> None:
             " Run pip install 'splinecli[render]'.",
         ),
         (
+            "OpenEXR",
+            "exr",
+            "EXR files need the package OpenEXR, which is not installed. Run pip install 'splinecli[exr]'.",
+        ),
+        (
             "fast_simplification",
             "mesh",
             "--decimate needs the package fast-simplification, which is not installed."

@@ -22,7 +22,7 @@ ROOMS = [
     {"networks", "devices"},
     {"fits", "calibration"},
     {"capture", "observation_map", "publishing", "surface"},
-    {"normals", "files", "locks", "memory", "transfer", "solve_3x3"},
+    {"normals", "files", "locks", "memory", "transfer", "solve_3x3", "exr"},
     {"extras"},
     {"errors", "__init__"},
 ]

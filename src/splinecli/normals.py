@@ -58,6 +58,11 @@ def encode_picture(
     return picture
 
 
+def describe(convention: Convention) -> str:
+    """Return the text that stands in files of normal maps: the frame, and where green points."""
+    return f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
+
+
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     """Decode an RGB image (..., 3) of 8 or 16 bits, green up, to unit normals.
 

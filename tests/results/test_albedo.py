@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from splinecli.calibration.balls import find_ball_files
+from splinecli.calibration.gray import measure_light_intensities
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import InputError
 from splinecli.results.albedo import albedo_map
@@ -41,6 +43,26 @@ def scene(tmp_path: Path):
     np.savetxt(tmp_path / "light_intensities.txt", INTENSITIES)
     cv2.imwrite(str(tmp_path / "mask.png"), inside.astype(np.uint8) * 255)
     return tmp_path, normals, albedo
+
+
+def test_a_gray_target_balances_the_colours(scene, tmp_path):
+    """With the intensities that calibrate measures on a gray card under coloured lamps, what is gray looks gray."""
+    folder, normals, _ = scene
+    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+    (tmp_path / "card").mkdir()
+    tint = INTENSITIES * (1, 0.7, 0.4)
+    for number, (light, colour) in enumerate(zip(lights, tint, strict=True)):
+        card = np.broadcast_to(0.5 * light[2] * colour * 65535, (20, 20, 3))
+        cv2.imwrite(str(tmp_path / f"card/{number}.png"), np.rint(card[..., ::-1]).astype(np.uint16))
+        gray = 0.4 * (normals @ light).clip(0)[..., None] * colour * 65535
+        cv2.imwrite(str(folder / f"{number}.png"), np.rint(gray[..., ::-1]).astype(np.uint16))
+    measured = measure_light_intensities(find_ball_files(tmp_path / "card"), lights, "card")
+    np.savetxt(folder / "light_intensities.txt", measured)
+    source = open_capture(folder)
+    found = albedo_map(source, source.read(), normals)[normals.any(axis=2)]
+    seen = found[found[:, 0] > 0]
+    np.testing.assert_allclose(seen / seen[:, :1], 1, atol=0.01)
+    assert seen.std() / seen.mean() < 0.02
 
 
 def test_restored_pixels_do_not_spoil_it(scene):

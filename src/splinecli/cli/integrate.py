@@ -35,8 +35,8 @@ def integrate(
     camera matrix, the depth map has heights towards the camera in pixels, with mean zero. With one, it has depths
     along the viewing axis, of unknown scale.
 
-    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object, and
-    surface.json.
+    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object,
+    depth.png and surface.json.
     """
     limit_reading(max_pixels_per_image)
     options = IntegrateOptions(

@@ -52,8 +52,9 @@ FILES = (
     ("OUT/NAME/normals.png", "Normal map, 16-bit RGB, (n + 1) / 2."),
     ("OUT/NAME/normals.npy", "Normal map, float32, H x W x 3, zero outside the mask."),
     (
-        "OUT/NAME/normals_8bit.png, normals.tiff",
-        "With --format png8, tiff: normal map in 8 bits, in float32.",
+        "OUT/NAME/normals_8bit.png, normals.tiff, normals.exr",
+        "With --format png8, tiff, exr: normal map in 8 bits, in float32, in float32 for renderers. exr also writes"
+        " albedo.exr and depth.exr, if there are these maps.",
     ),
     ("OUT/NAME/error_map.png", "If there are true normals: angular error with a color bar."),
     ("OUT/NAME/found_mask.png", "With --auto-mask: the mask of the object."),
@@ -64,9 +65,9 @@ FILES = (
     ),
     ("OUT/NAME/preview.png", "With --maps preview: the surface in matte white under a raking light."),
     (
-        "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff",
+        "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png",
         "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json. Both can write mesh.obj"
-        " (with mesh.mtl and mesh.png) and mesh.stl, integrate also depth.png.",
+        " (with mesh.mtl and mesh.png) and mesh.stl.",
     ),
     (
         "OUT/NAME/page.html",

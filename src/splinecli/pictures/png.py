@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,8 +15,16 @@ Picture = NDArray[np.uint8]
 """An RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits."""
 
 
-def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:
+_HEAD = 33
+"""Bytes of the signature and of the header, which is the first chunk of a file."""
+
+
+def encode_png(picture: NDArray[np.unsignedinteger], texts: Mapping[str, str] | None = None) -> bytes:
     """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) of 8 or 16 bits.
+
+    Args:
+        picture: the picture.
+        texts: texts of the file by keyword, in Latin-1 (PNG specification, tEXt).
 
     Raises:
         OutputError: OpenCV cannot encode the picture.
@@ -22,4 +34,12 @@ def encode_png(picture: NDArray[np.unsignedinteger]) -> bytes:
     done, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
     if not done:
         raise OutputError("the picture cannot be encoded as PNG")
-    return encoded.tobytes()
+    file = encoded.tobytes()
+    chunks = b"".join(_text_chunk(*text) for text in (texts or {}).items())
+    return file[:_HEAD] + chunks + file[_HEAD:]
+
+
+def _text_chunk(keyword: str, text: str) -> bytes:
+    # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
+    content = b"tEXt" + keyword.encode("latin-1") + b"\0" + text.encode("latin-1")
+    return struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))

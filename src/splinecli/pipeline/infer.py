@@ -211,7 +211,7 @@ def _further_files(
             albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
         colours = albedo_picture(albedo, capture.mask)
         if "albedo" in options.maps:
-            writers.append(partial(files.write_albedo, albedo, capture.mask))
+            writers.append(partial(files.write_albedo, albedo, capture.mask, exr="exr" in options.formats))
     if "confidence" in options.maps and estimate.confidence_map is not None:
         writers.append(partial(files.write_confidence, estimate.confidence_map))
     if "preview" in options.maps:
@@ -249,7 +249,9 @@ def _surface(
             pixel_size_mm=pixel_size,
             progress=share_of_iterations(advance),
         )
-    return partial(write_surface, surface=surface, formats=(*options.mesh_formats, *DEPTH_FORMATS))
+    exr = ("exr",) if "exr" in options.formats else ()
+    formats = (*options.mesh_formats, *DEPTH_FORMATS, *exr)
+    return partial(write_surface, surface=surface, formats=formats)
 
 
 def _page(

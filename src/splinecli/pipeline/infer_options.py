@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from splinecli.errors import UsageError
+from splinecli.exr import check_exr
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.normals import Convention
 from splinecli.pipeline.surface import check_decimation, check_surface_options
@@ -55,7 +56,7 @@ class InferOptions:
         rotations, batch_size: of a network. None for the method's own.
         distil: learn the network on a sample of the pixels; False for the network on every pixel, None for the faster.
         output: results go to `output`/<capture name>/.
-        formats: names of `splinecli.results.files.NORMALS`.
+        formats: names of `splinecli.results.files.NORMALS`. With exr, albedo and depth are EXR files, too.
         maps: names of `splinecli.results.files.MAPS`.
         html: also write page.html. surface: also write the depth map and the mesh.
         mesh_formats: of the surface: keys of `splinecli.surface.surface_files.MESH_FILES`.
@@ -197,6 +198,7 @@ class InferOptions:
                 check_file(Path(name), "a file", pipe=name == self.lights)
         self.radiometric_calibration()
         check_decimation(self.decimate)
+        check_exr(self.formats)
 
     def radiometric_calibration(self) -> RadiometricCalibration:
         """Return how the images' values become linear light. Raises InputError."""

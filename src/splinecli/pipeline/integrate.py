@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import InputError, UsageError
+from splinecli.exr import check_exr
 from splinecli.files import is_unfinished, read_json
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
@@ -103,6 +104,7 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
     from splinecli.publishing import held_folder
 
     check_decimation(options.decimate)
+    check_exr(options.formats)
     with held_folder(options.folder, observer.warn):
         check_free(options.folder, options.files, overwrite=options.overwrite)
         return _integrate_into(options, observer)

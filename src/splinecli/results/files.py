@@ -12,21 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.inference import NormalEstimate
-from splinecli.normals import Convention, encode_picture
+from splinecli.normals import Convention, describe, encode_picture
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
 from splinecli.publishing import new_files
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 
-NORMALS = {"png": "normals.png", "png8": "normals_8bit.png", "npy": "normals.npy", "tiff": "normals.tiff"}
+NORMALS = {
+    "png": "normals.png",
+    "png8": "normals_8bit.png",
+    "npy": "normals.npy",
+    "tiff": "normals.tiff",
+    "exr": "normals.exr",
+}
 """The file of the normal map in each format."""
 
 ERROR_MAP = "error_map.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-ALBEDO_PICTURE, ALBEDO, PREVIEW = "albedo.png", "albedo.npy", "preview.png"
+ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR, PREVIEW = "albedo.png", "albedo.npy", "albedo.exr", "preview.png"
 CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
 MAPS = {
-    "albedo": (ALBEDO_PICTURE, ALBEDO),
+    "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
     "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
     "preview": (PREVIEW,),
 }
@@ -87,17 +93,28 @@ def write_estimate(
 
 
 def write_normals(estimate: NormalEstimate, form: str, path: Path, convention: Convention) -> None:
-    """Write the normal map as a 16-bit or 8-bit PNG picture, or as a float32 NPY or TIFF file."""
+    """Write the normal map as a 16-bit or 8-bit PNG picture, or as a float32 NPY, TIFF or EXR file.
+
+    EXR has the colours of the pictures, (n + 1) / 2 and black outside the mask, because renderers expect them.
+    """
     if form in ("png", "png8"):
         bits = 8 if form == "png8" else 16
         picture = encode_picture(estimate.normal_map, estimate.capture.mask, bits=bits, convention=convention)
-        path.write_bytes(encode_png(picture))
+        path.write_bytes(encode_png(picture, {"normals": describe(convention)}))
     elif form == "npy":
         np.save(path, estimate.normal_map, allow_pickle=False)
+    elif form == "exr":
+        from splinecli.exr import encode_exr
+
+        signs = np.array((1, 1 if convention == "opengl" else -1, 1), np.float32)
+        colours = (estimate.normal_map * signs + 1) / 2 * estimate.capture.mask[..., None]
+        path.write_bytes(encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"}))
     else:
         import tifffile
 
-        tifffile.imwrite(path, estimate.normal_map, photometric="rgb")
+        tifffile.imwrite(
+            path, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}"
+        )
 
 
 def write_error_map(error_map_deg: NDArray[np.float32], folder: Path) -> None:
@@ -107,9 +124,15 @@ def write_error_map(error_map_deg: NDArray[np.float32], folder: Path) -> None:
     (folder / ERROR_MAP).write_bytes(encode_png(error_map_picture(error_map_deg)))
 
 
-def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], folder: Path) -> None:
-    """Write a linear albedo map (H, W, 3) as a float32 NPY file and as a picture."""
+def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], folder: Path, *, exr: bool) -> None:
+    """Write a linear albedo map (H, W, 3) as a float32 NPY file, as a picture and, with exr, as a float16 EXR file."""
     np.save(folder / ALBEDO, albedo, allow_pickle=False)
+    if exr:
+        from splinecli.exr import encode_exr
+
+        largest = np.finfo(np.float16).max
+        content = encode_exr(albedo.clip(0, largest).astype(np.float16), {"colours": "linear RGB"})
+        (folder / ALBEDO_EXR).write_bytes(content)
     (folder / ALBEDO_PICTURE).write_bytes(encode_png(albedo_picture(albedo, mask)))
 
 

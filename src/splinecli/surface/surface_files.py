@@ -1,4 +1,4 @@
-"""The files of a surface: meshes, the depth map as float32 NPY and TIFF, and as a 16-bit PNG picture."""
+"""The files of a surface: meshes, the depth map as float32 NPY, TIFF and EXR, and as a 16-bit PNG picture."""
 
 from __future__ import annotations
 
@@ -24,14 +24,20 @@ MESH_FILES = {
 }
 """The file names of each format of a mesh; mesh.png is the texture of an OBJ file, if there are colours."""
 
-SURFACE_FILES = {**MESH_FILES, "npy": ("depth.npy",), "tiff": ("depth.tiff",), "png": ("depth.png",)}
+SURFACE_FILES = {
+    **MESH_FILES,
+    "npy": ("depth.npy",),
+    "tiff": ("depth.tiff",),
+    "png": ("depth.png",),
+    "exr": ("depth.exr",),
+}
 """The file names of each format."""
 
 SURFACE_REPORT = "surface.json"
 """The report that `integrate` writes beside them."""
 
 DEFAULT_MESHES = ("glb", "ply")
-DEPTH_FORMATS = ("npy", "tiff")
+DEPTH_FORMATS = ("npy", "tiff", "png")
 DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
 
 _WHITE = 65535  # of 16 bits
@@ -94,10 +100,16 @@ def _encode(surface: Surface, form: str) -> dict[str, bytes]:
         _save_depth_picture(surface, buffer)
     elif form == "npy":
         np.save(buffer, surface.depth.astype(np.float32), allow_pickle=False)
+    elif form == "exr":
+        from splinecli.exr import encode_exr
+
+        low = np.nanmin(surface.depth)
+        heights = np.where(np.isfinite(surface.depth), surface.depth, low).astype(np.float32)
+        buffer.write(encode_exr(heights, {"unit": surface.unit, "outside": f"{low:.7g}"}))
     else:
         import tifffile
 
-        tifffile.imwrite(buffer, surface.depth.astype(np.float32))
+        tifffile.imwrite(buffer, surface.depth.astype(np.float32), description=f"unit: {surface.unit}")
     return {SURFACE_FILES[form][0]: buffer.getvalue()}
 
 

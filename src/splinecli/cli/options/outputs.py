@@ -39,7 +39,8 @@ NORMAL_FORMATS = Option(
     "png,npy",
     "--format",
     metavar="LIST",
-    help="Files of the normal map: any of {formats}. png has 16 bits, png8 has 8, npy and tiff are float32.",
+    help="Files of the normal map: any of {formats}. png has 16 bits, png8 has 8, npy and tiff are float32."
+    " exr (needs the extra 'exr') is for all maps that are written: normals, albedo, depth.",
     autocompletion=complete_list(choices.normal_formats),
 )
 SURFACE_FORMATS = Option(
@@ -47,7 +48,7 @@ SURFACE_FORMATS = Option(
     "--format",
     metavar="LIST",
     help=f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or"
-    " as a 16-bit picture (png).",
+    " as a 16-bit picture (png). exr needs the extra 'exr'.",
     autocompletion=complete_list(*SURFACE_FILES),
 )
 MAPS = Option(
@@ -62,7 +63,9 @@ HTML = Option(
     help="Also write page.html: the maps, and a view of the surface under a light that you move.",
 )
 SURFACE = Option(
-    False, "--surface", help="Also write mesh.glb, mesh.ply, depth.npy and depth.tiff, as integrate does."
+    False,
+    "--surface",
+    help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.",
 )
 MESH_FORMATS = Option(
     ",".join(DEFAULT_MESHES),

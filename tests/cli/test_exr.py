@@ -1,0 +1,74 @@
+"""EXR files hold the values and the channels that renderers read, and texts about them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from splinecli.exr import encode_exr
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header of an EXR file and its channels, each on its own."""
+    library = pytest.importorskip("OpenEXR")
+    file = library.File(str(path), separate_channels=True)
+    return file.header(), {name: channel.pixels for name, channel in file.channels().items()}
+
+
+@pytest.mark.parametrize("form", [np.float16, np.float32])
+def test_values_and_channels_survive(tmp_path: Path, form: type[np.floating]) -> None:
+    pytest.importorskip("OpenEXR")
+    pixels = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(form)
+    (tmp_path / "rgb.exr").write_bytes(encode_exr(pixels, {"made": "here"}))
+    (tmp_path / "y.exr").write_bytes(encode_exr(pixels[..., 0], {}))
+    header, channels = read(tmp_path / "rgb.exr")
+    assert header["made"] == "here"
+    assert set(channels) == set("RGB")
+    for number, name in enumerate("RGB"):
+        assert channels[name].dtype == form
+        np.testing.assert_array_equal(channels[name], pixels[..., number])
+    np.testing.assert_array_equal(read(tmp_path / "y.exr")[1]["Y"], pixels[..., 0])
+
+
+@pytest.mark.parametrize("convention", ["opengl", "directx"])
+def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
+    pytest.importorskip("OpenEXR")
+    options = ("--method", "ls", "--maps", "albedo", "--surface", "--convention", convention)
+    assert run("infer", capture, *options, "--format", "exr,png,npy,tiff").code == 0
+    out = Path("out/sphere")
+    green = f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
+    header, channels = read(out / "normals.exr")
+    assert header["normals"] == f"(n + 1) / 2; {green}"
+    picture = cv2.imread(str(out / "normals.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
+    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=2), picture, atol=1e-5)
+    with Image.open(out / "normals.png") as image:
+        assert image.info["normals"] == green
+    with tifffile.TiffFile(out / "normals.tiff") as file:
+        assert file.pages[0].description == "normals: x right, y up, z to the camera; green is y up"
+    _, channels = read(out / "albedo.exr")
+    albedo = np.load(out / "albedo.npy")
+    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=2), albedo, rtol=1e-3)
+    assert channels["R"].dtype == np.float16
+    header, channels = read(out / "depth.exr")
+    depth = np.load(out / "depth.npy")
+    assert header["unit"] == "pixel"
+    np.testing.assert_array_equal(channels["Y"], np.where(np.isnan(depth), np.nanmin(depth), depth))
+    assert (out / "depth.png").is_file()
+
+
+@pytest.mark.parametrize("command", [("infer", "sphere", "--method", "ls"), ("integrate", "missing.npy")])
+def test_without_the_library_nothing_is_done(
+    capture: Path, run: Any, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    result = run(*command, "--format", "exr")
+    assert result.code == 2
+    assert "EXR files need the package OpenEXR, which is not installed" in result.err
+    assert not Path("out/sphere").exists()
