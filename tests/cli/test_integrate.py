@@ -11,6 +11,8 @@ import pytest
 import tifffile
 from PIL import Image
 
+from splinecli.capture.capture_size import results_bytes
+from splinecli.capture.formats import image_size
 from splinecli.files import COMPLETE
 from splinecli.normals import encode_picture
 
@@ -194,6 +196,27 @@ def test_a_decimated_mesh_and_its_textures(run):
     assert (trimesh.load("out/mesh.ply").visual.vertex_colors[:, :3] == (0, 180, 0)).all()
     obj = trimesh.load("out/mesh.obj", process=False)
     assert obj.visual.material.image.getpixel((5, 5))[:3] == (0, 180, 0)
+
+
+def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monkeypatch):
+    """A mesh without triangles, and one that takes more memory than there is, have one message before the work."""
+    mask = np.zeros((24, 24), np.uint8)
+    mask[8:16, 12] = 255  # a line
+    cv2.imwrite("line.png", mask)
+    result = run("infer", capture, "--method", "ls", "--mask", "line.png", "--surface")
+    assert (result.code, "the mesh has no triangles" in result.err) == (3, True)
+    assert not Path("out/sphere/report.json").exists()
+    line = ("infer", capture, "--method", "ls", "--mask", "line.png", "--surface", "--mesh-format", "stl")
+    assert run(*line).code == 0
+
+    assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
+    n_pixels = json.loads(Path("out/sphere/report.json").read_text())["n_pixels"]
+    assert results_bytes(n_pixels, 5, surface=True) - results_bytes(n_pixels, 5) == n_pixels * 600
+    monkeypatch.setattr(image_size, "available_memory", lambda: n_pixels * 600.0)
+    assert run("integrate", "out/sphere").code == 0
+    monkeypatch.setattr(image_size, "available_memory", lambda: n_pixels * 600.0 - 1)
+    refused = run("integrate", "out/sphere", "--overwrite")
+    assert (refused.code, f"the surface of {n_pixels} pixels takes" in refused.err) == (3, True)
 
 
 def test_refusals(run, golden):

@@ -1,4 +1,4 @@
-"""The documents of infer and integrate are those that docs/reports.schema.json describes."""
+"""The documents of infer, integrate and evaluate are those that docs/reports.schema.json describes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 
 import jsonschema
 import pytest
+
+from splinecli.capture import capture_warnings
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8"))
 
@@ -43,6 +45,27 @@ def test_reports_of_infer(capture, run, arguments):
 def test_reports_of_integrate(capture, run):
     assert run("infer", capture, "--method", "ls").code == 0
     check(json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "surface_report")
+
+
+@pytest.mark.parametrize("lights", [["4"], ["4", "all"]])
+def test_results_of_evaluate(make_capture, run, lights):
+    make_capture("data/matte")
+    chosen = [word for number in lights for word in ("--n-lights", number)]
+    arguments = ("--method", "ls", "--method", "l1", *chosen, "--trials", 2)
+    document = json.loads(run("evaluate", "data", *arguments, "--json").out)
+    assert document == json.loads(Path("evaluation/results.json").read_text("utf-8"))
+    check(document, "results")
+    for change in ({"colour": 1}, {"averages": {"ls": "good"}}):
+        with pytest.raises(jsonschema.ValidationError):
+            check({**document, **change}, "results")
+
+
+def test_the_codes_of_warnings_are_those_of_the_source():
+    codes = {
+        value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)
+    }
+    described = SCHEMA["$defs"]["report"]["properties"]["warnings"]["items"]["properties"]["code"]["enum"]
+    assert described == sorted(codes)
 
 
 @pytest.mark.parametrize(

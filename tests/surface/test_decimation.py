@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from glb_file import read_glb
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
+from splinecli.surface import decimation
 from splinecli.surface.camera import pixel_rays
-from splinecli.surface.decimation import decimate
+from splinecli.surface.decimation import decimate, mesh_to_decimate
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 from splinecli.surface.mesh_files import encode_glb
 
@@ -114,6 +115,32 @@ def test_vertices_stay_on_the_dome_and_in_their_places(
     depth = height if camera is None else -(3 - height / 125)
     scale = 1 if camera is None else 125
     assert np.abs(decimated.vertices[:, 2] - depth).mean() * scale < 0.2  # pixels
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_blocks_of_a_large_map_have_its_shape(
+    camera: NDArray[np.float64] | None, odd: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their places."""
+    monkeypatch.setattr(decimation, "LARGE_MAP", 0)
+    rows, columns = np.mgrid[: SIDE + odd, :SIDE].astype(float)
+    mask = np.hypot(columns - 44.5, rows - 44.5) < 42
+    height, normal_map = height_of_dome(columns, rows), measured(columns, rows) * mask[..., None]
+    depth = height if camera is None else 3 - height / 125
+    colours = np.full((*mask.shape, 3), 90, np.uint8)
+    fine = mesh_to_decimate(depth, mask, camera, colours, n_triangles=300, normal_map=normal_map)
+    assert 4 * 300 <= len(fine.triangles) < np.count_nonzero(mask)
+    mesh = decimate(fine, 300, normal_map, camera)
+    assert mesh.texture is not None and mesh.normal_texture is not None
+    assert mesh.texture.shape == mesh.normal_texture.shape == (*mask.shape, 3)
+    columns, rows = (mesh.uvs * mask.shape[::-1] - 0.5).T
+    found = mesh.vertices[:, 2] if camera is None else 125 * (3 + mesh.vertices[:, 2])
+    near = np.hypot(columns - 44.5, rows - 44.5) < 38
+    assert np.abs(found - height_of_dome(columns, rows))[near].mean() < 0.5  # pixels
+    if camera is None:
+        middle = (SIDE - 1 + odd) / 2
+        np.testing.assert_allclose(mesh.vertices[:, 0], columns - 44.5, atol=1e-3)
+        np.testing.assert_allclose(mesh.vertices[:, 1], middle - rows, atol=1e-3)
 
 
 def test_a_mesh_that_is_small_enough_stays(camera: NDArray[np.float64] | None) -> None:

@@ -15,6 +15,9 @@ _BYTES_OF_RESULTS = 52
 _BYTES_OF_ALBEDO = 52
 """Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
 
+BYTES_OF_SURFACE = 600
+"""Of each pixel of the mask: integration, or the mesh and its files, whichever takes more."""
+
 _IMAGES = 2
 """Images in memory while they are read; see read_ahead."""
 
@@ -40,9 +43,11 @@ def common_size(images: Sequence[Path]) -> StoredSize:
     return largest
 
 
-def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False) -> int:
+def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False, surface: bool = False) -> int:
     """Return the bytes that `infer` takes for the results of a capture, beside its observations."""
-    return n_pixels * (_BYTES_OF_RESULTS + (_BYTES_OF_ALBEDO + n_lights if albedo else 0))
+    # The surface is made after what the albedo needs is free again.
+    more = max(_BYTES_OF_ALBEDO + n_lights if albedo else 0, BYTES_OF_SURFACE if surface else 0)
+    return n_pixels * (_BYTES_OF_RESULTS + more)
 
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:

@@ -77,6 +77,10 @@ def _infer_into(
     if estimator is None:
         estimator = make_method(options)
     _check_memory(capture, folder, options)
+    if options.surface and "glb" in options.mesh_formats:
+        from splinecli.surface.mesh import check_triangles
+
+        check_triangles(capture.mask)  # now, because the normals would be lost
     distilled, found = distil_for(capture, estimator, options.distil, observer)
     warnings += found
     estimate = _estimate(capture, distilled or estimator, observer)
@@ -156,10 +160,11 @@ def _check_memory(capture: Capture, folder: Path, options: InferOptions) -> None
 
     albedo = "albedo" in options.maps or options.html
     check_memory(
-        results_bytes(capture.n_pixels, capture.n_lights, albedo=albedo),
+        results_bytes(capture.n_pixels, capture.n_lights, albedo=albedo, surface=options.surface),
         f"the results of {capture.n_pixels} pixels take",
         folder,
         hint="Mask the object, or use --scale or --crop"
+        + (", or leave --surface out" if options.surface else "")
         + (", or neither albedo in --maps nor --html" if albedo else ""),
     )
 

@@ -114,11 +114,20 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     """Do the work of integrate_normal_map in the folder of results, which the caller holds."""
     import numpy as np
 
+    from splinecli.capture.capture_size import BYTES_OF_SURFACE
+    from splinecli.capture.formats.image_size import check_memory
     from splinecli.capture.lights.lamp_files import read_camera_matrix
     from splinecli.publishing import new_files
 
     normal_map = _read_normal_map(options)
     mask = np.asarray(normal_map.any(axis=2))
+    n_pixels = int(np.count_nonzero(mask))
+    check_memory(
+        n_pixels * BYTES_OF_SURFACE,
+        f"the surface of {n_pixels} pixels takes",
+        options.normals,
+        hint="Mask the object with --mask, or reduce the normal map (infer --scale)",
+    )
     camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
     picture = options.colours or _find_albedo(options.normals)
     colours = None if picture is None else _read_colours(picture, mask.shape)
@@ -139,7 +148,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "schema": SCHEMA,
         "normals": str(options.normals),
         "colours": None if picture is None else str(picture),
-        "n_pixels": int(np.count_nonzero(mask)),
+        "n_pixels": n_pixels,
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
         "seconds": round(time.perf_counter() - started, 3),

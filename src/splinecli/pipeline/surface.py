@@ -48,14 +48,26 @@ def make_surface(
     import numpy as np
 
     from splinecli.surface.camera import focal_length
-    from splinecli.surface.decimation import decimate
+    from splinecli.surface.decimation import decimate, mesh_to_decimate
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
 
     depth = integrate_normals(normal_map, mask, camera_matrix, stiffness=stiffness, progress=progress)
-    mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
-    if n_triangles is not None:
-        mesh = decimate(mesh, n_triangles, normal_map, camera_matrix)
+    if n_triangles is None:
+        mesh = surface_mesh(
+            depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step
+        )
+    else:
+        fine = mesh_to_decimate(
+            depth,
+            mask,
+            camera_matrix,
+            colours,
+            n_triangles=n_triangles,
+            normal_map=normal_map,
+            largest_step=largest_step,
+        )
+        mesh = decimate(fine, n_triangles, normal_map, camera_matrix)
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit, millimetres = "pixel" if camera_matrix is None else "mean depth", 1 / pixel
     if pixel_size_mm is not None:

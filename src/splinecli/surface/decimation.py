@@ -10,9 +10,22 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError
 from splinecli.extras import import_extra
 from splinecli.normals import unit
+from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length, image_points, ray_basis
-from splinecli.surface.mesh import SurfaceMesh, texture_coordinates, vertex_normals
+from splinecli.surface.mesh import (
+    SurfaceMesh,
+    fill_outside,
+    surface_mesh,
+    texture_coordinates,
+    vertex_normals,
+)
 from splinecli.surface.normal_texture import normal_texture
+
+TRIANGLES_LEFT = 4
+"""Triangles before decimation, over those after it, at least."""
+
+LARGE_MAP = 500_000
+"""Pixels from which the triangles of a map are so many that those of blocks are decimated."""
 
 
 def decimate(
@@ -27,7 +40,7 @@ def decimate(
     error metrics, SIGGRAPH 1997). A mesh that has no more triangles is returned as it is.
 
     Args:
-        mesh: what surface_mesh returned.
+        mesh: what surface_mesh or mesh_to_decimate returned.
         n_triangles: at least 1.
         normal_map: (H, W, 3), unit on the object, zero outside.
         camera_matrix: (3, 3), the one that surface_mesh had, or None.
@@ -60,6 +73,50 @@ def decimate(
         tangents=tangents.astype(np.float32),
         normal_texture=normal_texture(points, triangles, normals, tangents, normal_map),
     )
+
+
+def mesh_to_decimate(
+    depth: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    camera_matrix: NDArray[np.floating] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+    *,
+    n_triangles: int,
+    normal_map: NDArray[np.floating],
+    largest_step: float | None = None,
+) -> SurfaceMesh:
+    """Return a mesh for `decimate`: that of surface_mesh or, of large maps, one of blocks of pixels.
+
+    Collapsing all edges of a large map takes much memory. If far fewer triangles are wanted, those of the blocks, which
+    are at least TRIANGLES_LEFT times as many, have the same shape, and the normal texture keeps the detail.
+
+    Args:
+        depth, mask, camera_matrix, colours, normal_map, largest_step: see surface_mesh.
+        n_triangles: see decimate.
+    """
+    step = int((2 * np.count_nonzero(mask) / (TRIANGLES_LEFT * n_triangles)) ** 0.5)
+    if step >= 2 and np.count_nonzero(mask) > LARGE_MAP:
+        blocks = Blocks.of_step(mask, step)
+        of_blocks = np.zeros((*blocks.mask.shape, 4))
+        pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
+        of_blocks[blocks.mask] = blocks.average(pixels, mask)
+        # Without a camera, a step counts in blocks, as a pixel does.
+        scale = step if camera_matrix is None else 1
+        mesh = surface_mesh(
+            of_blocks[..., 0] / scale,
+            blocks.mask,
+            blocks.shrink_camera(camera_matrix),
+            normal_map=unit(of_blocks[..., 1:]),
+            largest_step=largest_step,
+        )
+        if len(mesh.triangles) > n_triangles:
+            shift = np.zeros(3)
+            if camera_matrix is None:
+                shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
+            vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
+            texture = None if colours is None else fill_outside(colours, mask)
+            return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
+    return surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
 
 
 def _tangents(

@@ -108,6 +108,22 @@ def surface_mesh(
     )
 
 
+def check_triangles(mask: NDArray[np.bool_]) -> None:
+    """Raise InputError if the mesh of a mask (H, W) has no triangle: no square of four pixels has three of the mask."""
+    count = mask.astype(np.uint8)
+    squares = count[:-1, :-1] + count[1:, :-1] + count[:-1, 1:] + count[1:, 1:]
+    if not (squares >= 3).any():
+        raise no_triangles()
+
+
+def no_triangles() -> InputError:
+    """Return the error of a mesh that has none."""
+    return InputError(
+        "the mesh has no triangles: nowhere do three pixels of the object form a corner",
+        hint="Enlarge the mask, or leave glb out of the formats",
+    )
+
+
 def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
     """Return the unit normals (V, 3) of vertices: means over their triangles, weighted by area.
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.errors import InputError
-from splinecli.surface.mesh import SurfaceMesh
+from splinecli.surface.mesh import SurfaceMesh, no_triangles
 
 GRAY = 204
 """Colour of a mesh without a texture, of 255."""
@@ -29,11 +28,7 @@ def encode_glb(mesh: SurfaceMesh, *, metres: float) -> bytes:
     import trimesh
 
     if not len(mesh.triangles):
-        raise InputError(
-            "the mesh has no triangles: nowhere do three pixels of the object form a corner",
-            hint="Enlarge the mask, or leave glb out of the formats",
-        )
-
+        raise no_triangles()
     textures = {"baseColorTexture": mesh.texture, "normalTexture": mesh.normal_texture}
     material = trimesh.visual.material.PBRMaterial(
         name="surface",
