@@ -17,6 +17,10 @@ def double(folder: str, number: int) -> int:
     return 2 * number
 
 
+def threads(folder: str, number: int) -> str:
+    return os.environ["OMP_NUM_THREADS"]
+
+
 def die_of_thirteen(folder: str, number: int) -> int:
     """Return the double; a task of number 13 kills its worker."""
     with (Path(folder) / f"begun-{number}").open("a") as file:

@@ -22,10 +22,11 @@ from splinecli.pipeline import batch_on_workers, connection
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.capture_list import Member, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
-from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.cluster import Distributor
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT
+from splinecli.pipeline.tasks import LostError, Task
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 from splinecli.pipeline.worker import Work  # noqa: E402 - it may be imported without Dask, too
@@ -126,6 +127,12 @@ def test_workers_that_do_not_fit(client, work, tmp_path):
             list(distributor.run(numbered(range(3))))
 
 
+def test_workers_without_splinecli(client, work, monkeypatch):
+    monkeypatch.setattr(connection, "_PACKAGE", "no-such-package")
+    with pytest.raises(UsageError, match="splinecli is not installed on the worker tcp://"):
+        run(client, work(worker_tasks.double), numbered(range(3)))
+
+
 def test_gpu_workers_only(client, work):
     with pytest.raises(UsageError, match="no worker has the Dask resource GPU"):
         run(client, work(worker_tasks.double), numbered(range(3)), gpu=True)
@@ -183,6 +190,15 @@ def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, 
     # What is done is skipped: the reports have the seconds of the first run.
     Path("scheduler.json").write_text(json.dumps({"address": cluster.scheduler_address}))
     assert documents("-o", "out", "--cluster", "scheduler.json") == together
+
+
+def test_the_cores_are_shared_out(monkeypatch, work):
+    """Of seven cores, each of three workers gets two, whatever the user allows above that."""
+    monkeypatch.setattr(connection, "count_available_cores", lambda: 7)
+    monkeypatch.setenv("OMP_NUM_THREADS", "16")
+    options = ClusterOptions(workers=3)
+    with connection.connected(options) as client:
+        assert run(client, work(worker_tasks.threads), numbered(range(1))) == {0: "2"}
 
 
 def test_workers_of_this_machine(tmp_path, monkeypatch, capfd):

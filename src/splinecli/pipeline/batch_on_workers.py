@@ -17,11 +17,12 @@ from splinecli.files import UNFINISHED, refusals_as_output_errors
 from splinecli.pipeline.batch import Outcome, Redo, failed, run_member
 from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.capture_memory import expected_bytes
-from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.cluster import Distributor
 from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
+from splinecli.pipeline.tasks import LostError, Task
 from splinecli.pipeline.worker import SAME_STORAGE, Work
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 import uuid
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,9 +17,10 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import SplinecliError, UsageError
-from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.connection import ClusterOptions, workers_without_splinecli
 from splinecli.pipeline.observer import Observer
-from splinecli.pipeline.worker import Work, do_task, prepare_worker
+from splinecli.pipeline.tasks import LostError, Task
+from splinecli.pipeline.worker import SAME_VERSIONS, Work, do_task, prepare_worker, with_worker
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -27,20 +28,6 @@ if TYPE_CHECKING:
 _LOOK_SECONDS = 1.0  # between two looks at which workers there are
 _ANSWER_SECONDS = 60.0  # that the first tasks wait for workers that do not answer
 _MOST_LOST_EARLY = 10  # workers that may be lost while they get ready
-
-
-class LostError(SplinecliError):
-    """A worker was lost, or has too little memory: the task was not done, others may be."""
-
-
-@dataclass
-class Task:
-    """A task: the arguments of Work.do, the bytes of memory that it takes, and how many workers it has lost."""
-
-    args: tuple[Any, ...]
-    name: str
-    memory: float = 0.0
-    losses: int = 0
 
 
 @dataclass
@@ -78,6 +65,7 @@ class Distributor:
     _given_up: deque[tuple[Task, LostError]] = field(default_factory=deque)
     _done: SimpleQueue[str] = field(default_factory=SimpleQueue)  # addresses
     _looked: float = -math.inf
+    _seen: float = -math.inf  # when there were workers
     _lost_early: int = 0
     _has_begun: bool = False
     _said_waiting: bool = False
@@ -112,7 +100,8 @@ class Distributor:
                         break
                     self._give(worker, following)
                 following = None
-            yield from self._take_given_up()
+            while self._given_up:
+                yield self._given_up.popleft()
             if self._has_begun and following is None and not self.running and not self._again:
                 return
             yield from self._take_results()
@@ -130,14 +119,23 @@ class Distributor:
         self._looked = time.monotonic()
         for address in self._workers.keys() - found.keys():
             self._lose(self._workers.pop(address))
-        for address in found.keys() - self._workers.keys() - self._refused:
+        new = found.keys() - self._workers.keys() - self._refused
+        for address in workers_without_splinecli(self.client, new):
+            problem = f"splinecli is not installed on the worker {address}"
+            self._refuse(address, UsageError(problem, hint=SAME_VERSIONS))
+            new.remove(address)
+        for address in new:
             self._ask(address, found[address])
         if self.options.gpu and found and not self._workers:
             raise UsageError(
                 "no worker has the Dask resource GPU",
                 hint="Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'",
             )
-        if not found and not self._said_waiting:
+        if found:
+            self._seen = self._looked
+        elif self._lost_early and self._looked - self._seen > _ANSWER_SECONDS:
+            raise self._ended_early()
+        elif not self._said_waiting:
             self._said_waiting = True
             self.observer.say("waiting for workers")
 
@@ -158,14 +156,13 @@ class Distributor:
 
     def _choose(self, task: Task) -> _Worker | None:
         """Return an idle worker with enough memory. A machine without any task takes a task of any size."""
-        used: dict[str, list[float]] = {}
+        used: defaultdict[str, float] = defaultdict(float)
         for worker in self._workers.values():
-            if worker.task is not None:
-                used.setdefault(worker.host, []).append(worker.task.memory)
+            used[worker.host] += worker.task.memory if worker.task else 0.0
         for worker in self._workers.values():
             if worker.ready and worker.task is None and task.memory <= worker.limit:
-                others = used.get(worker.host, [])
-                if not others or sum(others) + task.memory <= self._free_memory[worker.host]:
+                others = used[worker.host]
+                if not others or others + task.memory <= self._free_memory[worker.host]:
                     return worker
         return None
 
@@ -210,7 +207,7 @@ class Distributor:
         if not worker.ready:
             self._lost_early += 1
             if self._lost_early > _MOST_LOST_EARLY:
-                raise SplinecliError(f"{self._lost_early} workers ended while they were getting ready")
+                raise self._ended_early()
         task = worker.task
         if task is None:
             return
@@ -225,10 +222,6 @@ class Distributor:
             hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
         )
         self._given_up.append((task, error))
-
-    def _take_given_up(self) -> Iterator[tuple[Task, LostError]]:
-        while self._given_up:
-            yield self._given_up.popleft()
 
     def _take_results(self) -> Iterator[tuple[Task, Any]]:
         """Wait a moment for results, and yield those that there are."""
@@ -256,12 +249,11 @@ class Distributor:
             self._lose(self._workers.pop(worker.address))
             return
         except SplinecliError as error:
-            named = _with_worker(error, worker.address)
-            if worker.ready or not self._has_begun:
+            named = with_worker(error, worker.address)
+            if worker.ready:
                 raise named from error
-            self._refused.add(worker.address)
             del self._workers[worker.address]
-            self.observer.warn(f"{named} This worker gets no work")
+            self._refuse(worker.address, named)
             return
         except Exception as error:
             if worker.ready:
@@ -270,7 +262,7 @@ class Distributor:
             reason = f"{type(error).__name__}: {error}"
             raise UsageError(
                 f"the worker {worker.address}, or the scheduler, cannot run splinecli ({reason})",
-                hint="Install the same version of splinecli on all workers and the scheduler",
+                hint=SAME_VERSIONS,
             ) from error
         worker.future, task, worker.task = None, worker.task, None
         if task is not None:
@@ -279,14 +271,21 @@ class Distributor:
         worker.ready = True
         self._free_memory.setdefault(worker.host, result)
 
+    def _refuse(self, address: str, error: SplinecliError) -> None:
+        """Give a worker no work. Raises the error if nothing has been computed yet."""
+        if not self._has_begun:
+            raise error
+        self._refused.add(address)
+        self.observer.warn(f"{error} This worker gets no work")
+
+    def _ended_early(self) -> SplinecliError:
+        return SplinecliError(
+            f"{self._lost_early} workers ended while they were getting ready",
+            hint="Read what Dask printed there",
+        )
+
     def _scheduler_lost(self) -> SplinecliError:
         return SplinecliError(
             "the connection to the Dask scheduler was lost",
             hint="Run the same command again. It skips what is done",
         )
-
-
-def _with_worker(error: SplinecliError, address: str) -> SplinecliError:
-    """Return the error of a worker, which its message names."""
-    problem = f"{error.problem} (on the worker {address})"
-    return type(error)(problem, path=error.path, line=error.line, hint=error.hint)

@@ -6,9 +6,10 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from importlib import metadata
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
@@ -25,10 +26,22 @@ if TYPE_CHECKING:
 RETRIES = 2
 """How often a task is done again whose worker was lost, unless the user says otherwise."""
 
+_PACKAGE = "splinecli"
 _CONNECT_SECONDS = 5.0
 _ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0
 _LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
+
+_QUIET = {
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.system-monitor.log-length": 10,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.tick.interval": "1s",
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.scheduler.work-stealing": False,
+    "distributed.worker.profile.enabled": False,
+}
+"""Settings of Dask without what serves its dashboard only. It would take processor time, and memory for an hour."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,20 +131,19 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
 
     threads = max(1, min(count_available_cores() // options.workers, _threads_of_user()))
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-    settings = {
-        "distributed.nanny.pre-spawn-environ": {
-            **dict.fromkeys(names, threads),
-            "OMP_WAIT_POLICY": "passive",
-        },
-        # The scheduler is in this process. What it remembers for a dashboard would grow for an hour.
-        "distributed.admin.low-level-log-length": 100,
-        "distributed.admin.system-monitor.log-length": 10,
+    environment = dict.fromkeys(names, str(threads))
+    settings: dict[str, Any] = {
+        "distributed.nanny.pre-spawn-environ": environment,
+        **_QUIET,
         "logging": dict.fromkeys(_LOGGERS, "critical"),
     }
+    # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives the worker up.
+    settings["distributed.deploy.lost-worker-timeout"] = "1 h"
     with dask.config.set(settings):
         cluster = LocalCluster(
             n_workers=options.workers,
             threads_per_worker=1,
+            env=environment,  # also where the user's environment has other numbers
             memory_limit=0,  # what is free on the machine is shared out by Distributor
             resources={"GPU": 1} if options.gpu else None,
             dashboard_address="127.0.0.1:0",
@@ -147,6 +159,20 @@ def _threads_of_user() -> float:
     """Return the threads that OMP_NUM_THREADS allows."""
     number = os.environ.get("OMP_NUM_THREADS", "")
     return int(number) if number.isdecimal() else math.inf
+
+
+def workers_without_splinecli(client: Client, addresses: Iterable[str]) -> list[str]:
+    """Return those of some workers on which splinecli is not installed.
+
+    A task would end such a worker without a message, because it cannot be unpickled there.
+    """
+    workers = list(addresses)
+    if not workers:
+        return []
+    versions = client.run(metadata.version, _PACKAGE, workers=workers, on_error="return")
+    return [
+        address for address, found in versions.items() if isinstance(found, metadata.PackageNotFoundError)
+    ]
 
 
 def _address(text: str) -> str:

@@ -14,9 +14,10 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import Estimator, MethodOptions, make_estimator
 from splinecli.pipeline.batch_on_workers import shared_probe
 from splinecli.pipeline.capture_memory import source_bytes
-from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.cluster import Distributor
 from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.observer import Observer
+from splinecli.pipeline.tasks import LostError, Task
 from splinecli.pipeline.worker import Work
 
 

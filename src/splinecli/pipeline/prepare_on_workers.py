@@ -9,9 +9,10 @@ from pathlib import Path
 
 from splinecli.files import UNFINISHED
 from splinecli.pipeline.batch_on_workers import shared_probe
-from splinecli.pipeline.cluster import Distributor, LostError, Task
+from splinecli.pipeline.cluster import Distributor
 from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.observer import Observer
+from splinecli.pipeline.tasks import LostError, Task
 from splinecli.pipeline.worker import Work
 from splinecli.pixel_sets.rendered import (
     ScenePlan,

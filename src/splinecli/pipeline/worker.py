@@ -12,7 +12,7 @@ from threading import Lock
 from typing import Any
 
 from splinecli import __version__
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.memory import available_memory, keep_freed_memory
 
 _ONE_AT_A_TIME = Lock()
@@ -23,6 +23,8 @@ _PROBE_SECONDS = 3.0
 """A network drive may show a new file a little later."""
 
 SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
+
+SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,12 @@ def do_task(work: Work, *args: Any) -> Any:
         return work.do(work.settings, *args)
 
 
+def with_worker(error: SplinecliError, address: str) -> SplinecliError:
+    """Return the error of a worker, which its message names."""
+    problem = f"{error.problem} (on the worker {address})"
+    return type(error)(problem, path=error.path, line=error.line, hint=error.hint)
+
+
 def _enter(work: Work) -> None:
     from splinecli.capture.formats.image_size import limit_pixels
     from splinecli.capture.layouts.image_lists import allow_images_elsewhere
@@ -99,7 +107,7 @@ def _enter(work: Work) -> None:
         if found != expected:
             raise UsageError(
                 f"found {package} {found}, expected {expected} as on this machine",
-                hint="Install the same versions everywhere",
+                hint=SAME_VERSIONS,
             )
     try:
         os.chdir(work.folder)
