@@ -133,7 +133,7 @@ class Distributor:
             )
         if found:
             self._seen = self._looked
-        elif self._lost_early and self._looked - self._seen > _ANSWER_SECONDS:
+        elif (self._lost_early or not self.options.address) and self._looked - self._seen > _ANSWER_SECONDS:
             raise self._ended_early()
         elif not self._said_waiting:
             self._said_waiting = True
@@ -280,8 +280,8 @@ class Distributor:
 
     def _ended_early(self) -> SplinecliError:
         return SplinecliError(
-            f"{self._lost_early} workers ended while they were getting ready",
-            hint="Read what Dask printed there",
+            "the workers end while they are getting ready",
+            hint="If there is too little memory, use fewer. Dask's output says more",
         )
 
     def _scheduler_lost(self) -> SplinecliError:
