@@ -198,15 +198,19 @@ def test_progress_counts_the_sample_twice_and_each_pixel_once() -> None:
     assert sum(estimating) == 3000
 
 
-def test_its_map_is_refined_by_the_net_of_its_teacher_without_turns() -> None:
+def test_its_map_is_refined_by_the_net_of_its_teacher_with_turns_where_it_is_small(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     normals, observations = glossy(3000)
     teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
     assert refiner_of(distil(teacher, observations, LIGHTS, SMALL)) is None
     teacher.refiner = Refiner(RefineNet(), "float32")  # type: ignore[attr-defined]
-    refiner = refiner_of(distil(teacher, observations, LIGHTS, SMALL))
-    assert refiner is not None
-    assert refiner.network is teacher.refiner.network  # type: ignore[attr-defined]
-    assert refiner.turns == 1
+    for most, turns in ((3000, 4), (2999, 1)):
+        monkeypatch.setattr("splinecli.methods.distilled.TURNED_PIXELS", most)
+        refiner = refiner_of(distil(teacher, observations, LIGHTS, SMALL))
+        assert refiner is not None
+        assert refiner.network is teacher.refiner.network  # type: ignore[attr-defined]
+        assert refiner.turns == turns
 
 
 def test_too_few_pixels() -> None:

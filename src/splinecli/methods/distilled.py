@@ -33,6 +33,9 @@ from splinecli.networks.error_head import median_error_deg
 from splinecli.normals import angle_between_deg
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
+TURNED_PIXELS = 500_000
+"""The most pixels of a capture whose map is refined in all turns. On more, the turns would take most of the time."""
+
 _HELD_OUT = 1 / 8  # of the sample
 _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
 _RARE_SHARE = 0.01  # of the pixels, and
@@ -73,15 +76,21 @@ class DistilledEstimator:
     """The few rare pixels of a tile still fill a batch of the network."""
 
     def __init__(
-        self, teacher: ConfidentEstimator, perceptron: Perceptron, sample: PixelSample, found: Distillation
+        self,
+        teacher: ConfidentEstimator,
+        perceptron: Perceptron,
+        sample: PixelSample,
+        found: Distillation,
+        n_pixels: int,
     ) -> None:
         self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
         refiner = refiner_of(teacher)
-        # Its turns would take most of the time of the capture.
-        self.refiner = None if refiner is None else refiner.without_turns()
+        if refiner is not None and n_pixels > TURNED_PIXELS:
+            refiner = refiner.without_turns()
+        self.refiner = refiner
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
@@ -204,7 +213,7 @@ def distil(
         p95_deg=float(np.quantile(angles, 0.95)),
         expected_deg=float(median_error_deg(errors[:held]).mean()),
     )
-    return DistilledEstimator(teacher, perceptron, sample, found)
+    return DistilledEstimator(teacher, perceptron, sample, found, len(observations))
 
 
 def seconds_of_learning(light_directions: NDArray[np.floating], size: PupilSize, device: str) -> float:
