@@ -1,11 +1,13 @@
 """Measure time and memory of `infer` against the size of the capture.
 
-python benchmarks/large_captures.py [--megapixels 0.05 0.5 2 6 24] [--method spline-net] [--formats png,npy]
+python benchmarks/large_captures.py [--megapixels 0.05 0.5 2 6 24] [--method spline-net] [--formats png,npy] \
+    [--plot FILE.png]
 
 Each capture is a smooth bumpy relief with a glossy half: ten 16-bit RGB images in PNG files under ten lights, with
 noise, all pixels in the mask. Each run is a process of its own. The table has the seconds of the report (reading,
 estimating, writing), those of all processor cores together, and the largest memory. On a busy machine, only the
-processor's seconds mean something, and they only beside others of the same run.
+processor's seconds mean something, and they only beside others of the same run. --plot draws these and the memory
+against the size.
 """
 
 from __future__ import annotations
@@ -68,12 +70,29 @@ def write_capture(folder: Path, megapixels: float) -> tuple[int, int]:
     return width, height
 
 
+def draw_plot(path: Path, rows: Sequence[tuple[float, float, float]]) -> None:
+    """Draw processor seconds and memory in MiB against megapixels."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    sizes, *columns = zip(*rows, strict=True)
+    for axes, values, name in zip(
+        figure.subplots(1, 2), columns, ("processor (s)", "memory (MiB)"), strict=True
+    ):
+        axes.plot(sizes, values, marker="o")
+        axes.set(xlabel="megapixels", ylabel=name, xlim=(0, None), ylim=(0, None))
+        axes.grid(visible=True, alpha=0.3)
+    figure.savefig(path, dpi=100)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--megapixels", type=float, nargs="+", default=[0.05, 0.5, 2, 6, 24])
     parser.add_argument("--method", default="spline-net")
     parser.add_argument("--formats", default="png,npy")
+    parser.add_argument("--plot", type=Path, help="a PNG file")
     options = parser.parse_args(arguments)
+    rows = []
     print("megapixels      read  estimate     write   processor    memory  unlike")
     for megapixels in options.megapixels:
         with tempfile.TemporaryDirectory() as place:
@@ -95,6 +114,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{width * height / 1e6:10.3f} {stages} {processor:9.1f} s {report['peak_memory_mib']:5d} MiB  {unlike}",
             flush=True,
         )
+        rows.append((width * height / 1e6, processor, report["peak_memory_mib"]))
+    if options.plot is not None:
+        draw_plot(options.plot, rows)
 
 
 if __name__ == "__main__":

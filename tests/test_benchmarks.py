@@ -102,11 +102,14 @@ def test_near_lamps(run: Run) -> None:
     assert distant < 1 > distant_range
 
 
-def test_large_captures(run: Run) -> None:
-    header, row = run("large_captures", "--megapixels", "0.001", "--method", "ls").splitlines()
+def test_large_captures(run: Run, tmp_path: Path) -> None:
+    plot = tmp_path / "plot.png"
+    arguments = ("--megapixels", "0.001", "--method", "ls", "--plot", str(plot))
+    header, row = run("large_captures", *arguments).splitlines()
     assert header.split()[0] == "megapixels"
     assert numbers(row)[0] == pytest.approx(0.001, abs=2e-4)
     assert row.endswith("exact")
+    assert plot.stat().st_size > 1000
 
 
 def test_busy_machine(run: Run) -> None:
