@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import metadata
+from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
@@ -139,6 +140,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     }
     # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives the worker up.
     settings["distributed.deploy.lost-worker-timeout"] = "1 h"
+    _start_resource_tracker()
     with dask.config.set(settings):
         cluster = LocalCluster(
             n_workers=options.workers,
@@ -153,6 +155,20 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
             yield cluster
         finally:
             cluster.close(timeout=_CLOSE_SECONDS)
+
+
+def _start_resource_tracker() -> None:
+    """Start the process in which Python counts semaphores, without its warning: SIGTERM may end this process first."""
+    if os.name == "nt":  # where there is no such process
+        return
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _threads_of_user() -> float:
