@@ -1,5 +1,5 @@
 #!/bin/sh
-# Train the weights that come with splinecli from scratch, in about five hours on two cores:
+# Train the weights that come with splinecli from scratch, in about ten hours on two cores:
 #
 #     sh examples/train_shipped_weights.sh FOLDER
 #
@@ -10,7 +10,7 @@ folder=${1:?name a folder for the scenes and the runs}
 
 splinecli=${SPLINECLI:-splinecli}
 "$splinecli" prepare --scenes 15 --size 96 --n-lights 200 --seed 21 -o "$folder/scenes"
-"$splinecli" prepare --scenes 60 --size 128 --n-lights 100 --seed 101 -o "$folder/whole-scenes"
+"$splinecli" prepare --scenes 120 --size 128 --n-lights 100 --seed 101 -o "$folder/whole-scenes"
 
 # Resume a run that was interrupted; skip a run that is finished.
 run() {
@@ -25,7 +25,7 @@ run() {
 run spline-net-1 scenes --preset compact --generator-weight 2 --steps 6280
 run spline-net-2 scenes --preset compact --generator-weight 2 --steps 2340 --param learning_rate=1e-3 \
   --param network.error_head=true --param updates=error_head --start-from "$folder/spline-net-1/weights.safetensors"
-run spline-net-3 whole-scenes --preset refine --steps 3300 --start-from "$folder/spline-net-2/weights.safetensors"
+run spline-net-3 whole-scenes --preset refine --steps 9000 --start-from "$folder/spline-net-2/weights.safetensors"
 run cnn-ps-1 scenes --preset cnn-ps --generator-weight 3 --steps 8136
 run cnn-ps-2 scenes --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
   --start-from "$folder/cnn-ps-1/weights.safetensors"
