@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ import worker_tasks
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.pipeline import batch_on_workers, connection
+from splinecli.pipeline import cluster as cluster_module
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.capture_list import Member, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
@@ -143,6 +145,45 @@ def test_gpu_workers_only(client, work):
         client.run(worker_tasks.set_resources, GPU=0)
 
 
+def test_workers_without_a_gpu_are_not_asked(client, work, monkeypatch):
+    with_gpu, _ = client.scheduler_info(n_workers=-1)["workers"]
+    asked: list[str] = []
+    monkeypatch.setattr(cluster_module, "workers_without_splinecli", lambda _, new: asked.extend(new) or [])
+    client.run(worker_tasks.set_resources, GPU=1, workers=[with_gpu])
+    try:
+        assert run(client, work(worker_tasks.double), numbered(range(3)), gpu=True) == {0: 0, 1: 2, 2: 4}
+    finally:
+        client.run(worker_tasks.set_resources, GPU=0)
+    assert asked == [with_gpu]
+
+
+def test_workers_that_come_late_and_do_not_fit(client, work, monkeypatch):
+    """If none fits, the command ends, however long it has waited for the first worker."""
+    clock, look = [0.0], client.scheduler_info
+
+    def nobody_at_first(**options: Any) -> Any:
+        if clock[0]:
+            return look(**options)
+        clock[0] = 1000.0
+        return {"workers": {}}
+
+    monkeypatch.setattr(client, "scheduler_info", nobody_at_first)
+    now = SimpleNamespace(monotonic=lambda: time.monotonic() + clock[0])
+    monkeypatch.setattr(cluster_module, "time", now)
+    good = work(worker_tasks.double)
+    other = replace(good, versions={**good.versions, "splinecli": "9.9"})
+    with pytest.raises(UsageError, match=r"expected 9\.9"):
+        run(client, other, numbered(range(3)), address="tcp://elsewhere")
+
+
+def test_workers_that_get_ready_are_no_early_losses(client, work):
+    """Workers that machines take back in a long command are not counted together."""
+    distributor = Distributor(client, work(worker_tasks.double), ClusterOptions(), SILENT)
+    distributor._lost_early = cluster_module._MOST_LOST_EARLY
+    assert len(list(distributor.run(numbered(range(2))))) == 2
+    assert distributor._lost_early == 0
+
+
 def write_captures(names: list[str]) -> list[str]:
     """Write small captures of different content into the working folder; `broken` has no images."""
     lights = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
@@ -235,7 +276,7 @@ def test_an_output_that_cannot_be_written_ends_the_batch(cluster, tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    "address", ["tcp://127.0.0.1:1", "strange://x", "none.json", "broken.json", "tcp://"]
+    "address", ["tcp://127.0.0.1:1", "strange://x", "http://x", "none.json", "broken.json", "tcp://"]
 )
 def test_no_scheduler(address, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

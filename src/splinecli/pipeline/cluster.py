@@ -86,6 +86,8 @@ class Distributor:
         source, following = iter(tasks), None
         while True:
             self._look_around()
+            if not self._workers:
+                began = time.monotonic()  # the wait for answers begins with the first worker
             asked = sum(not worker.ready for worker in self._workers.values())
             self._has_begun |= bool(self._workers) and (
                 not asked or time.monotonic() - began > _ANSWER_SECONDS
@@ -119,14 +121,16 @@ class Distributor:
         self._looked = time.monotonic()
         for address in self._workers.keys() - found.keys():
             self._lose(self._workers.pop(address))
-        new = found.keys() - self._workers.keys() - self._refused
+        self._refused &= found.keys()
+        fitting = {address for address, info in found.items() if self._has_gpu(info)}
+        new = fitting - self._workers.keys() - self._refused
         for address in workers_without_splinecli(self.client, new):
             problem = f"splinecli is not installed on the worker {address}"
             self._refuse(address, UsageError(problem, hint=SAME_VERSIONS))
             new.remove(address)
         for address in new:
             self._ask(address, found[address])
-        if self.options.gpu and found and not self._workers:
+        if found and not fitting and not self._has_begun:
             raise UsageError(
                 "no worker has the Dask resource GPU",
                 hint="Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'",
@@ -142,13 +146,15 @@ class Distributor:
     def _ask(self, address: str, info: dict[str, Any]) -> None:
         """Let a new worker get ready."""
         resources = info.get("resources") or {}
-        if self.options.gpu and resources.get("GPU", 0) < 1:
-            return
         limit = resources.get("MEMORY") or info.get("memory_limit") or math.inf
         worker = _Worker(address, info.get("host") or address, limit, "MEMORY" in resources)
         self._workers[address] = worker
         self._make_probe()
         self._submit(worker, prepare_worker, self.work)
+
+    def _has_gpu(self, info: dict[str, Any]) -> bool:
+        """Return whether a worker has the GPU that the tasks need, if they need one."""
+        return not self.options.gpu or (info.get("resources") or {}).get("GPU", 0) >= 1
 
     def _make_probe(self) -> None:
         """Make the file by which workers know the output folder. Another command may have removed it."""
@@ -268,7 +274,7 @@ class Distributor:
         if task is not None:
             yield task, result
             return
-        worker.ready = True
+        worker.ready, self._lost_early = True, 0
         self._free_memory.setdefault(worker.host, result)
 
     def _refuse(self, address: str, error: SplinecliError) -> None:

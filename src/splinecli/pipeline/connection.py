@@ -193,7 +193,10 @@ def workers_without_splinecli(client: Client, addresses: Iterable[str]) -> list[
 
 def _address(text: str) -> str:
     """Return the address of a scheduler, which may be in a scheduler file. Raises UsageError."""
-    if "://" in text:
+    from distributed.comm.registry import backends
+
+    scheme, separator, _ = text.partition("://")
+    if separator and scheme in backends:
         return text
     try:
         return str(read_json(Path(text))["address"])
