@@ -21,6 +21,11 @@ def threads(folder: str, number: int) -> str:
     return os.environ["OMP_NUM_THREADS"]
 
 
+def survive_an_interrupt(folder: str, number: int) -> int:
+    os.kill(os.getpid(), signal.SIGINT)
+    return os.getpid()
+
+
 def die_of_thirteen(folder: str, number: int) -> int:
     """Return the double; a task of number 13 kills its worker."""
     with (Path(folder) / f"begun-{number}").open("a") as file:

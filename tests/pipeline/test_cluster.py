@@ -80,6 +80,12 @@ def test_a_task_that_kills_its_workers(client, work, tmp_path, retries):
     assert all((tmp_path / f"begun-{number}").read_text() == "x" for number in results)
 
 
+def test_ctrl_c_leaves_workers_alone(client, work):
+    """A terminal sends it to all processes; the command itself ends the workers."""
+    pids = run(client, work(worker_tasks.survive_an_interrupt), numbered(range(6)), retries=0)
+    assert all(isinstance(pid, int) for pid in pids.values()) and len(set(pids.values())) <= 2
+
+
 def test_tasks_share_the_memory_of_a_machine(client, work, monkeypatch):
     """Two tasks of two thirds of the memory run one after the other, small ones side by side."""
     two_thirds = batch_on_workers_memory(client, work) * 2 / 3

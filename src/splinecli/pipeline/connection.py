@@ -33,6 +33,9 @@ _ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0
 _LOGGERS = ("distributed", "distributed.client", "distributed.worker", "distributed.scheduler", "tornado")
 
+# A terminal sends Ctrl-C to the workers, too. The command ends them.
+_IGNORE_INTERRUPTS = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"
+
 _QUIET = {
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 10,
@@ -136,6 +139,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         **_QUIET,
+        "distributed.worker.preload": [_IGNORE_INTERRUPTS],
         "logging": dict.fromkeys(_LOGGERS, "critical"),
     }
     # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives the worker up.
