@@ -65,7 +65,7 @@ class Distributor:
     _given_up: deque[tuple[Task, LostError]] = field(default_factory=deque)
     _done: SimpleQueue[str] = field(default_factory=SimpleQueue)  # addresses
     _looked: float = -math.inf
-    _seen: float = -math.inf  # when there were workers
+    _seen: float = field(default_factory=time.monotonic)  # when there were workers
     _lost_early: int = 0
     _has_begun: bool = False
     _said_waiting: bool = False
@@ -248,8 +248,10 @@ class Distributor:
             raise self._scheduler_lost()
         try:
             result = future.result(timeout=_LOOK_SECONDS)
-        except TimeoutError:  # if the worker is lost now, _look_around sees that
-            self._done.put(worker.address)
+        except TimeoutError:
+            if future.status == "error":  # of the task itself
+                raise
+            self._done.put(worker.address)  # if the worker is lost now, _look_around sees that
             return
         except KilledWorker:
             self._lose(self._workers.pop(worker.address))
