@@ -119,8 +119,8 @@ def test_busy_machine(run: Run) -> None:
     assert row.startswith("quiet")
     default, passive, single, ratio = numbers(row)
     assert min(default, passive, single) > 0
-    # The times are printed with one or two digits after the point.
-    assert (default - 0.05) / (passive + 0.05) - 0.05 <= ratio <= (default + 0.05) / (passive - 0.05) + 0.05
+    half = 0.0051  # of the last digit that is printed
+    assert (default - half) / (passive + half) - half <= ratio <= (default + half) / (passive - half) + half
 
 
 def test_diligent_figures(run: Run, tmp_path: Path) -> None:
