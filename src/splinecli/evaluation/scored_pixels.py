@@ -13,8 +13,8 @@ from splinecli.errors import InputError
 def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> NDArray[np.intp]:
     """Return the rows of the observations that have ground truth, in rising order.
 
-    With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. Methods
-    work pixel by pixel, so leaving pixels out does not change the normals of the others.
+    With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. A method
+    that sees neighbours estimates all pixels, and only these are scored.
 
     Raises:
         InputError: the capture has no ground truth.

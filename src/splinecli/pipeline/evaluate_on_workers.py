@@ -32,7 +32,7 @@ class _Settings:
 
 @dataclass(frozen=True)
 class OnWorkers:
-    """Scores draws on workers. The process of the command alone writes the store of trials.
+    """Scores draws on workers. Only the process of the command writes the store of trials.
 
     Args:
         estimators, method_options: the methods.
