@@ -80,7 +80,11 @@ class _AttentionLayer(nn.Module):
         pixels, count, width = tokens.shape
         split = self.queries_keys_values(self.norm1(tokens)).view(pixels, count, 3, self.heads, HEAD_WIDTH)
         queries, keys, values = split.permute(2, 0, 3, 1, 4)
-        attended = nn.functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+        if tokens.device.type == "cpu":
+            # PyTorch's attention on a CPU is slower in bfloat16 than in float32, and its gradient up to six times.
+            queries, keys, values = queries.float(), keys.float(), values.float()
+        with torch.autocast(tokens.device.type, enabled=False):
+            attended = nn.functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
         return out
