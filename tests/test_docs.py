@@ -115,7 +115,10 @@ def test_commands_have_options_that_exist(page, command):
         ("docs/train.md", f"every {loop.CHECKPOINT_SECONDS:.0f} seconds"),
         ("docs/train.md", f"at most {loop.CHECKPOINT_SECONDS:.0f} seconds"),
         ("docs/train.md", f"one line every {loop.REPORT_STEPS} steps"),
-        ("docs/train.md", f"`shards` ({TrainingConfig().shards} by default)"),
+        (
+            "docs/train.md",
+            f"{PRESETS['compact'].shards} in the preset `compact`, {PRESETS['cnn-ps'].shards} in `paper`",
+        ),
         ("docs/train.md", f"eta = {TrainingConfig().eta:g} and lambda_c = {TrainingConfig().lambda_c:g}"),
         ("docs/train.md", f"lambda_s = {PRESETS['paper'].symmetric_weight:g}"),
         ("docs/infer.md", f"at least {light_intensities.MIN_LIGHTS} lights"),

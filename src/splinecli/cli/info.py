@@ -44,7 +44,7 @@ def info(
     """Show what `infer` would read from CAPTURE, without running it.
 
     Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
-    the elevation of the lights, and the memory and time that infer needs. Writes nothing but the plot.
+    the angles of the lights from the camera axis, and the memory and time that infer needs. Writes only the plot.
     """
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
 

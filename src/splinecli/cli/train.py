@@ -38,12 +38,12 @@ def train(
     device: Device = computing.DEVICE,
     quiet: bool = outputs.QUIET,
 ) -> None:
-    """Train LI-Net and NE-Net.
+    """Train LI-Net and NE-Net, or with --preset refine the refinement net.
 
-    Without a SET, the pixels are generated during training. Writes weights.safetensors, which --weights of other
-    commands takes, checkpoint.safetensors, config.json, metrics.csv, curves.png and maps.png into RUN. After Ctrl-C,
-    --resume continues from the checkpoint. Settings come from the preset, then from --config, then from the other
-    options. With torchrun, several processes train together.
+    Without a SET, the pixels are generated during training; the refinement net needs a SET. Writes
+    weights.safetensors, which --weights of other commands takes, checkpoint.safetensors, config.json, metrics.csv,
+    curves.png and maps.png into RUN. After Ctrl-C, --resume continues from the checkpoint. Settings come from the
+    preset, then from --config, then from the other options. With torchrun, several processes train together.
     """
     if steps is not None and minutes is not None:
         raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")

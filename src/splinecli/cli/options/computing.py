@@ -26,7 +26,8 @@ ROTATIONS = Option(
     None,
     metavar="R",
     min=1,
-    help="Average the network's result over R rotations of the lights. [default: 1; cnn-ps: 10]",
+    help="Average the network's result over R views of each pixel: its lights rotated, for spline-net also mirrored."
+    " [default: 1; cnn-ps: 10]",
 )
 DISTIL = Option(
     None,

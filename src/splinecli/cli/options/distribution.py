@@ -29,7 +29,7 @@ TRIAL_RETRIES = Option(
     "--retries",
     metavar="N",
     min=0,
-    help="Repeat a draw N times whose worker was lost, on other workers. [default: 2]",
+    help="If the worker of a draw is lost, repeat the draw on another, up to N times. [default: 2]",
 )
 SCENE_WORKERS = Option(
     "1",
@@ -48,7 +48,7 @@ RETRIES = Option(
     None,
     metavar="N",
     min=0,
-    help="Repeat a capture N times whose worker was lost, on other workers. [default: 2]",
+    help="If the worker of a capture is lost, repeat it on another, up to N times. [default: 2]",
 )
 SHARD = Option(
     None,

@@ -48,7 +48,7 @@ LIGHT_ERROR = Option(
 LIGHT_POSITIONS = Option(
     None,
     metavar="FILE",
-    help="Near lamps: a line x y z for each image, in any unit, from the middle of the object."
+    help="Near lamps: a line x y z for each image, in any unit, from the middle of the image."
     " [default: light_positions.txt in CAPTURE]",
 )
 LIGHT_DISTANCE = Option(
@@ -87,7 +87,7 @@ AUTO_MASK = Option(
 CROP = Option(
     None, metavar="X,Y,W,H", help="Read this box of the images: left upper corner and size in pixels."
 )
-SCALE = Option(None, metavar="1/N", help="Read one of N rows and columns, for a first look. [default: all]")
+SCALE = Option(None, metavar="1/N", help="Read every N-th row and column, for a first look. [default: all]")
 GROUND_TRUTH = Option(
     None, metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."
 )

@@ -40,7 +40,7 @@ NORMAL_FORMATS = Option(
     "--format",
     metavar="LIST",
     help="Files of the normal map: any of {formats}. png has 16 bits, png8 has 8, npy and tiff are float32."
-    " exr (needs the extra 'exr') is for all maps that are written: normals, albedo, depth.",
+    " With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.",
     autocompletion=complete_list(choices.normal_formats),
 )
 SURFACE_FORMATS = Option(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typer import Argument, Option
 
 from splinecli.cli.options.values import complete_weights
-from splinecli.training.defaults import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STEPS, PRESET_NAMES
+from splinecli.training.defaults import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STEPS, PRESET_NAMES, REFINE_STEPS
 
 # Pixel sets of prepare.
 
@@ -41,7 +41,7 @@ PARAMETERS = Option(
 START_FROM = Option(
     None,
     metavar="NAME|FILE",
-    help="Begin with these weights. [default: random weights]",
+    help="Begin with these weights. [default: random weights; preset refine: spline-net]",
     autocompletion=complete_weights,
 )
 GENERATOR_WEIGHT = Option(
@@ -57,7 +57,8 @@ STEPS = Option(
     None,
     metavar="N",
     min=1,
-    help=f"Train for N steps. [default: {DEFAULT_STEPS:,}; preset paper: {PAPER_STEPS:,}]",
+    help=f"Train for N steps. [default: {DEFAULT_STEPS:,}; presets paper: {PAPER_STEPS:,},"
+    f" refine: {REFINE_STEPS:,}]",
 )
 MINUTES = Option(
     None,
