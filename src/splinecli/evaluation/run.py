@@ -237,7 +237,7 @@ def _tasks(job: CaptureJob, draws: Sequence[Sequence[Unit]]) -> list[DrawTask]:
     }
     missing = tuple((numbers[draw[0][0]][0], tuple(numbers[trial][1] for trial, _ in draw)) for draw in draws)
     positions: Sequence[int | None] = range(len(draws)) if draws else [None]
-    return [DrawTask(job.source.files.folder, job.name, missing, position) for position in positions]
+    return [DrawTask(job.folder, job.name, missing, position) for position in positions]
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:

@@ -12,8 +12,9 @@ import tifffile
 
 from splinecli.capture import capture_name, find_captures, open_capture, read_capture
 from splinecli.errors import InputError
+from splinecli.evaluation.draws_elsewhere import DrawScorer
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate
+from splinecli.evaluation.run import evaluate, evaluate_all
 from splinecli.methods import make_estimator
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
@@ -140,6 +141,18 @@ def test_evaluation_calls_the_captures_by_their_names(tree: Path) -> None:
         "Bunny10_metallic",
         "Bunny10_specular",
     ]
+
+
+def test_another_process_reads_the_kind_that_it_scores(tree: Path) -> None:
+    folders = find_captures(tree / "PRPS/Bunny9")
+    estimators, protocols = [make_estimator("ls")], [Protocol(4)]
+    scorer = DrawScorer(estimators, protocols)
+    (here,), (there,) = (
+        evaluate_all(folders, estimators, protocols, elsewhere=elsewhere)
+        for elsewhere in (None, lambda draws: ((draw, scorer.score(draw)) for draw in draws))
+    )
+    assert there.skipped == ()
+    assert [result.maes_deg for result in there.results] == [result.maes_deg for result in here.results]
 
 
 def test_a_missing_image(tmp_path: Path) -> None:
