@@ -8,7 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bump_capture import POSITIONS, write_bump
+from bump_capture import POSITIONS, SIZE, write_bump
+from splinecli.capture import read_capture
+from splinecli.capture.restore.light_refinement import refine_capture
+from splinecli.evaluation.plan import CaptureJob, Task
+from splinecli.evaluation.protocol import Protocol
+from splinecli.methods import make_estimator
 
 
 @pytest.fixture
@@ -51,6 +56,37 @@ def test_evaluate(run, rough: np.ndarray) -> None:
     assert document["protocol"]["light_error_deg"] == 3
     assert errors[1] < 0.9 * errors[0]
     assert errors[2] not in errors[:2]
+
+
+def test_evaluate_refines_from_all_pixels(rough: np.ndarray) -> None:
+    """The lights do not depend on the pixels that are scored, or on whether the method sees all of them."""
+    job = CaptureJob.plan(
+        Path("bump"),
+        "bump",
+        [make_estimator("ls")],
+        [Task.of(Protocol(light_error_deg=5.0, max_pixels=150))],
+    )
+    assert job is not None
+    source, trial = job.read(job.draws), job.draws[0][0][0]
+    scored, whole = source.see(trial), source.see(trial, whole=True)
+    assert (scored.n_pixels, whole.n_pixels) == (150, SIZE * SIZE)
+    refined = refine_capture(read_capture("bump"), error_deg=5.0)
+    assert np.abs(refined.light_directions - rough).max() > 0.02
+    for seen in (scored, whole):
+        np.testing.assert_array_equal(seen.light_directions, refined.light_directions)
+
+
+def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> None:
+    write_bump(Path("near"))
+    np.savetxt("near/light_positions.txt", POSITIONS)
+    Path("near/pixel_size.txt").write_text("2\n")
+    arguments = ["--method", "ls", "--n-lights", "all", "--refine-lights", "--json"]
+    result = run("evaluate", "bump", "near", *arguments)
+    document = json.loads(result.out)
+    assert [scored["capture"] for scored in document["results"]] == ["bump"]
+    assert [skipped["capture"] for skipped in document["skipped"]] == ["near"]
+    assert "--refine-lights refines distant lights, and this capture has near lamps" in result.err
+    assert run("evaluate", "near", *arguments).code == 2
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from pathlib import Path
 from splinecli.capture import CaptureSource, capture_name, open_capture
 from splinecli.capture.lights.draws import Draw, DrawsFile, draw_lights, read_draws
 from splinecli.capture.record import MIN_LIGHTS
+from splinecli.capture.restore.light_refinement import check_distant
 from splinecli.capture.stamp import stamp_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.capture_notes import capture_notes
@@ -75,12 +76,14 @@ class CaptureJob:
     """One capture with its trials under all protocols.
 
     Args:
+        folder: the capture's folder as it was given. Other processes open it again.
         name: name of the capture in the tables.
         source: the opened capture.
         tasks: the protocols that can score it.
         draws: for each draw, the trial and the method of each method that sees it.
     """
 
+    folder: Path
     name: str
     source: CaptureSource
     tasks: list[Task]
@@ -98,7 +101,7 @@ class CaptureJob:
             for task in tasks:
                 task.fail(name, as_input_error(error, folder))
             return None
-        job = cls(name, source, [], [])
+        job = cls(folder, name, source, [], [])
         for task in tasks:
             try:
                 draws = draws_for(source, name, task.protocol, task.draws_file)
@@ -141,7 +144,9 @@ class CaptureJob:
         protocol = self.tasks[0].protocol
         rows = scored_rows(stored.capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
         as_stored = all(task.protocol.as_stored for task in self.tasks)
-        whole = any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw)
+        whole = any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw) or any(
+            task.protocol.light_error_deg is not None for task in self.tasks
+        )
         return TrialSource.with_pixels(stored, rows, as_stored=as_stored, whole=whole)
 
 
@@ -185,7 +190,7 @@ def draws_for(
 
     Raises:
         InputError: the capture has no ground truth, or a draw of the file does not fit it.
-        UsageError: it has too few lights.
+        UsageError: it has too few lights, or near lamps that are to be refined.
     """
     if source.files.ground_truth is None:  # known before the images are read
         raise InputError(
@@ -193,6 +198,8 @@ def draws_for(
             path=source.files.folder,
             hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
         )
+    if protocol.light_error_deg is not None:
+        check_distant(near=source.lamps is not None and source.lamps.used)
     skipped = protocol.skipped_lights(name)
     left = source.n_lights - skipped
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)

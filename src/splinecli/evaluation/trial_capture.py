@@ -42,7 +42,7 @@ class TrialSource:
         """Return a source that scores the given rows of the observations only.
 
         Args:
-            whole: whether a method sees neighbours, and so needs all pixels.
+            whole: whether all pixels are needed: a method sees neighbours, or lights are refined.
             as_stored: whether no trial restores. Otherwise all pixels are kept where the light intensities are
                 unknown, because `infer` estimates them from all pixels. They are also kept under near lamps, which
                 need the whole surface.
@@ -56,13 +56,16 @@ class TrialSource:
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
         """Return the capture under the lights of a trial, with noise on their directions, which are refined if asked.
 
-        It has the scored pixels, or with `whole` all of them.
+        It has the scored pixels, or with `whole` all of them. Lights are refined from all pixels, as in `infer`.
         """
-        capture = self._see(trial, None if whole else self.rows)
+        rows = None if whole else self.rows
         if trial.light_error_deg is None:
-            return capture
+            return self._see(trial, rows)
         known = self.stored.intensities_known
-        return refine_capture(capture, error_deg=trial.light_error_deg, intensities_known=known)
+        capture = refine_capture(
+            self._see(trial, None), error_deg=trial.light_error_deg, intensities_known=known
+        )
+        return capture if rows is None else capture.choose_pixels(rows)
 
     def _see(self, trial: Trial, rows: NDArray[np.integer] | None) -> Capture:
         position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}

@@ -87,11 +87,7 @@ def refine_capture(
     Raises:
         UsageError: the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
     """
-    if capture.lamps is not None:
-        raise UsageError(
-            "--refine-lights refines distant lights, and this capture has near lamps",
-            hint="Leave --refine-lights out",
-        )
+    check_distant(near=capture.lamps is not None)
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
     check_light_error(error_deg)
     found = refine_lights(
@@ -141,6 +137,15 @@ def _why_kept(capture: Capture) -> str:
     if _choose_pixels(capture.observations) is None:
         return f"there are fewer than {_MIN_PIXELS} lit pixels"
     return "no others near them fit the images much better"
+
+
+def check_distant(*, near: bool) -> None:
+    """Raise UsageError for a capture with near lamps."""
+    if near:
+        raise UsageError(
+            "--refine-lights refines distant lights, and this capture has near lamps",
+            hint="Leave --refine-lights out",
+        )
 
 
 def check_light_error(error_deg: float, *, needs_option: bool = False) -> None:
