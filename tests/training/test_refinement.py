@@ -21,7 +21,8 @@ from splinecli.training import refinement, tasks
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import WEIGHTS
 from splinecli.training.loop import Trainer
-from splinecli.training.refinement import ScenePool, refinement_losses, stack_maps
+from splinecli.training.refinement import STEPS_PER_EXAMPLE, ScenePool, refinement_losses, stack_maps
+from splinecli.training.tasks import RefinementTask
 
 CPU = torch.device("cpu")
 FLAWLESS = CaptureConfig(
@@ -155,6 +156,29 @@ def test_captures_of_a_pool(
     assert drawn.normals.shape == (3, 3, 14, 14)
     straight = refinement_losses(network, stack_maps([one])).before
     torch.testing.assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
+
+
+def test_a_run_that_continues_has_the_newest_captures(
+    refining: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It began with the oldest ones again."""
+    monkeypatch.setattr(tasks, "FIRST_EXAMPLES", 2)
+    monkeypatch.setattr(tasks, "VALIDATION_SCENES", 0)
+    torch.manual_seed(0)
+    network = SplineNet(refining.network)
+    config = replace(refining, sources={str(bumpy_set.folder): 1.0})
+    whole, rest = (RefinementTask(config, range(config.shards), CPU) for _ in range(2))
+    whole.prepare(network, rank=0, step=0)
+    next_step = STEPS_PER_EXAMPLE + 1
+    for step in range(next_step):
+        list(whole.losses(network, step, bfloat16=False))
+    rest.prepare(network, rank=0, step=next_step)
+    newest = list(whole.pool.examples)[-2:]
+    for one, other in zip(newest, rest.pool.examples, strict=True):
+        torch.testing.assert_close(tuple(one), tuple(other), rtol=0, atol=0)
+    for task in (whole, rest):
+        task.pool.add()
+    assert torch.equal(whole.pool.examples[-1].features, rest.pool.examples[-1].features)
 
 
 def test_unknown_normals_count_for_nothing(refining: TrainingConfig, bumpy_set: PixelSet) -> None:

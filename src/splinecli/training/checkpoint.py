@@ -1,7 +1,7 @@
-"""Checkpoints: one safetensors file from which a run continues exactly where it stopped.
+"""Checkpoints: one safetensors file from which a run continues where it stopped.
 
 A checkpoint contains no state of a random generator. The draws of a step follow from the seed and the step number
-alone.
+alone. A run of the refinement net photographs its newest captures again, and goes on without the earlier ones.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ class Trainer:
             self.counters = load_checkpoint(
                 folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets
             )
-        self.task.prepare(self.network, rank=self.workers.rank)
+        self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
             write_text(folder / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -83,13 +84,14 @@ class SceneMaps(NamedTuple):
 class ScenePool:
     """Captures of scenes, each under its own lights and faults. The pool grows while training goes on.
 
-    A capture depends only on (seed, its number). A run that continues begins with new captures.
+    A capture depends only on (seed, its number).
 
     Args:
         scenes: pixel sets with some of their entries, and the weight of each set.
         network: a SPLINE-Net with an error head, on the device of the captures.
         config: number of lights and the faults of a capture.
         seed: seed of all captures.
+        first: the number of the first capture. A run that continues begins with its newest captures.
     """
 
     def __init__(
@@ -98,23 +100,21 @@ class ScenePool:
         network: SplineNet,
         config: CaptureConfig,
         seed: int,
+        *,
+        first: int = 0,
     ) -> None:
         self.scenes = tuple(scenes)
         self.network = network
         self.config = config
         self.seed = seed
-        self.examples: list[SceneMaps] = []
-        self._made = 0
+        self.examples: deque[SceneMaps] = deque(maxlen=MOST_EXAMPLES)
+        self._made = first
 
     def add(self) -> None:
         """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
         seeds = np.random.SeedSequence((self.seed, self._made)).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(seeds[0] >> np.uint64(1)))
-        example = self._draw_example(generator)
-        if len(self.examples) < MOST_EXAMPLES:
-            self.examples.append(example)
-        else:
-            self.examples[self._made % MOST_EXAMPLES] = example
+        self.examples.append(self._draw_example(generator))
         self._made += 1
 
     def _draw_example(self, generator: torch.Generator) -> SceneMaps:

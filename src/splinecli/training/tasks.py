@@ -52,8 +52,8 @@ class Task(Protocol):
     sets: dict[str, str]
     single_scene_sets: tuple[str, ...]
 
-    def prepare(self, network: SplineNet, *, rank: int) -> None:
-        """Draw what is needed before the first step, for process number `rank`. Only process 0 validates."""
+    def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
+        """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
         ...
 
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
@@ -69,7 +69,7 @@ class Task(Protocol):
         ...
 
 
-def open_task(config: TrainingConfig, shards: range, device: torch.device) -> PixelTask | RefinementTask:
+def open_task(config: TrainingConfig, shards: range, device: torch.device) -> Task:
     """Open the sources of a run. Raises InputError, UsageError."""
     if config.updates == "refine_net":
         return RefinementTask(config, shards, device)
@@ -96,7 +96,7 @@ class PixelTask:
         self._held = sources.validation
         self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
 
-    def prepare(self, network: SplineNet, *, rank: int) -> None:
+    def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         if rank == 0:
             pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
             draws = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
@@ -154,11 +154,11 @@ class RefinementTask:
         self.scenes = open_scenes(config)
         self.sets, self.single_scene_sets = self.scenes.sets, self.scenes.single_scene_sets
 
-    def prepare(self, network: SplineNet, *, rank: int) -> None:
+    def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         config, scenes = self.config, self.scenes
-        self.pool = ScenePool(
-            scenes.training, network, config.pixels, stream_seed(config.seed, rank, _POOL_STREAM)
-        )
+        seed = stream_seed(config.seed, rank, _POOL_STREAM)
+        first = -(-step // STEPS_PER_EXAMPLE)  # of the captures, if one is added before step 0 and so on
+        self.pool = ScenePool(scenes.training, network, config.pixels, seed, first=first)
         for _ in range(FIRST_EXAMPLES):
             self.pool.add()
         if rank == 0:
