@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from splinecli.fits.weighted_least_squares import weighted_sum
+from splinecli.networks.layers import zeroed
 from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
 
 HEAD_WIDTH = 16
@@ -31,9 +33,7 @@ class SetBranch(nn.Module):
         self.pixel = nn.Linear(3 * normals + 1, width)
         self.layers = nn.ModuleList(_AttentionLayer(width) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        self.weigh = nn.Linear(width, 2)
-        nn.init.zeros_(self.weigh.weight)
-        nn.init.zeros_(self.weigh.bias)
+        self.weigh = zeroed(nn.Linear(width, 2))
 
     def forward(
         self, observed: Tensor, lights: Tensor, residual: Tensor, valid: Tensor | None, normals: Tensor
@@ -80,7 +80,7 @@ class _AttentionLayer(nn.Module):
         pixels, count, width = tokens.shape
         split = self.queries_keys_values(self.norm1(tokens)).view(pixels, count, 3, self.heads, HEAD_WIDTH)
         queries, keys, values = split.permute(2, 0, 3, 1, 4)
-        if tokens.device.type == "cpu":
+        if queries.device.type == "cpu" and queries.dtype == torch.bfloat16:
             # PyTorch's attention on a CPU is slower in bfloat16 than in float32, and its gradient up to six times.
             queries, keys, values = queries.float(), keys.float(), values.float()
         with torch.autocast(tokens.device.type, enabled=False):
@@ -110,8 +110,8 @@ def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor
     x, y, z = lights.unbind(-1)
     prior = lights.new_tensor((_PRIOR, _PRIOR, _PRIOR, 0, 0, 0))
     products = torch.stack((x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
-    matrix = (weight[:, None] @ products)[:, 0] + prior
+    matrix = weighted_sum(weight, products) + prior
     # Where nothing else decides, the normal points to the camera.
-    vector = ((weight * targets)[:, None] @ lights)[:, 0] + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
+    vector = weighted_sum(weight * targets, lights) + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
     scaled = multiply_symmetric(inverse_3x3(matrix.unbind(-1), 1e-6), vector.unbind(-1))
     return nn.functional.normalize(torch.stack(scaled, dim=-1), dim=-1)
