@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.scenes import CLASSES, Scene, SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.principled import CLASSES, PrincipledMaterial
+from splinecli.synthesis.scenes import Scene, SceneConfig, draw_scene, render_scene
 
 LEVELS = 6
 # Cosines of the lights with the viewing direction, and their azimuths in degrees.

@@ -10,11 +10,10 @@ pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.errors import UsageError
 from splinecli.synthesis.meshes import Mesh
+from splinecli.synthesis.principled import CLASSES, draw_class
 from splinecli.synthesis.scenes import (
-    CLASSES,
     MIN_LIGHT_Z,
     SceneConfig,
-    draw_class,
     draw_lights,
     draw_patches,
     draw_scene,

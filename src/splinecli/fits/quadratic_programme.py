@@ -17,9 +17,10 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor, *, iterations: int = 1
     violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum.
 
     Args:
-        hessian: (P, K, K), symmetric and positive definite. linear: (P, K). iterations: a limit, because rounding
-        errors may cause cycles if a hessian is nearly singular. The result is then
-            feasible and close to the optimum.
+        hessian: (P, K, K), symmetric and positive definite.
+        linear: (P, K).
+        iterations: a limit, because rounding errors may cause cycles if a hessian is nearly singular. The result is
+            then feasible and close to the optimum.
     """
     count, size = linear.shape
     eye = torch.eye(size, dtype=hessian.dtype, device=hessian.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from splinecli.networks.layers import PATCH, MapEncoder
+from splinecli.networks.layers import PATCH, MapEncoder, zeroed
 
 
 class PaperLINet(nn.Module):
@@ -59,9 +59,7 @@ class CompactLINet(nn.Module):
     def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
         super().__init__()
         self.encoder = MapEncoder(channels, width, blocks, map_size)
-        self.decoder = nn.Conv2d(width, PATCH**2, 1)
-        nn.init.zeros_(self.decoder.weight)
-        nn.init.zeros_(self.decoder.bias)  # type: ignore[arg-type]
+        self.decoder = zeroed(nn.Conv2d(width, PATCH**2, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
         return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.networks.error_head import ErrorHead
-from splinecli.networks.layers import MapEncoder
+from splinecli.networks.layers import PATCH, MapEncoder, zeroed
 
 DROPOUT = 0.2
 """Share of the channels that the paper size drops in training."""
@@ -79,11 +79,9 @@ class CompactNENet(nn.Module):
         super().__init__()
         self.encoder = MapEncoder(channels, width, blocks, map_size)
         self.squeeze = nn.Conv2d(width, width // 2, 1)
-        side = map_size // 4
+        side = map_size // PATCH
         self.hidden = nn.Linear(width // 2 * side * side, head_width)
-        self.out = nn.Linear(head_width, 3)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        self.out = zeroed(nn.Linear(head_width, 3))
         self.compare: nn.Linear | None = None
         self.weigh: nn.Linear | None = None
         if fits:

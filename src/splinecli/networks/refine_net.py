@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
+from splinecli.networks.layers import zeroed
 from splinecli.networks.refine_features import CHANNELS, split_features
 
 WIDTHS = (32, 64, 96, 64)
@@ -23,10 +24,8 @@ DECODING_BLOCKS = (1, 1, 0)
 SIGMAS = (0.7, 1.5, 3.0)
 """Widths in pixels of the smoothed normals that the net weighs against the estimated one."""
 
-_LEAST_MEDIAN, _LARGEST_MEDIAN = (
-    -6.0,
-    1.0,
-)  # logarithms of errors in radians, for the weights of the smoothing
+# Logarithms of errors in radians, for the weights of the smoothing.
+_LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
 
 COARSEST = 2 ** (len(WIDTHS) - 1)
 """Side of the coarsest scale's pixels. The origins of tiles are multiples of it."""
@@ -63,9 +62,7 @@ class RefineNet(nn.Module):
             nn.ModuleList(_MaskedBlock(width) for _ in range(count))
             for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
         )
-        self.out = nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
+        self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside the mask.
@@ -191,9 +188,7 @@ class _MaskedBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+        self.second = zeroed(nn.Conv2d(width, width, 3, padding=1))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         hidden = self.first(torch.relu(x)).mul_(mask).relu_()

@@ -19,7 +19,8 @@ from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.measured import MeasuredLibrary
 from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.meshes import read_mesh
-from splinecli.synthesis.scenes import CLASSES, RenderedScene, SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.principled import CLASSES
+from splinecli.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
 
 RENDERER = 2
 """Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both."""

@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.principled import PrincipledMaterial, draw_material
+from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_class, draw_material
 from splinecli.synthesis.random_numbers import draw_number
-from splinecli.synthesis.scenes import CLASSES, draw_class
 
 _SMOOTH_SHARE = 1 / 3
 """A share of the pieces has no detail: smooth things must stay smooth, whatever they are made of."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.synthesis.random_numbers import draw_uniform
+from splinecli.transfer import decode_transfer
 
 DARK_SHARE = 0.4
 """Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""
@@ -98,7 +100,10 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
     steps = torch.where(eight, 255.0, 2.0**depth - 1).to(exposed.dtype)
     rounded = (exposed * steps).round() / steps
     cut = (exposed * 256).floor().clamp(max=255) / 255
-    encoded = _decode_srgb((_encode_srgb(exposed) * 255).round() / 255)
+    # The linear values of the 256 levels, and the borders between them.
+    stored = np.linspace(0, 1, 511, dtype=np.float32)
+    linear = torch.from_numpy(decode_transfer(stored, None)).to(exposed)
+    encoded = linear[::2][torch.bucketize(exposed.contiguous(), linear[1::2].contiguous())]
     return torch.where(eight & (kind < 0.5), encoded, torch.where(eight & (kind < 0.75), cut, rounded))
 
 
@@ -122,14 +127,3 @@ def restore(
     lights = (directions[rows] * valid[rows, :, None]).cpu().numpy()
     restore_saturated(values, clipped[rows].cpu().numpy(), lights.__getitem__)
     return observed.index_copy(0, rows, torch.from_numpy(values).to(observed))
-
-
-def _encode_srgb(linear: Tensor) -> Tensor:
-    """Return the sRGB encoding (IEC 61966-2-1) of values from 0 to 1, not rounded."""
-    return torch.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    )
-
-
-def _decode_srgb(stored: Tensor) -> Tensor:
-    return torch.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)

@@ -15,6 +15,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from splinecli.synthesis.random_numbers import draw_uniform
+
+CLASSES = ("diffuse", "specular", "metallic")
+"""Classes of materials of the rendered scenes; see draw_class."""
+
 _RETRO_EXPONENT = 20
 """The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart."""
 
@@ -113,10 +118,9 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
     MERL's measured materials fall faster than by the cosine: as (n.l)^1.14 in the median of those that are no metal,
     nine tenths of them between 0.86 and 1.47. The ranges of base and minnaert were chosen to come near that.
     """
-    device = generator.device
 
     def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
-        return torch.rand(pixels, 1, generator=generator, device=device) * (high - low) + low
+        return draw_uniform(generator, pixels, 1, low=low, high=high)
 
     kind, split = uniform(), uniform()
     metal = (kind >= 0.58) & (kind < 0.86)
@@ -139,6 +143,43 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
         second_share=torch.where(has_second, uniform(0.0, 0.7), zero),
         second_roughness=uniform(0.1, 0.8),
         retro=torch.where((uniform() < 0.08) & ~metal, 10 ** uniform(-1.3, 0.0), zero),
+    )
+
+
+def draw_class(
+    name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False
+) -> PrincipledMaterial:
+    """Draw materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
+
+    base: U(0, 1). metallic: 1 for metals, else 0. specular: U(0, 4) for the specular class, else U(0, 1). roughness:
+    U(0.3, 0.7) for metals, else U(0, 1). sheen: U(0, 1) for a fifth of the patches that are not metals.
+
+    Args:
+        one_gloss: all patches have the specular reflection, the roughness and the sheen of the first.
+    """
+
+    def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
+        return draw_uniform(generator, patches, 1, low=low, high=high)
+
+    def gloss(values: Tensor) -> Tensor:
+        return values[:1].expand(patches, 1) if one_gloss else values
+
+    metal = name == "metallic"
+    zero = torch.zeros(patches, 1)
+    return PrincipledMaterial(
+        base=uniform(),
+        metallic=torch.ones_like(zero) if metal else zero,
+        specular=gloss(uniform(0.0, 4.0 if name == "specular" else 1.0)),
+        roughness=gloss(uniform(0.3, 0.7) if metal else uniform()),
+        sheen=gloss(zero if metal else uniform() * (uniform() < 0.2)),
+        clearcoat=zero,
+        clearcoat_gloss=zero,
+        interface_loss=zero,
+        minnaert=zero + 1,
+        tail_exponent=zero + 2,
+        second_share=zero,
+        second_roughness=zero + 1,
+        retro=zero,
     )
 
 

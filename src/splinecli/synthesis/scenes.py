@@ -12,18 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from splinecli.errors import UsageError
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.material import Material
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.principled import PrincipledMaterial
+from splinecli.synthesis.principled import CLASSES, draw_class
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
-
-CLASSES = ("diffuse", "specular", "metallic")
 
 MIN_LIGHT_Z = 0.03
 """Lowest z of a light, the cosine of its angle to the viewing direction."""
@@ -198,43 +195,6 @@ def draw_patches(mesh: Mesh, patches: int, rng: np.random.Generator) -> NDArray[
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     seeds = centres[rng.integers(len(centres), size=patches)]
     return np.asarray(cKDTree(seeds).query(centres)[1], dtype=np.int64)
-
-
-def draw_class(
-    name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False
-) -> PrincipledMaterial:
-    """Draw materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
-
-    base: U(0, 1). metallic: 1 for metals, else 0. specular: U(0, 4) for the specular class, else U(0, 1). roughness:
-    U(0.3, 0.7) for metals, else U(0, 1). sheen: U(0, 1) for a fifth of the patches that are not metals.
-
-    Args:
-        one_gloss: all patches have the specular reflection, the roughness and the sheen of the first.
-    """
-
-    def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
-        return torch.rand(patches, 1, generator=generator) * (high - low) + low
-
-    def gloss(values: Tensor) -> Tensor:
-        return values[:1].expand(patches, 1) if one_gloss else values
-
-    metal = name == "metallic"
-    zero = torch.zeros(patches, 1)
-    return PrincipledMaterial(
-        base=uniform(),
-        metallic=torch.ones_like(zero) if metal else zero,
-        specular=gloss(uniform(0.0, 4.0 if name == "specular" else 1.0)),
-        roughness=gloss(uniform(0.3, 0.7) if metal else uniform()),
-        sheen=gloss(zero if metal else uniform() * (uniform() < 0.2)),
-        clearcoat=zero,
-        clearcoat_gloss=zero,
-        interface_loss=zero,
-        minnaert=zero + 1,
-        tail_exponent=zero + 2,
-        second_share=zero,
-        second_roughness=zero + 1,
-        retro=zero,
-    )
 
 
 def _draw_patch_count(rng: np.random.Generator) -> int:

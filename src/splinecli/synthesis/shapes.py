@@ -38,9 +38,8 @@ def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[st
     slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera).
 
     Args:
-        place: determines the kind, from 0 to 1. Evenly spread values give a set the right share of each kind. None
-        draws
-            it at random.
+        place: determines the kind, from 0 to 1. Evenly spread values give a set the right share of each kind.
+            None draws it at random.
 
     Raises:
         UsageError: the extra `render` is not installed.
