@@ -47,7 +47,8 @@ def capture_figures(
 ) -> list[CaptureFigure]:
     """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
 
-    All pixels in the mask are estimated, also where the protocol has max_pixels.
+    Under near lamps, there is none of pixels. All pixels in the mask are estimated, also where the protocol has
+    max_pixels.
 
     Args:
         folder: the capture.
@@ -74,14 +75,20 @@ def capture_figures(
     }
     title = f"{printable(name)}, {heading(protocol)}{_listed(trial.lights)}"
     figures = [_maps_figure(capture, estimates, stem, title)]
-    for estimator in estimators:
-        if estimator.name.startswith("spline-net"):
-            whole = stored.capture if trial.as_stored else stored.restore(stored.estimate_intensities())
-            chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
-            png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)
-            caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
-            figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
+    estimator = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
+    # Under near lamps, each pixel has light directions of its own.
+    if estimator is not None and capture.lamps is None:
+        whole = stored.capture if trial.as_stored else stored.restore(stored.estimate_intensities())
+        chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
+        png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)
+        caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
+        figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
+
+
+def has_observation_maps(method: str) -> bool:
+    """Return whether a method has observation maps that figures can show."""
+    return method.startswith("spline-net")
 
 
 def file_stems(names: Sequence[str]) -> list[str]:

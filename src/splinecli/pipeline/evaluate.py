@@ -14,7 +14,12 @@ from splinecli.capture import find_captures, open_capture
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.devices import count_available_cores
 from splinecli.errors import InputError, UsageError
-from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems
+from splinecli.evaluation.capture_figures import (
+    CaptureFigure,
+    capture_figures,
+    file_stems,
+    has_observation_maps,
+)
 from splinecli.evaluation.files import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
@@ -91,6 +96,8 @@ class EvaluateOptions:
             )
         if self.light_error_deg is not None:
             check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
+        if self.jobs is not None and self.jobs < 1:
+            raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(
                 "--jobs contradicts --workers and --cluster",
@@ -98,7 +105,7 @@ class EvaluateOptions:
             )
         for name in self.methods:
             check_method(name)
-        if self.pixels and not (self.figures and "spline-net" in self.methods):
+        if self.pixels and not (self.figures and any(map(has_observation_maps, self.methods))):
             raise UsageError(
                 "--pixel chooses the observation maps that --figures shows",
                 hint="Add --figures and --method spline-net",
@@ -112,7 +119,7 @@ class EvaluateOptions:
         return [
             Protocol(
                 count,
-                self.trials or DEFAULT_TRIALS,
+                DEFAULT_TRIALS if self.trials is None else self.trials,
                 self.seed,
                 None if self.draws is None else Path(self.draws),
                 noise,
@@ -173,7 +180,7 @@ def evaluate_captures(
                 estimators,
                 protocols,
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
-                jobs=options.jobs or _default_jobs(estimators),
+                jobs=_default_jobs(estimators) if options.jobs is None else options.jobs,
                 elsewhere=_elsewhere(options, estimators, protocols, observer),
                 on_progress=_follow(advance),
             )
