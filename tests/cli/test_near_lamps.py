@@ -225,3 +225,16 @@ def test_albedo_and_saturation(run, bump: Path) -> None:
     if albedo is None:
         albedo = cv2.imread("out/bump/albedo.png", cv2.IMREAD_UNCHANGED).astype(float)
     assert albedo.std() < 0.03 * albedo.mean()
+
+
+def test_the_surface_is_seen_by_the_camera_of_the_lamps(run, bump: Path) -> None:
+    """What `infer --surface` integrates is what `integrate` makes of its normals with the same camera matrix."""
+    np.savetxt(bump / "light_positions.txt", POSITIONS)
+    (bump / "pixel_size.txt").write_text("2\n")
+    np.savetxt(bump / "camera_matrix.txt", ((100, 0, 15.5), (0, 100, 15.5), (0, 0, 1)))
+    report = infer(run, "--surface")
+    assert report["surface"]["camera"] == report["near_lamps"]["camera"] == "perspective"
+    assert report["surface"]["unit"] == "mean depth"
+    matrix = ["--camera-matrix", bump / "camera_matrix.txt", "--format", "npy"]
+    assert run("integrate", "out/bump", "-o", "again", *map(str, matrix)).code == 0
+    np.testing.assert_array_equal(np.load("again/depth.npy"), np.load("out/bump/depth.npy"))

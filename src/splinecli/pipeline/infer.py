@@ -242,6 +242,7 @@ def _surface(
     from splinecli.pipeline.surface import make_surface, share_of_iterations
     from splinecli.surface.surface_files import DEPTH_FORMATS, write_surface
 
+    lamps = estimate.capture.lamps
     pixel_size = options.pixel_size
     if pixel_size is not None:
         pixel_size *= parse_window(options.crop, options.scale).step
@@ -249,7 +250,8 @@ def _surface(
         surface, report["surface"] = make_surface(
             estimate.normal_map,
             estimate.capture.mask,
-            colours=colours,
+            None if lamps is None else lamps.camera_matrix,
+            colours,
             n_triangles=options.decimate,
             pixel_size_mm=pixel_size,
             progress=share_of_iterations(advance),
