@@ -214,9 +214,10 @@ def test_its_map_is_refined_by_the_net_of_its_teacher_with_turns_where_it_is_sma
 
 
 def test_too_few_pixels() -> None:
-    normals, observations = glossy(50)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (50, 1)))
-    with pytest.raises(UsageError, match="50 pixels are lit, too few to distil the network"):
+    """The sample is half of the lit pixels at most: of 127, 63."""
+    normals, observations = glossy(127)
+    teacher = Teacher(observations, normals, np.tile(log_median(2), (127, 1)))
+    with pytest.raises(UsageError, match="127 pixels are lit, too few to distil the network"):
         distil(teacher, observations, LIGHTS, SIZE)
 
 

@@ -108,3 +108,13 @@ def test_refused() -> None:
         with pytest.raises(UsageError, match=problem):
             distil_for(few, estimator, True)
         assert distillation.distil_for(few, estimator, None) == (None, [])
+
+
+def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a mask, most pixels are a black background."""
+    monkeypatch.setattr(distilled, "seconds_of_learning", lambda *_: 0.0)
+    dark = capture(AUTOMATIC_FROM)
+    dark.observations[100:] = 0
+    with pytest.raises(UsageError, match="matte: 100 pixels are lit, too few to distil the network. Leave"):
+        distil_for(dark, Teacher(), True)
+    assert distil_for(dark, Teacher(seconds=0.02), None) == (None, [])

@@ -163,13 +163,13 @@ def distil(
         progress: called with numbers of pixels; in all, twice the pixels of the sample.
 
     Raises:
-        UsageError: fewer than FEWEST_PIXELS pixels are lit.
+        UsageError: too few pixels are lit for a sample of FEWEST_PIXELS.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     chosen = np.sort(rng.choice(len(observations), min(_CANDIDATES, len(observations)), replace=False))
     candidates = observations[chosen]
     candidates = candidates[(candidates > 0).any(axis=1)]
-    if len(candidates) < FEWEST_PIXELS:
+    if len(candidates) // 2 < FEWEST_PIXELS:  # the sample is at most half of them
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
     lights = torch.as_tensor(light_directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)

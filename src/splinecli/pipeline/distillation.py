@@ -57,10 +57,13 @@ def distil_for(
     if wanted is None and not _is_faster(capture, estimator, sizes[0]):
         return None, []
     for size in sizes:
-        with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-            distilled = distil(
-                estimator, capture.observations, capture.light_directions, size, progress=advance
-            )
+        try:
+            with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
+                distilled = distil(
+                    estimator, capture.observations, capture.light_directions, size, progress=advance
+                )
+        except UsageError as error:  # most pixels are a dark background
+            return _refuse(wanted, f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:
             return distilled, []
     return None, [not_distilled(distilled.distillation.mean_deg, distilled.distillation.expected_deg)]
