@@ -15,6 +15,7 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate
 from splinecli.evaluation.scored_pixels import scored_rows
 from splinecli.inference import estimate_normals
+from splinecli.methods import refiner
 from splinecli.methods.estimator import UNKNOWN_ERROR
 from splinecli.methods.lamp_light import LampLight
 from splinecli.methods.networks import NetworkEstimator
@@ -112,6 +113,35 @@ def test_a_turned_capture_gets_turned_normals() -> None:
 
     # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them in this test.
     np.testing.assert_allclose(refined(1), refined(0), atol=1e-3)
+
+
+def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near lamps give each pixel its own frame. Blocks of pixels are turned back as all pixels at once."""
+    rng = np.random.default_rng(4)
+    normals = unit(rng.normal((0, 0, 3), 1, (900, 3))).astype(np.float32)
+    observations = (normals @ LIGHTS.T).clip(0).astype(np.float32)
+    turns = np.linalg.qr(rng.normal(size=(900, 3, 3)))[0].astype(np.float32)
+    net = lively(RefineNet())
+    assert isinstance(net, RefineNet)
+    asked: list[int] = []
+
+    def refined(turned: bool) -> NDArray[np.float32]:
+        def light_of(rows: NDArray[np.integer]) -> LampLight:
+            asked.append(len(rows))
+            return LampLight(observations[rows], LIGHTS, turns[rows] if turned else None)
+
+        found, errors = normals.copy(), np.tile(np.float32((-3, 1)), (900, 1))
+        Refiner(net, "float32").refine(np.ones((30, 30), np.bool_), observations, light_of, found, errors)
+        return found
+
+    at_once = refined(True)
+    asked.clear()
+    monkeypatch.setattr(refiner, "_BLOCK", 200)
+    np.testing.assert_allclose(refined(True), at_once, atol=1e-5)
+    assert asked == 2 * [200, 200, 200, 200, 100]
+    asked.clear()
+    refined(False)
+    assert sum(asked) == 900 + 200  # in one frame for all pixels, nothing is turned back
 
 
 def estimator(*, refines: bool) -> NetworkEstimator:

@@ -128,6 +128,7 @@ class Refiner:
             progress: called after each tile with the number of its pixels.
         """
         reference = brightness(torch.from_numpy(observations))
+        lit = observations.max(axis=1) > 0
         mask = _around_object(mask)
         above = _Band(slice(0, 0), normals, errors)
         for pixels, tiles in self._rows_of_tiles(mask):
@@ -137,8 +138,8 @@ class Refiner:
                 own = tile.rows[tile.inner][tile.mask[tile.inner]]
                 refined, refined_errors = self._refine(tile, light_of, normals, errors, reference)
                 # Nothing is known of a pixel that is dark under every light.
-                lit = observations[own].max(axis=1) > 0
-                band.put(own[lit], refined[lit], refined_errors[lit])
+                known = lit[own]
+                band.put(own[known], refined[known], refined_errors[known])
                 if progress is not None:
                     progress(len(own))
             # These tiles needed the pixels above as they were. The tiles below need these tiles' pixels.
@@ -193,7 +194,13 @@ class Refiner:
         inside = tile.mask[tile.inner]
         refined, refined_errors = (values.permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
         own = tile.rows[tile.inner][inside]
-        return np.asarray(light_of(own).in_frame_of_capture(refined), np.float32), refined_errors
+        for start in range(0, len(own), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            light = light_of(own[part])
+            if light.turns is None:
+                break
+            refined[part] = light.in_frame_of_capture(refined[part])
+        return refined, refined_errors
 
     def _average_turns(
         self, features: torch.Tensor, mask: torch.Tensor, inner: Part
