@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splinecli import devices
+from splinecli import devices, memory
 from splinecli.devices import (
     cgroup_quotas,
     choose_device,
@@ -16,6 +16,7 @@ from splinecli.devices import (
     use_available_cores,
 )
 from splinecli.errors import UsageError
+from splinecli.memory import available_memory
 
 
 def test_unknown_device() -> None:
@@ -57,28 +58,72 @@ def write(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-def test_quota_of_a_control_group(tmp_path: Path) -> None:
-    write(tmp_path / "cpu.max", "max 100000\n")
-    write(tmp_path / "jobs/cpu.max", "300000 100000\n")
-    write(tmp_path / "jobs/ours/cpu.max", "400000 100000\n")
+@pytest.fixture
+def mount(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of control groups, beside the file `groups` that says in which ones this process is."""
+    monkeypatch.setattr(memory, "_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(memory, "_MOUNT", tmp_path / "mount")
+    return tmp_path / "mount"
+
+
+def enter(mount: Path, groups: str) -> None:
+    write(mount.parent / "groups", groups)
+
+
+def test_quota_of_a_control_group(mount: Path) -> None:
+    write(mount / "cpu.max", "max 100000\n")
+    write(mount / "jobs/cpu.max", "300000 100000\n")
+    write(mount / "jobs/ours/cpu.max", "400000 100000\n")
+    assert cgroup_quotas() == []
+    enter(mount, "0::/jobs/ours\n")
     # The group above limits this one, too.
-    assert sorted(cgroup_quotas("0::/jobs/ours\n", tmp_path)) == [3, 4]
-    assert cgroup_quotas("0::/\n", tmp_path) == []
+    assert sorted(cgroup_quotas()) == [3, 4]
+    enter(mount, "0::/\n")
+    assert cgroup_quotas() == []
 
 
-def test_quota_inside_a_container_that_shows_the_host_s_path(tmp_path: Path) -> None:
-    write(tmp_path / "cpu.max", "150000 100000\n")
-    assert cgroup_quotas("0::/docker/0123abcd\n", tmp_path) == [1.5]
+def test_quota_inside_a_container_that_shows_the_host_s_path(mount: Path) -> None:
+    write(mount / "cpu.max", "150000 100000\n")
+    enter(mount, "0::/docker/0123abcd\n")
+    assert cgroup_quotas() == [1.5]
 
 
-def test_quota_of_version_1(tmp_path: Path) -> None:
-    groups = "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n"
-    write(tmp_path / "cpu,cpuacct/cpu.cfs_quota_us", "-1\n")
-    write(tmp_path / "cpu,cpuacct/cpu.cfs_period_us", "100000\n")
-    assert cgroup_quotas(groups, tmp_path) == []
-    write(tmp_path / "cpu,cpuacct/box/cpu.cfs_quota_us", "50000\n")
-    write(tmp_path / "cpu,cpuacct/box/cpu.cfs_period_us", "100000\n")
-    assert cgroup_quotas(groups, tmp_path) == [0.5]
+def test_quota_of_version_1(mount: Path) -> None:
+    enter(mount, "12:memory:/box\n4:cpu,cpuacct:/box\n1:name=systemd:/box\n")
+    write(mount / "cpu,cpuacct/cpu.cfs_quota_us", "-1\n")
+    write(mount / "cpu,cpuacct/cpu.cfs_period_us", "100000\n")
+    assert cgroup_quotas() == []
+    write(mount / "cpu,cpuacct/box/cpu.cfs_quota_us", "50000\n")
+    write(mount / "cpu,cpuacct/box/cpu.cfs_period_us", "100000\n")
+    assert cgroup_quotas() == [0.5]
+
+
+def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job of Slurm or systemd is in a group within groups. Each of them may have a limit."""
+    monkeypatch.setattr(memory, "_free_memory", lambda: 9e9)
+    monkeypatch.setattr(memory, "_left_in_address_space", lambda: 8e9)
+    assert available_memory() == 8e9
+    enter(mount, "0::/jobs/ours\n")
+    write(mount / "jobs/ours/memory.max", "max\n")
+    write(mount / "jobs/ours/memory.current", "100\n")
+    assert available_memory() == 8e9
+    write(mount / "jobs/memory.max", "5000\n")
+    write(mount / "jobs/memory.current", "3000\n")
+    write(mount / "jobs/memory.stat", "anon 2500\ninactive_file 500\n")
+    assert available_memory() == 5000 - 3000 + 500
+
+
+def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_free_memory", lambda: 8e9)
+    monkeypatch.setattr(memory, "_left_in_address_space", lambda: 9e9)
+    enter(mount, "12:cpu:/cpu\n4:memory:/box/ours\n0::/\n")
+    for group, limit in (("", 9223372036854771712), ("box", 5000), ("box/ours", 9223372036854771712)):
+        write(mount / "memory" / group / "memory.limit_in_bytes", f"{limit}\n")
+        write(mount / "memory" / group / "memory.usage_in_bytes", "3000\n")
+    write(mount / "memory/box/memory.stat", "inactive_file 7\ntotal_inactive_file 500\n")
+    assert available_memory() == 5000 - 3000 + 500
+    enter(mount, "12:cpu:/cpu\n4:memory:/\n0::/\n")
+    assert available_memory() == 8e9
 
 
 @pytest.mark.parametrize(
@@ -94,7 +139,7 @@ def test_available_cores(
 ) -> None:
     monkeypatch.setattr(devices.os, "cpu_count", lambda: machine)
     monkeypatch.setattr(devices.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
-    monkeypatch.setattr(devices, "cgroup_quotas", lambda *_: quotas)
+    monkeypatch.setattr(devices, "cgroup_quotas", lambda: quotas)
     assert count_available_cores() == expected
 
 

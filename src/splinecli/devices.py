@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from splinecli.errors import UsageError
+from splinecli.memory import own_groups
 
 if TYPE_CHECKING:
     import torch
-
-_CGROUPS = Path("/sys/fs/cgroup")
 
 
 def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
@@ -68,36 +67,13 @@ def count_available_cores() -> int:
     limits = [float(os.cpu_count() or 1)]
     if hasattr(os, "sched_getaffinity"):
         limits.append(len(os.sched_getaffinity(0)))
-    try:
-        groups = Path("/proc/self/cgroup").read_text("utf-8")
-    except OSError:
-        groups = ""  # not Linux
-    limits += cgroup_quotas(groups, _CGROUPS)
+    limits += cgroup_quotas()
     return max(1, int(min(limits)))
 
 
-def cgroup_quotas(groups: str, mount: Path) -> list[float]:
-    """Return the CPU quotas, in cores, of a process's control groups and of the groups above them.
-
-    Args:
-        groups: text of /proc/PID/cgroup: lines "0::/group" (version 2) or "N:controllers:/group" (version 1).
-        mount: folder where the control groups are mounted.
-    """
-    quotas = []
-    for line in groups.splitlines():
-        _, controllers, group = line.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        top = mount / controllers if controllers else mount
-        if controllers and not top.is_dir():
-            top = mount / "cpu"
-        folder = top / group.lstrip("/")
-        # Inside a container the path may be that of the host, which does not exist here. The top always does.
-        for place in (folder, *folder.parents):
-            quotas += _quota_v1(place) if controllers else _quota_v2(place)
-            if place == top:
-                break
-    return quotas
+def cgroup_quotas() -> list[float]:
+    """Return the CPU quotas, in cores, of this process's control groups and of the groups above them."""
+    return [quota for folder in own_groups("cpu") for quota in (*_quota_v2(folder), *_quota_v1(folder))]
 
 
 def _quota_v2(folder: Path) -> list[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from splinecli.errors import SplinecliError
@@ -22,16 +22,47 @@ _NO_MEMORY = (
     "failed to map segment",
     "start new thread",
 )
-_MEMORY = Path("/sys/fs/cgroup")
+_GROUPS = Path("/proc/self/cgroup")  # lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
+_MOUNT = Path("/sys/fs/cgroup")
+_GROUP_FILES = (  # the limit, the use, and the file cache within it
+    ("memory.max", "memory.current", "inactive_file"),  # version 2
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
+)
 
 
 def available_memory() -> float:
     """Return the bytes of memory that this process may still use; infinity where the system does not say.
 
-    It is the least of the machine's free memory, the limit of the process's control group, and the limit on its address
-    space (ulimit -v).
+    It is the least of the machine's free memory, the limits of the process's control groups, and the limit on its
+    address space (ulimit -v).
     """
-    return min(_free_memory(), _left_in_group(_MEMORY), _left_in_address_space())
+    in_groups = map(_left_in_group, own_groups("memory"))
+    return min(_free_memory(), _left_in_address_space(), *in_groups)
+
+
+def own_groups(controller: str) -> Iterator[Path]:
+    """Yield the folders of this process's control groups, and of the groups above them, which limit it, too.
+
+    Args:
+        controller: what the groups limit, such as cpu or memory.
+    """
+    try:
+        lines = _GROUPS.read_text("utf-8").splitlines()
+    except OSError:
+        return  # not Linux
+    for line in lines:
+        _, controllers, group = line.split(":", 2)
+        if controllers and controller not in controllers.split(","):
+            continue
+        top = _MOUNT / controllers
+        if not top.is_dir():
+            top = _MOUNT / controller
+        folder = top / group.lstrip("/")
+        # Inside a container the path may be that of the host, which does not exist here. The top always does.
+        for place in (folder, *folder.parents):
+            yield place
+            if place == top:
+                break
 
 
 def check_address_space() -> None:
@@ -80,17 +111,17 @@ def _free_memory() -> float:
 
 
 def _left_in_group(folder: Path) -> float:
-    """Return what the limit of a control group (version 2) leaves. The group's file cache can be freed."""
-    try:
-        most = (folder / "memory.max").read_text("utf-8").strip()
-        used = int((folder / "memory.current").read_text("utf-8"))
-    except (OSError, ValueError):
-        return math.inf
-    return (
-        math.inf
-        if most == "max"
-        else int(most) - used + _value_after("inactive_file", folder / "memory.stat", 0)
-    )
+    """Return what the limit of a control group leaves. The group's file cache can be freed.
+
+    Without a limit it is infinity or, in version 1, a huge number.
+    """
+    for limit, use, cache in _GROUP_FILES:
+        try:
+            most, used = (int((folder / name).read_text("utf-8")) for name in (limit, use))
+        except (OSError, ValueError):  # the other version, or the limit "max"
+            continue
+        return most - used + _value_after(cache, folder / "memory.stat", 0)
+    return math.inf
 
 
 def _address_space_limit() -> float:
