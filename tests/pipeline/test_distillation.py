@@ -115,6 +115,6 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network(monkeypatch:
     monkeypatch.setattr(distilled, "seconds_of_learning", lambda *_: 0.0)
     dark = capture(AUTOMATIC_FROM)
     dark.observations[100:] = 0
-    with pytest.raises(UsageError, match="matte: 100 pixels are lit, too few to distil the network. Leave"):
+    with pytest.raises(UsageError, match="matte: 100 pixels are lit, too few to distil"):
         distil_for(dark, Teacher(), True)
     assert distil_for(dark, Teacher(seconds=0.02), None) == (None, [])
