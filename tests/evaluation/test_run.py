@@ -269,7 +269,7 @@ def test_progress(write_dome: WriteDome) -> None:
 
 def test_a_trial_that_runs_moves_the_progress(write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch) -> None:
     tiles = partial(estimate_normals, tile_pixels=10)
-    monkeypatch.setattr("splinecli.evaluation.run.estimate_normals", tiles)
+    monkeypatch.setattr("splinecli.evaluation.trial_capture.estimate_normals", tiles)
     seen: list[float] = []
     evaluate_all(
         [write_dome()],

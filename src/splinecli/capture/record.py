@@ -157,8 +157,7 @@ class Capture:
                 f"{self.name}: light {self.light_indices[below]} lies below the horizon (z <= 0)",
                 hint="z points to the camera",
             )
-        singular_values = np.linalg.svd(lights, compute_uv=False)
-        if singular_values[-1] < COPLANAR_RATIO * singular_values[0]:
+        if in_one_plane(lights):
             raise InputError(
                 f"{self.name}: the {len(lights)} lights lie in one plane,"
                 " so least squares (LS) cannot solve for a normal",
@@ -195,6 +194,12 @@ class Capture:
             # In this form, NaN fails the check, too.
             if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():
                 raise InputError(f"{self.name}: a ground-truth normal is neither a unit vector nor zero")
+
+
+def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
+    """Return whether lights (F, 3) lie in one plane, so that Capture refuses them."""
+    singular_values = np.linalg.svd(light_directions, compute_uv=False)
+    return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
 
 
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:

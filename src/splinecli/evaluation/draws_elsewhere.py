@@ -10,10 +10,8 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.plan import CaptureJob, Task, Unit
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
-from splinecli.evaluation.trials import Score, Trial
-from splinecli.inference import estimate_normals
+from splinecli.evaluation.trials import Score
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import refiner_of
 
 Missing = tuple[tuple[int, tuple[int, ...]], ...]
 """What is to be scored of a capture: the number of each draw in CaptureJob.draws, and of its methods."""
@@ -66,7 +64,7 @@ class DrawScorer:
             return DrawScores(notes=notes)
         draw = draws[task.draw]
         shared = SharedDraw(source, draw[0][0])
-        return DrawScores(tuple(score_trial(shared, trial, estimator) for trial, estimator in draw), notes)
+        return DrawScores(tuple(shared.score(estimator) for _, estimator in draw), notes)
 
     def _capture(self, task: DrawTask) -> tuple[CaptureJob, list[list[Unit]], TrialSource]:
         if self._of != (task.folder, task.missing):
@@ -79,11 +77,3 @@ class DrawScorer:
             self._read = job, draws, job.read(draws or job.draws[:1])
             self._of = task.folder, task.missing
         return self._read
-
-
-def score_trial(shared: SharedDraw, trial: Trial, estimator: Estimator) -> Score:
-    """Return the score of a method under a draw."""
-    capture = shared.capture(whole=refiner_of(estimator) is not None)
-    estimate = estimate_normals(capture, estimator)
-    estimated = capture.estimated_intensities is not None
-    return Score(shared.mean_error_deg(estimate), estimate.seconds, estimated)

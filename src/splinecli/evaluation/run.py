@@ -17,10 +17,8 @@ from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import CaptureJob, Task, Unit, check_skip_first, distinct_names
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
-from splinecli.evaluation.trials import Score, Trial, TrialStore
-from splinecli.inference import estimate_normals
+from splinecli.evaluation.trials import Trial, TrialStore
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import refiner_of
 
 Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, DrawScores]]]
 """Scores draws in other processes, and yields each with its scores as it ends."""
@@ -177,11 +175,7 @@ class _Run:
         return running
 
     def _score(self, shared: SharedDraw, trial: Trial, estimator: Estimator) -> None:
-        capture = shared.capture(whole=refiner_of(estimator) is not None)
-        advance = self._progress.begin(capture.n_pixels)
-        estimate = estimate_normals(capture, estimator, progress=advance)
-        estimated = capture.estimated_intensities is not None
-        self._store.add(trial, Score(shared.mean_error_deg(estimate), estimate.seconds, estimated))
+        self._store.add(trial, shared.score(estimator, self._progress.begin))
 
 
 class _Progress:

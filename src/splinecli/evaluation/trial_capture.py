@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -9,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.capture.lights.draws import NOISE_STREAM, in_one_plane
+from splinecli.capture.lights.draws import NOISE_STREAM
+from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.light_noise import tilt_lights
-from splinecli.evaluation.trials import Trial
-from splinecli.inference import NormalEstimate
+from splinecli.evaluation.trials import Score, Trial
+from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.methods import Estimator
+from splinecli.methods.estimator import Progress, refiner_of
 from splinecli.methods.near_light import find_surface
 
 _RETILTS = 100
@@ -91,14 +95,29 @@ class SharedDraw:
         self._lock = Lock()
         self._captures: dict[bool, Capture] = {}
 
-    def capture(self, *, whole: bool) -> Capture:
-        """Return the capture under the lights of the draw: the scored pixels, or all. Any thread may call this."""
+    def score(self, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
+        """Return the score of a method under the draw. Any thread may call this.
+
+        Args:
+            begin: called with the number of pixels before they are estimated. Its function counts those done.
+
+        Raises:
+            SplinecliError: the method returned normals that are not unit vectors.
+        """
+        capture = self._capture(whole=refiner_of(estimator) is not None)
+        progress = None if begin is None else begin(capture.n_pixels)
+        estimate = estimate_normals(capture, estimator, progress=progress)
+        estimated = capture.estimated_intensities is not None
+        return Score(self._mean_error_deg(estimate), estimate.seconds, estimated)
+
+    def _capture(self, *, whole: bool) -> Capture:
+        """Return the capture under the lights of the draw: the scored pixels, or all."""
         with self._lock:
             if whole not in self._captures:
                 self._captures[whole] = self._source.see(self._trial, whole=whole)
             return self._captures[whole]
 
-    def mean_error_deg(self, estimate: NormalEstimate) -> float:
+    def _mean_error_deg(self, estimate: NormalEstimate) -> float:
         """Return the mean error of an estimate over the scored pixels."""
         assert (
             estimate.errors is not None and estimate.error_map_deg is not None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import read_lines
-from splinecli.capture.record import COPLANAR_RATIO, MIN_LIGHTS
+from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
 
 Draw = tuple[int, ...]
@@ -145,12 +145,6 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
         f"found no {n_lights} lights that do not lie in one plane in {_REDRAWS} draws",
         hint="Choose more lights, or lights that surround the viewing direction",
     )
-
-
-def in_one_plane(light_directions: NDArray[np.float64]) -> bool:
-    """Return whether lights (F, 3) lie in one plane, so that Capture refuses them."""
-    singular_values = np.linalg.svd(light_directions, compute_uv=False)
-    return bool(singular_values[-1] < COPLANAR_RATIO * singular_values[0])
 
 
 def _light_index(word: str, path: Path, line: int) -> int:
