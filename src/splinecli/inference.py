@@ -20,7 +20,7 @@ from splinecli.errors import SplinecliError
 from splinecli.memory import return_freed_memory
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
-from splinecli.methods.lamp_light import LampLight, rows_of
+from splinecli.methods.lamp_light import LampLight
 from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
@@ -120,7 +120,7 @@ def _light_on(capture: Capture, rows: slice | NDArray[np.integer]) -> LampLight:
     observations = capture.observations[rows]
     if capture.lamps is None:
         return LampLight(observations, capture.light_directions)
-    return LampLight.of(observations, rows_of(capture.lamps, rows))
+    return LampLight.of(observations, capture.lamps.choose_pixels(rows))
 
 
 def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:

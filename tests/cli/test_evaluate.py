@@ -96,13 +96,13 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lig
 
 def test_a_part_of_the_pixels_has_the_intensities_of_all(overexposed, run):
     """The scored pixels keep the normals that they have when all pixels are scored."""
-    from splinecli.evaluation.plan import CaptureJob, Task
+    from splinecli.evaluation.plan import CaptureJob, ProtocolTrials
     from splinecli.evaluation.protocol import Protocol
     from splinecli.methods import make_estimator
 
     seen = []
     for max_pixels in (None, 20):
-        tasks = [Task.of(Protocol(7, max_pixels=max_pixels))]
+        tasks = [ProtocolTrials.of(Protocol(7, max_pixels=max_pixels))]
         job = CaptureJob.plan(overexposed, "overexposed", [make_estimator("ls")], tasks)
         seen.append(job.read(job.draws).see(job.draws[0][0][0]))
     whole, part = seen

@@ -11,7 +11,7 @@ import pytest
 from bump_capture import POSITIONS, SIZE, write_bump
 from splinecli.capture import read_capture
 from splinecli.capture.restore.light_refinement import refine_capture
-from splinecli.evaluation.plan import CaptureJob, Task
+from splinecli.evaluation.plan import CaptureJob, ProtocolTrials
 from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import make_estimator
 
@@ -64,7 +64,7 @@ def test_evaluate_refines_from_all_pixels(rough: np.ndarray) -> None:
         Path("bump"),
         "bump",
         [make_estimator("ls")],
-        [Task.of(Protocol(light_error_deg=5.0, max_pixels=150))],
+        [ProtocolTrials.of(Protocol(light_error_deg=5.0, max_pixels=150))],
     )
     assert job is not None
     source, trial = job.read(job.draws), job.draws[0][0][0]

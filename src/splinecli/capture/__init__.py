@@ -3,7 +3,7 @@
 from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.images import read_image, read_mask
-from splinecli.capture.formats.normal_files import read_normal_map, read_normals
+from splinecli.capture.formats.normal_files import read_normal_map
 from splinecli.capture.layouts.capture_files import CaptureFiles, Overrides
 from splinecli.capture.layouts.registry import capture_name, find_capture_files, find_captures
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
@@ -32,5 +32,4 @@ __all__ = [
     "read_light_intensities",
     "read_mask",
     "read_normal_map",
-    "read_normals",
 ]

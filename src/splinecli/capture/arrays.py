@@ -32,7 +32,6 @@ def capture_from_arrays(
     pixel_size: float | None = None,
     white_level: float | None = None,
     as_stored: bool = False,
-    name: str = "capture",
 ) -> Capture:
     """Return the capture of these images, restored as `infer` restores the capture of a folder.
 
@@ -49,7 +48,6 @@ def capture_from_arrays(
             integer images; floating-point images then have none.
         as_stored: use the values alone. By default, saturated observations are restored and unknown light intensities
             are estimated.
-        name: the name of the capture, for messages.
 
     Raises:
         UsageError: a shape or a type does not fit.
@@ -71,7 +69,7 @@ def capture_from_arrays(
 
     found = collect_observations(pixels(), SaturationFinder(int(inside.sum()), n_lights, given=white_level))
     capture = Capture(
-        name=name,
+        name="capture",
         observations=found.values,
         light_directions=directions,
         light_indices=tuple(range(n_lights)),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.plan import CaptureJob, Task, Unit
+from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, Unit
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
 from splinecli.evaluation.trials import Score
@@ -69,7 +69,7 @@ class DrawScorer:
     def _capture(self, task: DrawTask) -> tuple[CaptureJob, list[list[Unit]], TrialSource]:
         if self._of != (task.folder, task.missing):
             self._of = None
-            tasks = [Task.of(protocol) for protocol in self._protocols]
+            tasks = [ProtocolTrials.of(protocol) for protocol in self._protocols]
             job = CaptureJob.plan(task.folder, task.name, self._estimators, tasks)
             if job is None:
                 raise tasks[0].failures[task.name]

@@ -31,7 +31,7 @@ OnImage = Callable[[int, int], object]
 
 
 @dataclass
-class Task:
+class ProtocolTrials:
     """A protocol with the trials of each capture and method, and the captures that failed."""
 
     protocol: Protocol
@@ -41,8 +41,8 @@ class Task:
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, protocol: Protocol) -> Task:
-        """Return the task of a protocol, with its draws file read. Raises UsageError, InputError."""
+    def of(cls, protocol: Protocol) -> ProtocolTrials:
+        """Return a protocol with its draws file read, without trials. Raises UsageError, InputError."""
         return cls(*read_draws_file(protocol))
 
     def fail(self, capture: str, error: SplinecliError) -> None:
@@ -86,12 +86,12 @@ class CaptureJob:
     folder: Path
     name: str
     source: CaptureSource
-    tasks: list[Task]
+    tasks: list[ProtocolTrials]
     draws: list[list[Unit]]
 
     @classmethod
     def plan(
-        cls, folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[Task]
+        cls, folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[ProtocolTrials]
     ) -> CaptureJob | None:
         """Return the job of a capture. Returns None if no protocol can score it; the tasks then contain the reasons."""
         try:

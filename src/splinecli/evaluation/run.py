@@ -14,7 +14,7 @@ from threading import Lock
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.draws_elsewhere import DrawScores, DrawTask
 from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.plan import CaptureJob, Task, Unit, check_skip_first, distinct_names
+from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, Unit, check_skip_first, distinct_names
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
 from splinecli.evaluation.trials import Trial, TrialStore
@@ -68,7 +68,7 @@ def evaluate_all(
     check_methods(estimators)
     if not captures:
         raise UsageError("there is nothing to score: give at least one capture and one method")
-    tasks = [Task.of(protocol) for protocol in protocols]
+    tasks = [ProtocolTrials.of(protocol) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:

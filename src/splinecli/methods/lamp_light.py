@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,12 +77,6 @@ def estimate_under_lamps(estimator: Estimator, observations: NDArray[np.float32]
     """Return the normals (P, 3) that a method estimates at the points of `lamps` from observations (P, F)."""
     light = LampLight.of(observations, lamps)
     return light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
-
-
-def rows_of(lamps: NearLamps, rows: slice | NDArray[np.integer]) -> NearLamps:
-    """Return the lamps with the points of some pixels."""
-    assert lamps.points is not None
-    return replace(lamps, points=lamps.points[rows])
 
 
 def _plane_distance(lamps: NearLamps) -> float:

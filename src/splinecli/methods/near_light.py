@@ -32,12 +32,8 @@ SOLVES = 10
 """Solves of the integration on the way. The first is least squares; the others let the surface tear at edges."""
 
 
-def find_surface(capture: Capture, *, rounds: int = ROUNDS) -> Capture:
-    """Return the capture with the points of its surface. One that has them, or distant lights, stays as it is.
-
-    Args:
-        rounds: number of fits. 0 leaves the surface a plane.
-    """
+def find_surface(capture: Capture) -> Capture:
+    """Return the capture with the points of its surface. One that has them, or distant lights, stays as it is."""
     lamps = capture.lamps
     if lamps is None or lamps.points is not None:
         return capture
@@ -47,7 +43,7 @@ def find_surface(capture: Capture, *, rounds: int = ROUNDS) -> Capture:
     blocks = Blocks.over(capture.mask, PIXELS_ON_THE_WAY)
     observations = blocks.average(capture.observations, capture.mask)
     depth = np.full(blocks.mask.shape, flat_depth(lamps))
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         normals = estimate_under_lamps(estimator, observations, replace(lamps, points=points))
         depth = _integrate(normals, blocks, lamps.camera_matrix)

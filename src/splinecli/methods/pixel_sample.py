@@ -19,15 +19,13 @@ class PixelSample:
     """A sample of pixels, and the appearances that it covers.
 
     Args:
-        rows: (N,) distinct numbers of the pixels. The first n_even are an even sample of all pixels.
-        n_even: number of pixels that were drawn evenly from all.
+        rows: (N,) distinct numbers of the pixels. The first EVEN_SHARE of them are an even sample of all pixels.
         centres: (K, C), the features at the centres of the groups.
         rare: (K,) bool, the groups of fewest pixels.
         reach: the largest distance of a pixel, among those that could be drawn, from the nearest centre.
     """
 
     rows: Tensor
-    n_even: int
     centres: Tensor
     rare: Tensor
     reach: float
@@ -72,7 +70,7 @@ def draw_sample(
     # One pixel of each group in turn, until there are enough.
     turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
     rows = torch.cat((order[:n_even], left[turns[: size - n_even]]))
-    return PixelSample(rows, n_even, features[centres], _rarest(counts, rare_share), reach)
+    return PixelSample(rows, features[centres], _rarest(counts, rare_share), reach)
 
 
 def _group(features: Tensor) -> tuple[Tensor, Tensor, float]:

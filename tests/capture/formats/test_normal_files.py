@@ -11,7 +11,7 @@ import scipy.io
 import tifffile
 from numpy.typing import NDArray
 
-from splinecli.capture import read_normal_map, read_normals
+from splinecli.capture import read_normal_map
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, encode_picture, unit
@@ -31,6 +31,10 @@ def normals() -> NDArray[np.float64]:
     )
     field[1, 2] = 0
     return np.asarray(field)
+
+
+def read_normals(path: Path, shape: tuple[int, int], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return read_ground_truth(path, shape, mask)[0]
 
 
 def write(path: Path, normals: NDArray[np.float64]) -> Path:

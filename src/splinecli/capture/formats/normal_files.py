@@ -62,11 +62,6 @@ def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | Path | None = None)
     return _to_normals(stored, wanted, path, check_floats=True)
 
 
-def read_normals(path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the normal map of read_ground_truth."""
-    return read_ground_truth(path, shape, mask)[0]
-
-
 def read_ground_truth(
     path: StrPath, shape: tuple[int, int], mask: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], bool]:

@@ -71,12 +71,6 @@ class NearLamps:
         reference = np.full_like(distances, distances.mean()) if equal else distances
         return cls(positions, pixel_size, shape, reference, camera_matrix)
 
-    @property
-    def directions(self) -> Floats:
-        """The light directions (F, 3) at the origin, unit."""
-        directions: Floats = self.positions / np.linalg.norm(self.positions, axis=1, keepdims=True)
-        return directions
-
     def as_dict(self) -> dict[str, Any]:
         """Return the lamps as JSON values: their distances from the origin, and the scale."""
         distances = np.linalg.norm(self.positions, axis=1)
@@ -100,7 +94,7 @@ class NearLamps:
             reference_distances=self.reference_distances[chosen],
         )
 
-    def choose_pixels(self, rows: NDArray[np.integer]) -> NearLamps:
+    def choose_pixels(self, rows: slice | NDArray[np.integer]) -> NearLamps:
         """Return the lamps with the surface in some of the pixels."""
         return self if self.points is None else replace(self, points=self.points[rows])
 
