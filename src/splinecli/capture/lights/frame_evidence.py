@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.robust_fit import absolute_weights, predict, shadow_weights
+from splinecli.capture.robust_fit import fit_robustly, shadow_weights
 from splinecli.normals import unit
 
 Array = NDArray[np.float64]
@@ -92,12 +92,8 @@ def rough_normals(
 
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
-    lit = weights = shadow_weights(values)
-    for _ in range(_FITS):
-        predicted = predict(values, weights, light_directions)
-        weights = lit * absolute_weights(values - predicted)
     normals = np.zeros((*mask.shape, 3))
-    normals[mask] = unit(predicted @ np.linalg.pinv(light_directions).T)
+    normals[mask] = unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
     smooth = np.stack([gaussian_filter(normals[..., axis], SMOOTHING) for axis in range(3)], axis=2)
     smooth = np.where(mask[..., None], unit(smooth), 0.0)
     return RoughNormals(smooth, mask, _outward(mask))

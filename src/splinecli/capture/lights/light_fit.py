@@ -1,4 +1,4 @@
-"""How well images fit their light directions, and whether another order of the lights would fit better.
+"""How well images fit light directions, also in other orders of the lights; light_order.py judges these.
 
 The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled normals times lights
 (Woodham 1980; Hayakawa, "Photometric stereo under a light source with arbitrary motion", JOSA A 1994). Its three
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.robust_fit import absolute_weights, fit_scaled_normals, predict
+from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals, lit_rows
 
 Array = NDArray[np.float64]
 
@@ -163,20 +163,17 @@ def fit_residual(values: Array, light_directions: Array) -> float:
 
     It is a share of the mean of the lit values.
     """
-    lit = weights = (values > LIT_SHARE).astype(np.float64)
-    for _ in range(_FITS):
-        residuals = values - predict(values, weights, light_directions)
-        weights = lit * absolute_weights(residuals)
+    lit = (values > LIT_SHARE).astype(np.float64)
+    normals, _ = fit_robustly(values, lit, light_directions, _FITS)
+    residuals = values - normals @ light_directions.T
     return float((np.abs(residuals) * lit).sum() / (values * lit).sum())
 
 
 def sample_pixels(observations: NDArray[np.floating]) -> Array:
     """Return lit pixels (p, F), each scaled to a largest observation of 1."""
-    n_lights, brightest = observations.shape[1], observations.max(axis=1)
+    n_lights = observations.shape[1]
     for share in DARK_SHARES:
-        usable = np.flatnonzero(brightest > share * np.quantile(brightest, 0.99))
-        number = min(len(usable), MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1))
-        chosen = usable[np.linspace(0, len(usable) - 1, number).astype(int)] if len(usable) else usable
+        chosen = lit_rows(observations, share, min(MAX_PIXELS, max(MAX_OBSERVATIONS // n_lights, 1)))
         values = observations[chosen].astype(np.float64)
         values = values / values.max(axis=1, keepdims=True)
         # Three unknowns need more than three lit observations to leave a residual.

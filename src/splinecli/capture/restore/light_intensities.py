@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.robust_fit import absolute_weights, predict, shadow_weights
+from splinecli.capture.robust_fit import fit_robustly, lit_rows, shadow_weights
 from splinecli.normals import unit
 
 Array = NDArray[np.float64]
@@ -63,16 +63,15 @@ def estimate_light_intensities(
         return None
     values, known = chosen
     equal = np.ones(len(light_directions))
-    equal_error = _error(values, _predict(values, known, equal, light_directions), known)
+    equal_error = _error(values, _fit(values, known, equal, light_directions) @ light_directions.T, known)
     if equal_error <= MIN_EQUAL_ERROR:
         return None
     intensities = _alternate(values, known, light_directions)
     if intensities is None:
         return None
-    predicted = _predict(values, known, intensities, light_directions)
-    normals = unit(predicted @ np.linalg.pinv(light_directions).T)
-    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
-    error = _error(values / intensities, predicted, known)
+    scaled_normals = _fit(values, known, intensities, light_directions)
+    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(unit(scaled_normals).T))[1]))
+    error = _error(values / intensities, scaled_normals @ light_directions.T, known)
     fits = error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR)
     return intensities if fits and spread >= MIN_NORMAL_SPREAD else None
 
@@ -84,11 +83,7 @@ def _choose_pixels(
     n_lights = observations.shape[1]
     if n_lights < MIN_LIGHTS:
         return None
-    brightest = observations.max(axis=1)
-    # Leaves out the dark background of a capture without a mask.
-    lit = np.flatnonzero(brightest > _DARK_SHARE * np.quantile(brightest, 0.99))
-    number = min(len(lit), _MAX_PIXELS, _MAX_OBSERVATIONS // n_lights)
-    chosen = lit[np.linspace(0, len(lit) - 1, number).astype(int)] if len(lit) else lit
+    chosen = lit_rows(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
     known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
     enough = known.sum(axis=1) >= MIN_LIGHTS
     known, values = known[enough], observations[chosen[enough]].astype(np.float64)
@@ -102,7 +97,7 @@ def _alternate(values: Array, known: NDArray[np.bool_], light_directions: Array)
     """Return the intensities (F,) at which fits and medians agree; None where a light reaches too few pixels."""
     intensities = np.ones(len(light_directions))
     for _ in range(_MAX_ROUNDS):
-        predicted = _predict(values, known, intensities, light_directions)
+        predicted = _fit(values, known, intensities, light_directions) @ light_directions.T
         counts = known & (predicted > _LIT_SHARE * predicted.max(axis=1, keepdims=True))
         if (counts.sum(axis=0) < _MIN_PIXELS_PER_LIGHT).any():
             return None
@@ -118,18 +113,13 @@ def _alternate(values: Array, known: NDArray[np.bool_], light_directions: Array)
     return intensities
 
 
-def _predict(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Array) -> Array:
-    """Return what matte pixels with these observations would show under lights of intensity 1."""
+def _fit(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Array) -> Array:
+    """Return the scaled normals (p, 3) of matte pixels with these observations, for lights of intensity 1."""
     observed = values / intensities
     largest = observed.max(axis=1, keepdims=True)
     observed = observed / largest
-    lit = shadow_weights(observed) * known
-    weights = lit
-    for _ in range(_FITS_PER_ROUND):
-        predicted = predict(observed, weights, lights)
-        weights = lit * absolute_weights(observed - predicted)
-    fitted: Array = predicted * largest
-    return fitted
+    normals, _ = fit_robustly(observed, shadow_weights(observed) * known, lights, _FITS_PER_ROUND)
+    return np.asarray(normals * largest)
 
 
 def _error(observed: Array, predicted: Array, known: NDArray[np.bool_]) -> float:

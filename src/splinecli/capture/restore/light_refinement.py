@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings
 from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
-from splinecli.capture.restore.robust_fit import absolute_weights, fit_scaled_normals
+from splinecli.capture.robust_fit import fit_robustly, lit_rows
 from splinecli.errors import UsageError
 from splinecli.normals import angle_between_deg, unit
 
@@ -178,17 +178,17 @@ def refine_lights(
     reference = _SHADOW_SHARE * np.quantile(values, _UNSHADED, axis=1, keepdims=True)
     lit = (values > reference).astype(np.float64)
     lights = light_directions
-    normals, weights = _fit(values, lights, lit, lit, _FIRST_FITS)
+    normals, weights = fit_robustly(values, lit, lights, _FIRST_FITS)
     before = _misfit(values, normals, lights, lit)
     precision = _prior(light_directions, error_deg)
     for _ in range(_MAX_ROUNDS):
-        normals, weights = _fit(values, lights, lit, weights, _FITS_PER_ROUND)
+        normals, weights = fit_robustly(values, lit, lights, _FITS_PER_ROUND, weights)
         moved = _move_lights(values, normals, weights, lights, light_directions, precision)
         moved = unit(moved) if intensities_known else moved
         change, lights = np.abs(moved - lights).max(), moved
         if change < _CONVERGED:
             break
-    normals, _ = _fit(values, lights, lit, weights, _FIRST_FITS)
+    normals, _ = fit_robustly(values, lit, lights, _FIRST_FITS, weights)
     after = _misfit(values, normals, lights, lit)
     ratio = after / max(before, 1e-12)
     intensities = np.linalg.norm(lights, axis=1)
@@ -201,21 +201,11 @@ def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too few."""
     if observations.shape[1] < MIN_LIGHTS:
         return None
-    brightest = observations.max(axis=1)
-    lit = np.flatnonzero(brightest > _DARK_SHARE * np.quantile(brightest, 0.99))
-    if len(lit) < _MIN_PIXELS:
+    chosen = lit_rows(observations, _DARK_SHARE, _MAX_PIXELS)
+    if len(chosen) < _MIN_PIXELS:
         return None
-    chosen = lit[np.linspace(0, len(lit) - 1, min(len(lit), _MAX_PIXELS)).astype(int)]
     values = observations[chosen].astype(np.float64).clip(min=0)
     return np.asarray(values / values.max(axis=1, keepdims=True))
-
-
-def _fit(values: Array, lights: Array, lit: Array, weights: Array, fits: int) -> tuple[Array, Array]:
-    """Return scaled normals (p, 3) of a robust matte fit, and the weights (p, F) for the next."""
-    for _ in range(fits):
-        normals = np.asarray(fit_scaled_normals(values, weights, lights), np.float64)
-        weights = lit * absolute_weights(values - normals @ lights.T)
-    return normals, weights
 
 
 def _misfit(values: Array, normals: Array, lights: Array, lit: Array) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.restore.robust_fit import absolute_weights, predict, shadow_weights
+from splinecli.capture.robust_fit import absolute_weights, predict, shadow_weights
 
 ITERATIONS = 16
 """Fits to a pixel. More change the restored values by less than the fit's own error."""

@@ -1,4 +1,4 @@
-"""Lambertian predictions by weighted least squares, from which saturation and light intensities are estimated."""
+"""Robust Lambertian fits by weighted least squares, from which lights and saturated values are judged and estimated."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def predict(observations: Array, weights: Array, light_directions: Array) -> Arr
 
     Args:
         observations, weights: (P, F).
-        light_directions: (F, 3) or (P, F, 3), unit.
+        light_directions: (F, 3) or (P, F, 3), of any length.
     """
     scaled_normals = fit_scaled_normals(observations, weights, light_directions)
     if light_directions.ndim == 2:
@@ -63,3 +63,35 @@ def absolute_weights(residuals: Array) -> Array:
     """Return weights with which the next weighted least squares approximates least absolute deviations."""
     weights: Array = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
     return weights
+
+
+def fit_robustly(
+    values: Array, lit: Array, lights: Array, fits: int, weights: Array | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next fit.
+
+    Args:
+        values: (P, F), each pixel scaled to a largest value of 1.
+        lit: (P, F), weights that do not depend on the fit, such as those of shadow_weights.
+        lights: (F, 3), of any length.
+        fits: number of weighted fits, at least 1.
+        weights: of the first fit; None for `lit`.
+    """
+    weights = lit if weights is None else weights
+    for _ in range(fits):
+        normals = fit_scaled_normals(values, weights, lights)
+        weights = lit * absolute_weights(values - normals @ lights.T)
+    return np.asarray(normals, np.float64), np.asarray(weights, np.float64)
+
+
+def lit_rows(observations: Array, dark_share: float, most: int) -> NDArray[np.intp]:
+    """Return at most `most` rows of observations (P, F), evenly spread over those that are not dark.
+
+    Args:
+        dark_share: pixels below this share of the brightest hundredth are dark, as the background of a capture without
+            a mask.
+    """
+    brightest = observations.max(axis=1)
+    lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))
+    chosen: NDArray[np.intp] = lit[np.linspace(0, len(lit) - 1, min(len(lit), most)).astype(int)]
+    return chosen
