@@ -59,7 +59,7 @@ def estimate_normals(
             that they differ.
         pixel_size: for near lamps, the width of a pixel on the object. light_directions are then the positions of the
             lamps in the same unit, from the middle of the image on the object's mean plane.
-        method: "spline-net", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
+        method: "spline-net", "spline-net-pixelwise", "cnn-ps", "ls", "ls-trimmed", "l1", "iw12", "st14" or "ia14".
         as_stored: use the values of the images alone. By default, saturated observations are restored and unknown
             light intensities are estimated.
         white_level: the value from which an observation is saturated, in the unit of the images. None finds it for

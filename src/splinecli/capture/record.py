@@ -45,8 +45,8 @@ class Capture:
             where no observation was restored.
         white_level: the stored value from which observations counted as saturated; None for floating-point images
             and for captures that are not read from images.
-        lamps: where the lamps are, if they are near; then light_directions are those at the middle of the object. None
-            for distant lights.
+        lamps: where the lamps are, if they are near; then light_directions are those at the origin, the middle of the
+            image on the object's mean plane. None for distant lights.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above the

@@ -95,7 +95,9 @@ class EvaluateOptions:
                 hint="Leave --trials out: each line of the draws is a trial",
             )
         if self.light_error_deg is not None:
-            check_light_error(self.light_error_deg, needs_option=not self.refine_lights)
+            if not self.refine_lights:
+                raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
+            check_light_error(self.light_error_deg)
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:

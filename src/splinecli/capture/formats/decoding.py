@@ -20,18 +20,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.header import stated_size
+from splinecli.capture.formats.header import JPEG, PNG, TIFF, stated_size
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
 from splinecli.capture.formats.raw import RAW_SUFFIXES, decode_raw, raw_size
 from splinecli.capture.formats.tiff import decode_tiff, tiff_size
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.memory import is_out_of_memory
-
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8\xff"
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_START_BYTES = 8  # as many as the longest of these
 
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -126,15 +121,15 @@ def _kind(path: Path) -> Literal["RAW", "TIFF", "PNG", "JPEG"]:
     check_file(path, "an image")
     try:
         with path.open("rb") as file:
-            start = file.read(_START_BYTES)
+            start = file.read(len(PNG))
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
     if start and path.suffix.lower() in RAW_SUFFIXES:
         return "RAW"
-    if start.startswith(_TIFF):
+    if start.startswith(TIFF):
         return "TIFF"
-    if start.startswith((_PNG, _JPEG)):
-        return "PNG" if start.startswith(_PNG) else "JPEG"
+    if start.startswith((PNG, JPEG)):
+        return "PNG" if start.startswith(PNG) else "JPEG"
     raise InputError("found neither PNG, TIFF nor JPEG" if start else "the file is empty", path=path)
 
 
@@ -193,7 +188,7 @@ _MOST_SMALL_CHUNKS, _USUAL_CHUNK = 10_000, 1024
 
 def _check_png(data: bytes, path: Path) -> None:
     """Raise InputError unless all chunks up to IEND are complete and have the right checksum."""
-    position, view = len(_PNG), memoryview(data)
+    position, view = len(PNG), memoryview(data)
     for _ in range(_MOST_SMALL_CHUNKS + len(data) // _USUAL_CHUNK):
         if position + 12 > len(data):
             break

@@ -8,8 +8,10 @@ from typing import Any, BinaryIO
 
 from splinecli.errors import InputError
 
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""The first bytes of the files. Those of a PNG are the longest."""
+
 _MOST_PARTS = 10_000
 """Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
 
@@ -18,7 +20,7 @@ _MAX_SAMPLE_VALUE, _WHITE_LEVEL = 281, 50717  # tags of TIFF and DNG
 
 def is_image(content: bytes) -> bool:
     """Return whether the content of a file begins as PNG, JPEG or TIFF."""
-    return content.startswith((_PNG, _JPEG, *_TIFF))
+    return content.startswith((PNG, JPEG, *TIFF))
 
 
 def stated_size(path: Path) -> tuple[tuple[int, int, int], int]:
@@ -29,7 +31,7 @@ def stated_size(path: Path) -> tuple[tuple[int, int, int], int]:
     """
     try:
         with path.open("rb") as file:
-            kind = "PNG" if file.read(len(_PNG)) == _PNG else "JPEG"
+            kind = "PNG" if file.read(len(PNG)) == PNG else "JPEG"
             size = _png_size(file) if kind == "PNG" else _jpeg_size(file)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
@@ -74,10 +76,10 @@ def is_display_encoded(path: Path) -> bool:
     """
     try:
         with path.open("rb") as file:
-            start = file.read(len(_PNG))
-            if start.startswith(_JPEG):
+            start = file.read(len(PNG))
+            if start.startswith(JPEG):
                 return True
-            for kind, content in _png_chunks(file) if start == _PNG else ():
+            for kind, content in _png_chunks(file) if start == PNG else ():
                 if kind == b"sRGB":
                     return True
                 if kind == b"gAMA":
@@ -99,12 +101,12 @@ def stated_white_level(path: Path) -> int | None:
     """
     try:
         with path.open("rb") as file:
-            start = file.read(len(_PNG))
-            if start == _PNG:
+            start = file.read(len(PNG))
+            if start == PNG:
                 return _stated_by_png(file)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    return _stated_by_tiff(path) if start.startswith(_TIFF) else None
+    return _stated_by_tiff(path) if start.startswith(TIFF) else None
 
 
 def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:

@@ -148,10 +148,8 @@ def check_distant(*, near: bool) -> None:
         )
 
 
-def check_light_error(error_deg: float, *, needs_option: bool = False) -> None:
-    """Raise UsageError for an error of directions that is out of range, or where `needs_option`."""
-    if needs_option:
-        raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
+def check_light_error(error_deg: float) -> None:
+    """Raise UsageError for an error of directions that is out of range."""
     if not 0 < error_deg <= LARGEST_LIGHT_ERROR_DEG:
         raise UsageError(
             f"the light error is {error_deg:g} degrees, expected above 0 and at most {LARGEST_LIGHT_ERROR_DEG:g}"
