@@ -75,9 +75,9 @@ def estimate_normals(
 
     Returns:
         A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the mask and zero
-        outside; confidence_map, (H, W) float32, the probability that a normal is off by at most 5 degrees, or None where
-        the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or others
-        that have an error head); and capture, with the observations and with warnings that you should read.
+        outside; confidence_map, (H, W) float32, the probability that a normal is off by at most 5 degrees, or None
+        where the method does not estimate it (only spline-net and spline-net-pixelwise do, with the shipped weights or
+        others that have an error head); and capture, with the observations and with warnings that you should read.
 
     Raises:
         splinecli.errors.UsageError: a shape, a type or an option does not fit.
