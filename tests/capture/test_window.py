@@ -79,7 +79,7 @@ def test_results_are_a_part_of_those_of_the_whole(
 
 def test_info_counts_what_is_read() -> None:
     crop, scale = WINDOWS[2]
-    part = describe_capture(InfoOptions(capture=MEDALLION, crop=crop, scale=scale))
+    part = describe_capture(InfoOptions(capture=MEDALLION, reading=InferOptions(crop=crop, scale=scale)))
     expected = open_capture(MEDALLION, window=parse_window(crop, scale)).read().n_pixels
     assert part["n_pixels"] == expected
     assert part["reads"] == "50 x 47 pixels from (31, 22), one of 4 rows and columns"

@@ -35,7 +35,7 @@ REPORT = {
 def test_options_are_frozen() -> None:
     options = InfoOptions(capture=Path("cat"))
     with pytest.raises(FrozenInstanceError):
-        options.white_level = 4095  # type: ignore[misc]
+        options.overwrite = True  # type: ignore[misc]
 
 
 def test_lines_of_a_report() -> None:

@@ -16,6 +16,7 @@ from splinecli.cli.options.values import (
     LightForm,
     NormalConvention,
     Precision,
+    as_text,
     parse_cluster,
     parse_indices,
     split_commas,
@@ -114,23 +115,23 @@ def infer(
             raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
         limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
         options = InferOptions(
-            lights=_text(lights),
-            intensities=_text(intensities),
+            lights=as_text(lights),
+            intensities=as_text(intensities),
             refine_lights=refine_lights,
             light_error_deg=light_error_deg,
-            light_positions=_text(light_positions),
+            light_positions=as_text(light_positions),
             light_distance=light_distance,
             pixel_size=pixel_size,
             object_width=object_width,
-            camera_matrix=_text(camera_matrix),
-            mask=_text(mask),
+            camera_matrix=as_text(camera_matrix),
+            mask=as_text(mask),
             auto_mask=auto_mask,
             crop=crop,
             scale=scale,
-            ground_truth=_text(ground_truth),
+            ground_truth=as_text(ground_truth),
             transfer=transfer,
-            ambient=_text(ambient),
-            flat_field=_text(flat_field),
+            ambient=as_text(ambient),
+            flat_field=as_text(flat_field),
             white_level=white_level,
             as_stored=as_stored,
             n_lights=n_lights,
@@ -199,10 +200,6 @@ def _show_all(
 
 def _indices(text: str) -> tuple[int, ...]:
     return tuple(parse_indices(text, "--light-indices"))
-
-
-def _text(path: Path | None) -> str | None:
-    return None if path is None else str(path)
 
 
 def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: bool) -> None:

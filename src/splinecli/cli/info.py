@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splinecli.capture.lights.lamp_files import LampOptions
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
-from splinecli.cli.options.values import LightForm
+from splinecli.cli.options.values import LightForm, as_text
 from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import InputError
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
 
 
@@ -49,31 +49,28 @@ def info(
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
 
     limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
-    options = InfoOptions(
-        capture=capture,
-        lights=lights,
-        intensities=intensities,
-        mask=mask,
+    reading = InferOptions(
+        lights=as_text(lights),
+        intensities=as_text(intensities),
+        light_positions=as_text(light_positions),
+        light_distance=light_distance,
+        pixel_size=pixel_size,
+        object_width=object_width,
+        camera_matrix=as_text(camera_matrix),
+        mask=as_text(mask),
         crop=crop,
         scale=scale,
-        ground_truth=ground_truth,
-        lamps=LampOptions(
-            positions=None if light_positions is None else str(light_positions),
-            distance=light_distance,
-            pixel_size=pixel_size,
-            object_width=object_width,
-            camera_matrix=None if camera_matrix is None else str(camera_matrix),
-        ),
+        ground_truth=as_text(ground_truth),
         transfer=transfer,
-        ambient=ambient,
-        flat_field=flat_field,
+        ambient=as_text(ambient),
+        flat_field=as_text(flat_field),
         white_level=white_level,
-        plot=plot,
-        overwrite=overwrite,
         light_frame=light_frame,
         lights_format=lights_format.value,
-        check_lights=check_lights,
         strict=strict,
+    )
+    options = InfoOptions(
+        capture=capture, reading=reading, plot=plot, overwrite=overwrite, check_lights=check_lights
     )
     messages = Messages(quiet=quiet)
     report = describe_capture(options, messages)

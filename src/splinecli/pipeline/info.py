@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions
 from splinecli.errors import UsageError
 from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
-from splinecli.pipeline.infer_options import LightForm, radiometric_calibration
+from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.transfer import AUTOMATIC
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
@@ -44,60 +42,18 @@ class InfoOptions:
 
     Args:
         capture: the folder of the capture.
-        lights, intensities, mask, ground_truth: files that replace those of the capture. `intensities` may also be
-            "equal".
-        lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
-        light_frame: the frame of the light file, such as "x-left,y-down".
-        lamps: near lamps; see LampOptions.
-        crop, scale: the part of the images that is read; see InferOptions.
-        transfer: the curve of the images: auto, linear, srgb or gamma:G.
-        ambient: an image without any of the lights.
-        flat_field: a folder of images of an evenly white surface.
-        white_level: the stored value from which a pixel counts as saturated. None finds it.
+        reading: how `infer` would read it. What concerns the method and the results does not count. With its `strict`,
+            what could not be checked is a warning, too.
         plot: a PNG file that a plot of the lights is written to.
         overwrite: replace an earlier plot.
         check_lights: also list the readings of the light file that were compared.
-        strict: also warn of what could not be checked.
     """
 
     capture: Path
-    lights: Path | None = None
-    intensities: Path | None = None
-    mask: Path | None = None
-    ground_truth: Path | None = None
-    light_frame: str | None = None
-    lights_format: LightForm = "xyz"
-    lamps: LampOptions = NO_LAMP_OPTIONS
-    crop: str | None = None
-    scale: str | None = None
-    transfer: str = AUTOMATIC
-    ambient: Path | None = None
-    flat_field: Path | None = None
-    white_level: float | None = None
+    reading: InferOptions = field(default_factory=InferOptions)
     plot: Path | None = None
     overwrite: bool = False
     check_lights: bool = False
-    strict: bool = False
-
-    def open(self) -> CaptureSource:
-        """Open the capture under these options. Raises InputError, UsageError."""
-        from splinecli.capture import open_capture
-        from splinecli.capture.lights.light_frames import parse_light_frame
-        from splinecli.capture.window import parse_window
-
-        return open_capture(
-            self.capture,
-            lights=self.lights,
-            intensities=self.intensities,
-            mask=self.mask,
-            ground_truth=self.ground_truth,
-            radiometry=radiometric_calibration(self.transfer, self.ambient, self.flat_field),
-            white_level=self.white_level,
-            light_frame=parse_light_frame(self.light_frame),
-            lights_format=self.lights_format,
-            lamps=self.lamps,
-            window=parse_window(self.crop, self.scale),
-        )
 
 
 def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[str, Any]:
@@ -115,7 +71,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
     from splinecli.files import write_bytes
     from splinecli.pipeline.input_checks import StatedLights, check_sample
 
-    source = options.open()
+    source = options.reading.open(options.capture)
     if options.plot is not None:
         _check_plot(options.plot, source, overwrite=options.overwrite)
     with observer.progress("reading", len(source.files.images)) as advance:
@@ -127,7 +83,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
     check, warnings = None, summary.warnings()
     if summary.sample is not None and summary.closeup is not None:
         lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
-        check, found = check_sample(lights, summary.sample, summary.closeup, strict=options.strict)
+        check, found = check_sample(lights, summary.sample, summary.closeup, strict=options.reading.strict)
         warnings += found
     for warning in warnings:
         observer.warn(str(warning))
