@@ -204,7 +204,16 @@ class InferOptions:
 
     def radiometric_calibration(self) -> RadiometricCalibration:
         """Return how the images' values become linear light. Raises InputError."""
-        return radiometric_calibration(self.transfer, self.ambient, self.flat_field)
+        from splinecli.capture import RadiometricCalibration
+        from splinecli.capture.layouts.image_lists import check_not_empty, list_images
+
+        flats: tuple[Path, ...] = ()
+        if self.flat_field is not None:
+            folder = Path(self.flat_field)
+            flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
+            check_not_empty(flats, folder)
+        dark = None if self.ambient is None else Path(self.ambient)
+        return RadiometricCalibration(parse_transfer(self.transfer), dark, flats, self.transfer == AUTOMATIC)
 
     def open(self, folder: Path) -> CaptureSource:
         """Open the capture in the folder under these options. Raises InputError."""
@@ -225,22 +234,6 @@ class InferOptions:
             lamps=self.lamps,
             window=parse_window(self.crop, self.scale),
         )
-
-
-def radiometric_calibration(
-    transfer: str, ambient: str | Path | None, flat_field: str | Path | None
-) -> RadiometricCalibration:
-    """Return what --transfer, --ambient and --flat-field ask for. Raises UsageError, InputError."""
-    from splinecli.capture import RadiometricCalibration
-    from splinecli.capture.layouts.image_lists import check_not_empty, list_images
-
-    flats: tuple[Path, ...] = ()
-    if flat_field is not None:
-        folder = Path(flat_field)
-        flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
-        check_not_empty(flats, folder)
-    dark = None if ambient is None else Path(ambient)
-    return RadiometricCalibration(parse_transfer(transfer), dark, flats, transfer == AUTOMATIC)
 
 
 def _check_one_of(what: str, value: str, allowed: Mapping[str, Any] | tuple[str, ...]) -> None:
