@@ -356,9 +356,10 @@ def test_rotations_change_little_and_batches_nothing(capture, run):
     inside = one.any(axis=-1)
     difference = angle_between_deg(one[inside], five[inside])
     assert 0 < difference.mean() < 3
-    # Rounding may move a light into the next cell of a pixel's map. On this symmetric sphere, lights lie on borders.
-    rounding = np.sort(angle_between_deg(one[inside], small[inside]))
-    assert rounding[:-5].max() < 1e-3
+    # Rounding may move a light into the next cell of a pixel's map: on this symmetric sphere, lights lie on borders.
+    # The refinement net passes a part of such a change on to the neighbours.
+    rounding = angle_between_deg(one[inside], small[inside])
+    assert np.quantile(rounding, 0.9) < 2e-3
     assert rounding.max() < 0.5
 
 
