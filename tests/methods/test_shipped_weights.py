@@ -108,7 +108,7 @@ def test_confidence_on_path_traced_captures(shared_data):
     assert share_found(expected, error_deg) > 1 / 3
     # These captures have no noise and no errors of calibration. The network, which sees one pixel at a time, expects
     # those of training: 57 % within the limit, where 66 % are.
-    assert (error_deg <= CONFIDENT_DEG).mean() == pytest.approx(expected.mean(), abs=0.1)
+    assert -0.02 <= (error_deg <= CONFIDENT_DEG).mean() - expected.mean() <= 0.1
 
 
 @pytest.mark.parametrize("name", sorted(manifest()))
