@@ -94,10 +94,7 @@ class EvaluateOptions:
                 "--draws and --trials contradict each other",
                 hint="Leave --trials out: each line of the draws is a trial",
             )
-        if self.light_error_deg is not None:
-            if not self.refine_lights:
-                raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
-            check_light_error(self.light_error_deg)
+        check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:

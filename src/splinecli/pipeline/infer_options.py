@@ -121,10 +121,7 @@ class InferOptions:
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         _ = self.lamps, parse_window(self.crop, self.scale)
-        if self.light_error_deg is not None:
-            if not self.refine_lights:
-                raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
-            check_light_error(self.light_error_deg)
+        check_light_error(self.light_error_deg, refines=self.refine_lights)
         check_method(self.method)
         check_surface_options(self.decimate, self.pixel_size if self.surface else None)
         for option, given in (

@@ -89,7 +89,7 @@ def refine_capture(
     """
     check_distant(near=capture.lamps is not None)
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
-    check_light_error(error_deg)
+    check_light_error(error_deg, refines=True)
     found = refine_lights(
         capture.observations,
         capture.light_directions,
@@ -148,8 +148,12 @@ def check_distant(*, near: bool) -> None:
         )
 
 
-def check_light_error(error_deg: float) -> None:
-    """Raise UsageError for an error of directions that is out of range."""
+def check_light_error(error_deg: float | None, *, refines: bool) -> None:
+    """Raise UsageError for a usual error of directions that is out of range, or given where none are refined."""
+    if error_deg is None:
+        return
+    if not refines:
+        raise UsageError("--light-error-deg needs --refine-lights", hint="Add it, or leave both out")
     if not 0 < error_deg <= LARGEST_LIGHT_ERROR_DEG:
         raise UsageError(
             f"the light error is {error_deg:g} degrees, expected above 0 and at most {LARGEST_LIGHT_ERROR_DEG:g}"
