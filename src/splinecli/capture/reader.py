@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from splinecli.capture.lights.named_lights import NamedLights, read_lights
 from splinecli.capture.linearise import AUTOMATIC, RadiometricCalibration
 from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
+from splinecli.capture.restore.white_level import check_white_level
 from splinecli.capture.source import CaptureSource, Progress
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError, UsageError
@@ -67,8 +67,7 @@ def open_capture(
             inside the images.
         UsageError: the white level is not a number above 0, or the lamps are near and not the whole images are read.
     """
-    if white_level is not None and not 0 < white_level < math.inf:
-        raise UsageError(f"the white level is {white_level:g}, expected a number above 0")
+    check_white_level(white_level)
     equal = intensities is not None and str(intensities) == EQUAL
     named = (lights, None if equal else intensities, mask, ground_truth)
     overrides = Overrides(*(None if file is None else Path(file) for file in named))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 
 from splinecli.capture import find_captures, open_capture
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
+from splinecli.capture.restore.white_level import check_white_level
 from splinecli.devices import count_available_cores
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.capture_figures import (
@@ -82,8 +82,7 @@ class EvaluateOptions:
     cluster: ClusterOptions | None = None
 
     def __post_init__(self) -> None:
-        if self.white_level is not None and not 0 < self.white_level < math.inf:
-            raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
+        check_white_level(self.white_level)
         if self.draws is not None and self.n_lights:
             raise UsageError(
                 "--draws and --n-lights contradict each other",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -113,6 +112,7 @@ class InferOptions:
         from splinecli.capture.lights.light_frames import parse_light_frame
         from splinecli.capture.record import check_light_indices
         from splinecli.capture.restore.light_refinement import check_light_error
+        from splinecli.capture.restore.white_level import check_white_level
         from splinecli.capture.window import parse_window
         from splinecli.results.files import MAPS, NORMALS
 
@@ -136,8 +136,7 @@ class InferOptions:
             check_light_indices(self.light_indices, max(self.light_indices, default=0) + 1)
         parse_transfer(self.transfer)
         parse_light_frame(self.light_frame)
-        if self.white_level is not None and not 0 < self.white_level < math.inf:
-            raise UsageError(f"the white level is {self.white_level:g}, expected a number above 0")
+        check_white_level(self.white_level)
         _check_one_of("precision", self.precision, get_args(Precision))
         _check_one_of("light format", self.lights_format, get_args(LightForm))
         _check_one_of("device", self.device, get_args(Device))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.restore.saturation import find_saturated, in_any_channel
-from splinecli.errors import InputError
+from splinecli.errors import InputError, UsageError
 
 Origin = Literal["given", "file", "images", "full scale"]
 
@@ -42,6 +42,12 @@ SPIKE = 5
 
 _BLOCK, _NEAR = 1 << 20, 1 << 10
 _FULL_SCALE_16_BIT = 65_535
+
+
+def check_white_level(value: float | None) -> None:
+    """Raise UsageError for a white level that is no number above 0."""
+    if value is not None and not 0 < value < math.inf:
+        raise UsageError(f"the white level is {value:g}, expected a number above 0")
 
 
 @dataclass(frozen=True)
