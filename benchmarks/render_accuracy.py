@@ -38,17 +38,25 @@ def lights() -> NDArray[np.float32]:
 
 
 def comparable(scene: Scene) -> Scene:
-    """The scene under the compared lights, its materials within what Mitsuba can be told."""
+    """The scene under the compared lights, its materials within what Mitsuba has."""
     materials = {}
     for name, material in scene.materials.items():
         assert isinstance(material, PrincipledMaterial)
+        zero = torch.zeros_like(material.base)
         highest = max(float(material.specular.max()), 1e-6)
         rounded = ((material.specular / highest * LEVELS).floor() + 0.5).clamp(max=LEVELS - 0.5)
         materials[name] = dataclasses.replace(
             material,
             specular=rounded * highest / LEVELS,
-            # Ours is never smoother than this, whatever it is told.
+            # Ours is never smoother than this.
             roughness=material.roughness.clamp(min=0.1),
+            # Mitsuba's coat has another scale, and it lacks the parameters that are not Burley's.
+            clearcoat=zero,
+            interface_loss=zero,
+            minnaert=zero + 1,
+            tail_exponent=zero + 2,
+            second_share=zero,
+            retro=zero,
         )
     return dataclasses.replace(scene, lights=lights(), materials=materials)
 

@@ -22,7 +22,7 @@ from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.principled import CLASSES
 from splinecli.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
 
-RENDERER = 2
+RENDERER = 3
 """Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both."""
 
 # Meshes have random numbers of their own, so that a mesh changes no other scene.

@@ -6,14 +6,13 @@ Rendered scenes have few bends of a pixel's size. These pieces have, but no cast
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_class, draw_material
+from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.random_numbers import draw_number
 
 _SMOOTH_SHARE = 1 / 3
@@ -29,8 +28,8 @@ def draw_engraved(
     a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has one kind of
     detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or bent; facets of 3 to 20 pixels; or a
     random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third of it
-    for the texture. A third of the pieces are smooth. The material is that of draw_class, or as often that of
-    draw_material, with 1 to 300 patches; in half of the pieces these differ in their base alone.
+    for the texture. A third of the pieces are smooth. The material is that of draw_material, with 1 to 300 patches; in
+    half of the pieces these differ in their base alone.
 
     Args:
         lights: (F, 3), unit.
@@ -44,22 +43,13 @@ def draw_engraved(
         normals = normals - normals[:, 2:] * torch.nn.functional.pad(detail, (0, 1))
         normals = torch.nn.functional.normalize(normals, dim=1)
     patches = int(300 ** uniform())
-    material = _draw_patches(patches, generator).take(_cells(patches, size, generator)[mask])
+    material = draw_material(patches, generator)
+    if uniform() < 0.5:
+        material = with_one_gloss(material)
+    material = material.take(_cells(patches, size, generator)[mask])
     normals = normals[mask]
     cosines = (normals @ lights.T).clamp(min=0)
     return normals, material.shade(cosines, normals[:, 2:], lights[:, 2]), mask.view(size, size)
-
-
-def _draw_patches(count: int, generator: torch.Generator) -> PrincipledMaterial:
-    """Draw the materials of `count` patches: of rendered scenes, or of generated pixels, which have more kinds."""
-    uniform = partial(draw_number, generator)
-    one_gloss = uniform() < 0.5
-    if uniform() < 0.5:
-        return draw_class(CLASSES[int(len(CLASSES) * uniform())], count, generator, one_gloss=one_gloss)
-    material = draw_material(count, generator)
-    if not one_gloss:
-        return material
-    return replace(material.take(torch.zeros(count, dtype=torch.long)), base=material.base)
 
 
 def _draw_base(size: int, round_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -10,15 +10,15 @@ and the lobe is never narrower than at roughness 0.1, which float32 still resolv
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from splinecli.synthesis.random_numbers import draw_uniform
 
-CLASSES = ("diffuse", "specular", "metallic")
-"""Classes of materials of the rendered scenes; see draw_class."""
+CLASSES = {"diffuse": (0.0, 0.30), "specular": (0.30, 0.58), "metallic": (0.58, 1.0)}
+"""Classes of materials of the rendered scenes, and their part of the random number that chooses the kind."""
 
 _RETRO_EXPONENT = 20
 """The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart."""
@@ -101,7 +101,9 @@ class PrincipledMaterial:
         return self.base + 0.08 * self.specular * (1 - self.metallic)
 
 
-def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial:
+def draw_material(
+    pixels: int, generator: torch.Generator, kinds: tuple[float, float] = (0.0, 1.0)
+) -> PrincipledMaterial:
     """Draw random materials: 30 % matte, 28 % specular, 28 % metallic, 14 % half metallic.
 
     base: U(0.05, 1); 10^U(-1.7, 0) for half of what is no metal, because many real surfaces are dark.
@@ -117,12 +119,15 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
 
     MERL's measured materials fall faster than by the cosine: as (n.l)^1.14 in the median of those that are no metal,
     nine tenths of them between 0.86 and 1.47. The ranges of base and minnaert were chosen to come near that.
+
+    Args:
+        kinds: the part of these kinds, in their order, from which materials are drawn.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
         return draw_uniform(generator, pixels, 1, low=low, high=high)
 
-    kind, split = uniform(), uniform()
+    kind, split = uniform(*kinds), uniform()
     metal = (kind >= 0.58) & (kind < 0.86)
     blend = kind >= 0.86
     shiny = (kind >= 0.30) & (kind < 0.58)
@@ -149,38 +154,19 @@ def draw_material(pixels: int, generator: torch.Generator) -> PrincipledMaterial
 def draw_class(
     name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False
 ) -> PrincipledMaterial:
-    """Draw materials of the class "diffuse", "specular" or "metallic" (CNN-PS, section 4.1).
-
-    base: U(0, 1). metallic: 1 for metals, else 0. specular: U(0, 4) for the specular class, else U(0, 1). roughness:
-    U(0.3, 0.7) for metals, else U(0, 1). sheen: U(0, 1) for a fifth of the patches that are not metals.
+    """Draw materials of one of CLASSES; see draw_material.
 
     Args:
-        one_gloss: all patches have the specular reflection, the roughness and the sheen of the first.
+        one_gloss: all patches have the material of the first but for their base.
     """
+    material = draw_material(patches, generator, CLASSES[name])
+    return with_one_gloss(material) if one_gloss else material
 
-    def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
-        return draw_uniform(generator, patches, 1, low=low, high=high)
 
-    def gloss(values: Tensor) -> Tensor:
-        return values[:1].expand(patches, 1) if one_gloss else values
-
-    metal = name == "metallic"
-    zero = torch.zeros(patches, 1)
-    return PrincipledMaterial(
-        base=uniform(),
-        metallic=torch.ones_like(zero) if metal else zero,
-        specular=gloss(uniform(0.0, 4.0 if name == "specular" else 1.0)),
-        roughness=gloss(uniform(0.3, 0.7) if metal else uniform()),
-        sheen=gloss(zero if metal else uniform() * (uniform() < 0.2)),
-        clearcoat=zero,
-        clearcoat_gloss=zero,
-        interface_loss=zero,
-        minnaert=zero + 1,
-        tail_exponent=zero + 2,
-        second_share=zero,
-        second_roughness=zero + 1,
-        retro=zero,
-    )
+def with_one_gloss(material: PrincipledMaterial) -> PrincipledMaterial:
+    """Give all rows the material of the first but for their base, as of a painted or printed object."""
+    first = material.take(torch.zeros(len(material.base), dtype=torch.long, device=material.base.device))
+    return replace(first, base=material.base)
 
 
 def _facets(
