@@ -75,7 +75,7 @@ def mitsuba_shapes(scene: Scene, class_name: str) -> dict[str, Any]:
         f0 = 0.08 * float(level)
         textures = {
             name: {"type": "mesh_attribute", "name": f"face_{name}"}
-            for name in ("base", "roughness", "sheen")
+            for name in ("base", "metallic", "roughness", "sheen")
         }
         bsdf = mi.load_dict(
             {
@@ -83,7 +83,7 @@ def mitsuba_shapes(scene: Scene, class_name: str) -> dict[str, Any]:
                 "base_color": textures["base"],
                 "roughness": textures["roughness"],
                 "sheen": textures["sheen"],
-                "metallic": float(material.metallic.max()),
+                "metallic": textures["metallic"],
                 "eta": (1 + f0**0.5) / (1 - f0**0.5),
             }
         )
