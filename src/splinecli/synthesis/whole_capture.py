@@ -34,7 +34,7 @@ def photograph_scene(
     """Photograph a scene: return observations (P, F), divided by the intensities, and calibrated directions (F, 3).
 
     The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
-    places the 0.999 quantile at 10^U(-1.1, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 %
+    places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 %
     of the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also
     have a grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where
     images are shifted by a part of a pixel or light arrives from neighbours.
@@ -53,7 +53,7 @@ def photograph_scene(
     saturated = uniform() < config.saturated_share
     share = uniform(_BRIGHT_SHARE, _MOST_SATURATED) if saturated else _BRIGHT_SHARE
     bright = arriving.flatten().sort().values[-1 - math.floor(share * arriving.numel())].clamp(min=1e-6)
-    exposed = (arriving * ((1.0 if saturated else 10 ** uniform(-1.1, 0.0)) / bright)).clamp(max=1)
+    exposed = (arriving * ((1.0 if saturated else 10 ** uniform(-0.7, 0.0)) / bright)).clamp(max=1)
     clipped = exposed >= 1
     if config.sensor_noise:
         grain = 10 ** uniform(-2.5, -1.2) * (uniform() < _GRAINY_SHARE)
