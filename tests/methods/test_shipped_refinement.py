@@ -61,12 +61,12 @@ def mean_error_deg(estimate: NormalEstimate) -> float:
     return estimate.errors.mean
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.03])
-def test_a_noisy_plate_stays_as_flat_as_it_is(noise: float) -> None:
+@pytest.mark.parametrize(("noise", "most_tilted_deg"), [(0.01, 0.3), (0.03, 0.75)])
+def test_a_noisy_plate_stays_as_flat_as_it_is(noise: float, most_tilted_deg: float) -> None:
     refined, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
     assert mean_error_deg(refined) < 1.05 * mean_error_deg(pixelwise)
     mean = unit(refined.normal_map.mean(axis=(0, 1)))
-    assert float(angle_between_deg(mean, PLATE[0, 0])) < 0.6
+    assert float(angle_between_deg(mean, PLATE[0, 0])) < most_tilted_deg
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.5])
