@@ -1,4 +1,4 @@
-"""Scenes: reproducible one by one, and drawn from the ranges of CyclesPS."""
+"""Scenes: reproducible one by one, and drawn from the stated ranges."""
 
 from __future__ import annotations
 
@@ -91,7 +91,11 @@ def test_materials_of_the_classes(name: str, metallic: float, specular: float) -
     else:
         assert (material.metallic == metallic).all()
     assert 0.95 * specular < material.specular.max() <= specular
-    # Dark bases are frequent among what is no metal, with a median of 10^-0.85 in one half and 0.525 in the other.
+    assert (material.specular > 1).float().mean().item() == pytest.approx(0.5 * (specular > 1), abs=0.04)
+    roughest = 0.9 if name == "metallic" else 1.0
+    assert material.roughness.min() >= 0.05
+    assert 0.97 * roughest < material.roughness.max() <= roughest
+    # Half of what is no metal has bases of 10^U(-1.7, 0), with a median of 0.14; all else U(0.05, 1).
     median = {"metallic": 0.47}.get(name, 0.32)
     assert material.base.median().item() == pytest.approx(median, abs=0.03)
 

@@ -35,7 +35,8 @@ TILE = 640
 Larger tiles take less time, because their margins are smaller in all, and more memory.
 """
 
-_BLOCK, _BLOCK_VALUES = 1 << 16, 1 << 21  # most pixels, and observations, whose features are computed at once
+_BLOCK = 1 << 16  # pixels whose features are computed at once, at most
+_BLOCK_VALUES = 1 << 21  # and their observations, at most: under near lamps each has its own light direction
 
 LightOf = Callable[[NDArray[np.integer]], LampLight]
 """From rows of a capture's pixels to their observations and light directions."""

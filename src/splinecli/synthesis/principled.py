@@ -17,8 +17,11 @@ from torch import Tensor
 
 from splinecli.synthesis.random_numbers import draw_uniform
 
-CLASSES = {"diffuse": (0.0, 0.30), "specular": (0.30, 0.58), "metallic": (0.58, 1.0)}
-"""Classes of materials of the rendered scenes, and their part of the random number that chooses the kind."""
+_SHINY, _METAL, _HALF_METAL = 0.30, 0.58, 0.86
+"""A uniform number selects the kind of a material: matte below the first, then as named."""
+
+CLASSES = {"diffuse": (0.0, _SHINY), "specular": (_SHINY, _METAL), "metallic": (_METAL, 1.0)}
+"""Classes of materials of the rendered scenes, and the range of the number that selects the kind."""
 
 _RETRO_EXPONENT = 20
 """The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are 21 degrees apart."""
@@ -121,16 +124,16 @@ def draw_material(
     nine tenths of them between 0.86 and 1.47. The ranges of base and minnaert were chosen to come near that.
 
     Args:
-        kinds: the part of these kinds, in their order, from which materials are drawn.
+        kinds: the range of the uniform number that selects the kind.
     """
 
     def uniform(low: float = 0.0, high: float = 1.0) -> Tensor:
         return draw_uniform(generator, pixels, 1, low=low, high=high)
 
     kind, split = uniform(*kinds), uniform()
-    metal = (kind >= 0.58) & (kind < 0.86)
-    blend = kind >= 0.86
-    shiny = (kind >= 0.30) & (kind < 0.58)
+    metal = (kind >= _METAL) & (kind < _HALF_METAL)
+    blend = kind >= _HALF_METAL
+    shiny = (kind >= _SHINY) & (kind < _METAL)
     zero, one = torch.zeros_like(kind), torch.ones_like(kind)
     coat, dark = uniform(), (uniform() < 0.5) & ~metal
     has_second = uniform() < torch.where(metal | blend, 0.4, 0.15)
@@ -164,7 +167,10 @@ def draw_class(
 
 
 def with_one_gloss(material: PrincipledMaterial) -> PrincipledMaterial:
-    """Give all rows the material of the first but for their base, as of a painted or printed object."""
+    """Give all rows the material of the first but for their base, as of a painted or printed object.
+
+    A metal may then have the dark base of another kind, as where it has tarnished.
+    """
     first = material.take(torch.zeros(len(material.base), dtype=torch.long, device=material.base.device))
     return replace(first, base=material.base)
 
