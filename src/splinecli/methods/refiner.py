@@ -35,8 +35,7 @@ TILE = 640
 Larger tiles take less time, because their margins are smaller in all, and more memory.
 """
 
-_BLOCK = 1 << 16  # pixels whose features are computed at once, at most
-_BLOCK_VALUES = 1 << 21  # and their observations, at most: under near lamps each has its own light direction
+_BLOCK = 1 << 14  # pixels whose features are computed at once; under near lamps, each has its own lights
 
 LightOf = Callable[[NDArray[np.integer]], LampLight]
 """From rows of a capture's pixels to their observations and light directions."""
@@ -130,7 +129,6 @@ class Refiner:
         """
         reference = brightness(torch.from_numpy(observations))
         lit = observations.max(axis=1) > 0
-        block = max(1, min(_BLOCK, _BLOCK_VALUES // observations.shape[1]))
         mask = _around_object(mask)
         above = _Band(slice(0, 0), normals, errors)
         for pixels, tiles in self._rows_of_tiles(mask):
@@ -138,7 +136,7 @@ class Refiner:
             band = _Band(pixels, normals, errors)
             for tile in tiles:
                 own = tile.rows[tile.inner][tile.mask[tile.inner]]
-                refined, refined_errors = self._refine(tile, light_of, normals, errors, reference, block)
+                refined, refined_errors = self._refine(tile, light_of, normals, errors, reference)
                 # Nothing is known of a pixel that is dark under every light.
                 known = lit[own]
                 band.put(own[known], refined[known], refined_errors[known])
@@ -171,15 +169,9 @@ class Refiner:
                 yield _Tile(seen, rows[:, outer], inner)
 
     def _refine(
-        self,
-        tile: _Tile,
-        light_of: LightOf,
-        normals: Floats,
-        errors: Floats,
-        reference: float,
-        block: int,
+        self, tile: _Tile, light_of: LightOf, normals: Floats, errors: Floats, reference: float
     ) -> tuple[Floats, Floats]:
-        """Return the refined normals and errors of a tile without its margin, from `block` pixels at a time."""
+        """Return the refined normals and errors of a tile without its margin."""
         device = self.network.enter.weight.device
 
         def tensor(values: NDArray[np.floating]) -> torch.Tensor:
@@ -187,14 +179,14 @@ class Refiner:
 
         features = torch.zeros(*tile.mask.shape, CHANNELS, device=device)
         rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(device)
-        for start in range(0, len(rows), block):
-            some = rows[start : start + block]
-            light = light_of(some)
-            features.view(-1, CHANNELS)[places[start : start + block]] = refine_features(
+        for start in range(0, len(rows), _BLOCK):
+            block = rows[start : start + _BLOCK]
+            light = light_of(block)
+            features.view(-1, CHANNELS)[places[start : start + _BLOCK]] = refine_features(
                 tensor(light.observations),
                 tensor(light.directions),
-                tensor(light.in_frame_of_pixels(normals[some])),
-                tensor(errors[some]),
+                tensor(light.in_frame_of_pixels(normals[block])),
+                tensor(errors[block]),
                 reference,
             )
         mask = torch.from_numpy(tile.mask).to(device, torch.float32)
@@ -202,8 +194,8 @@ class Refiner:
         inside = tile.mask[tile.inner]
         refined, refined_errors = (values.permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
         own = tile.rows[tile.inner][inside]
-        for start in range(0, len(own), block):
-            part = slice(start, start + block)
+        for start in range(0, len(own), _BLOCK):
+            part = slice(start, start + _BLOCK)
             light = light_of(own[part])
             if light.turns is None:
                 break
