@@ -1,4 +1,6 @@
-"""From a Capture and an Estimator to a NormalEstimate, refined where the estimator has a refiner.
+"""From a Capture and an Estimator to a NormalEstimate.
+
+Where the estimator has a refiner, light from other parts of the object is removed first, and the map is refined.
 
 The pixels are processed in tiles. The working memory of a method is that of one tile; only the results grow with the
 capture.
@@ -7,7 +9,7 @@ capture.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -20,9 +22,12 @@ from splinecli.errors import SplinecliError
 from splinecli.memory import return_freed_memory
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
+from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
 from splinecli.methods.lamp_light import LampLight
 from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
+
+Rows = NDArray[np.integer]
 
 _UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
 
@@ -60,7 +65,7 @@ def estimate_normals(
     *,
     tile_pixels: int | None = None,
     progress: Progress | None = None,
-    refining: Callable[[], AbstractContextManager[Progress]] | None = None,
+    stage: Callable[[str], AbstractContextManager[Progress]] | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
 
@@ -70,7 +75,8 @@ def estimate_normals(
         tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
         progress: called with the number of pixels just finished: after each batch of the estimator, and up to 128 times
             a batch of a network, not only after each tile.
-        refining: called where the refinement begins; its function is called with the number of pixels just refined.
+        stage: called with the name of each later stage where it begins; its function is called with the number of
+            pixels just finished.
 
     Raises:
         SplinecliError: the estimator gave normals that are not unit vectors.
@@ -81,9 +87,10 @@ def estimate_normals(
         tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
     normals = np.empty((capture.n_pixels, 3), np.float32)
     errors = np.empty((capture.n_pixels, 2), np.float32) if tells_confidence(estimator) else None
-    for start in range(0, capture.n_pixels, tile_pixels):
-        rows = slice(start, start + tile_pixels)
-        light = _light_on(capture, rows)
+    light_of = partial(_light_on, capture)
+
+    def estimate(rows: Rows, progress: Progress | None) -> None:
+        light = light_of(rows)
         if errors is not None and tells_confidence(estimator):
             found, errors[rows] = estimator.estimate_with_error(
                 light.observations, light.directions, progress=progress
@@ -91,10 +98,22 @@ def estimate_normals(
         else:
             found = estimator.estimate(light.observations, light.directions, progress=progress)
         normals[rows] = light.in_frame_of_capture(found)
+
+    for rows in _tiles(capture.n_pixels, tile_pixels):
+        estimate(rows, progress)
     refiner = refiner_of(estimator)
     if refiner is not None and errors is not None:
-        light_of = partial(_light_on, capture)
-        with nullcontext() if refining is None else refining() as advance:
+        indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
+        if indirect is not None:
+            light_of = partial(_light_on, capture, without=indirect)
+            with nullcontext() if stage is None else stage("removing indirect light") as advance:
+                for rows in _tiles(capture.n_pixels, tile_pixels):
+                    changed = rows[indirect.counts_at(capture.observations[rows], rows)]
+                    if len(changed):
+                        estimate(changed, None)
+                    if advance is not None:
+                        advance(len(rows))
+        with nullcontext() if stage is None else stage("refining") as advance:
             refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
     return_freed_memory()
     seconds = time.perf_counter() - started
@@ -115,9 +134,16 @@ def estimate_normals(
     )
 
 
-def _light_on(capture: Capture, rows: slice | NDArray[np.integer]) -> LampLight:
+def _tiles(n_pixels: int, size: int) -> Iterator[Rows]:
+    for start in range(0, n_pixels, size):
+        yield np.arange(start, min(start + size, n_pixels))
+
+
+def _light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:
     """Return the observations and the light directions of some of a capture's pixels."""
     observations = capture.observations[rows]
+    if without is not None:
+        observations = without.remove(observations, rows)
     if capture.lamps is None:
         return LampLight(observations, capture.light_directions)
     return LampLight.of(observations, capture.lamps.choose_pixels(rows))

@@ -172,17 +172,14 @@ def _check_memory(capture: Capture, folder: Path, options: InferOptions) -> None
 def _estimate(capture: Capture, estimator: Estimator, observer: Observer) -> NormalEstimate:
     from splinecli.inference import estimate_normals
 
-    def stage(name: str) -> AbstractContextManager[Advance]:
-        return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
-
     with ExitStack() as stages:
 
-        def refining() -> AbstractContextManager[Advance]:
-            stages.close()
-            return stage("refining")
+        def stage(name: str) -> AbstractContextManager[Advance]:
+            stages.close()  # one bar at a time
+            return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
 
         advance = stages.enter_context(stage("estimating"))
-        return estimate_normals(capture, estimator, progress=advance, refining=refining)
+        return estimate_normals(capture, estimator, progress=advance, stage=stage)
 
 
 def _method_warnings(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:

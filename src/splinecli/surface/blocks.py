@@ -46,7 +46,7 @@ class Blocks:
         """Return the means (p, F) over the blocks of the values (P, F) of a mask's pixels."""
         if self.step == 1:
             return values
-        block = self._block_of(*np.nonzero(mask))
+        block = self.numbers_at(*np.nonzero(mask))
         sums = np.stack([np.bincount(block, column) for column in values.T], axis=1)
         return (sums / np.bincount(block)[:, None]).astype(values.dtype)
 
@@ -67,10 +67,34 @@ class Blocks:
         places = [(axis - self._shift) / self.step for axis in np.nonzero(mask)]
         return np.asarray(map_coordinates(depth[tuple(nearest)], places, order=1, mode="nearest"))
 
-    def _block_of(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.integer]:
+    def numbers_at(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.integer]:
         """Return the numbers (P,) of the blocks of some pixels."""
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
         return np.asarray(number[rows // self.step, columns // self.step])
+
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the map (h, w, F) of the values (p, F) of the blocks. Other cells have the values of the nearest."""
+        from scipy.ndimage import distance_transform_edt
+
+        number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
+        nearest = distance_transform_edt(~self.mask, return_distances=False, return_indices=True)
+        return np.asarray(values[number[tuple(nearest)]])
+
+    def sample(
+        self, maps: NDArray[np.float32], rows: NDArray[np.integer], columns: NDArray[np.integer]
+    ) -> NDArray[np.float32]:
+        """Return the values (n, F) of a map (h, w, F) at some pixels, by bilinear interpolation between the centres."""
+        height, width, count = maps.shape
+        found = np.zeros((len(rows), count), np.float32)
+        y, x = (
+            ((axis - self._shift) / self.step).clip(0, size - 1)
+            for axis, size in ((rows, height), (columns, width))
+        )
+        top, left = y.astype(np.int32), x.astype(np.int32)
+        for row, down in ((top, 1 - (y - top)), ((top + 1).clip(max=height - 1), y - top)):
+            for column, across in ((left, 1 - (x - left)), ((left + 1).clip(max=width - 1), x - left)):
+                found += maps[row, column] * (down * across)[:, None].astype(np.float32)
+        return found
 
     @property
     def _shift(self) -> float:

@@ -1,0 +1,204 @@
+"""Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
+
+The photographs show how bright each visible part of the object is under each light, after all reflections. A matte part
+is as bright from all sides. Estimated normals give the surface. Together they tell how much light arrives at a pixel
+from the rest of the object, and the pixel reflects it. (Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV
+1991, also alternate between the shape and the light on it.)
+
+Two things are unknown: the exposure, that is which observation an albedo of 1 gives, and whether the object is matte
+enough. Attached shadows tell both: under a light behind its tangent plane, a pixel shows indirect light alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.methods.lamp_light import LampLight
+from splinecli.normals import unit
+from splinecli.surface.blocks import Blocks
+from splinecli.surface.integration import integrate_normals
+
+Rows = NDArray[np.integer]
+Floats = NDArray[np.float32]
+
+LightOf = Callable[[Rows], LampLight]
+"""From rows of a capture's pixels to their observations and light directions."""
+
+NEGLIGIBLE = 0.02
+"""Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at most."""
+
+_BLOCKS = 1200  # parts of the surface that exchange light
+_AT_ONCE = 1 << 14  # pixels; under near lamps, each has its own lights
+
+_SHADOW_PIXELS = 50_000
+_FEWEST_SHADOWS = 50
+_SHADOW_COSINE = -0.05
+"""Attached shadows are looked for at about so many pixels, and so many are needed. There, the cosine of the angle
+between light and normal is below the last number."""
+
+_LEAST_CORRELATION = 0.6
+"""Correlation of attached shadows and gathered light. Below it, the object is not matte: on rendered scenes, metal."""
+
+_BRIGHT_QUANTILE, _MOST_ALBEDO = 0.98, 1.4
+"""This quantile of the albedos is at most so large. It may exceed 1, because the gathered light is too weak where the
+camera does not see what reflects."""
+
+_MOST_RADIANCE = 3.0
+"""A block sends at most this many times the light of a matte one that faces the lamp. The rest is a highlight, which
+goes another way."""
+
+_NEAREST = 0.5  # added to the distances, in sides of a block: those of neighbours are not those of their middles
+_LEAST_Z = 0.15  # of a block's normal, for its area
+_LEAST_LEFT = 0.02  # of an observation; what is gathered is never exact
+
+
+class _PixelPlaces:
+    """Rows and columns of the pixels of a mask. Two bytes a pixel, as captures may have many."""
+
+    def __init__(self, mask: NDArray[np.bool_]) -> None:
+        kind = np.min_scalar_type(mask.shape[1])
+        self._columns = np.concatenate([np.flatnonzero(row).astype(kind) for row in mask])
+        self._ends = np.count_nonzero(mask, axis=1).cumsum()
+
+    def places(self, pixels: Rows) -> tuple[Rows, Rows]:
+        """Return the rows and columns (n,) in the image of pixels with these numbers."""
+        return np.searchsorted(self._ends, pixels, side="right"), self._columns[pixels]
+
+
+@dataclass(frozen=True)
+class IndirectLight:
+    """The indirect light of a capture with P pixels.
+
+    Args:
+        blocks: blocks of the mask's pixels.
+        arriving: (h, w, F), the light that arrives at each block from the others. Other cells have that of the nearest.
+        albedo: (P,), the share of the arriving light that a pixel reflects.
+        pixels: the places of the pixels.
+    """
+
+    blocks: Blocks
+    arriving: Floats
+    albedo: NDArray[np.floating]
+    pixels: _PixelPlaces
+
+    def at(self, rows: Rows) -> Floats:
+        """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
+        arriving = self.blocks.sample(self.arriving, *self.pixels.places(rows))
+        return arriving * self.albedo[rows, None]
+
+    def remove(self, observations: Floats, rows: Rows) -> Floats:
+        """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
+        return np.maximum(observations - self.at(rows), _LEAST_LEFT * observations)
+
+    def counts_at(self, observations: Floats, rows: Rows) -> NDArray[np.bool_]:
+        """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
+        return np.asarray(self.at(rows).max(axis=1) > NEGLIGIBLE * observations.max(axis=1))
+
+
+def find_indirect_light(
+    mask: NDArray[np.bool_], observations: Floats, light_of: LightOf, normals: Floats
+) -> IndirectLight | None:
+    """Return the indirect light of a capture, or None where attached shadows show none that could be removed.
+
+    The camera counts as orthographic, whatever it is: only nearby parts exchange much light.
+
+    Args:
+        mask: (H, W), with P true pixels.
+        observations: (P, F), as they were photographed, divided by the intensities alone.
+        light_of: gives the observations of some pixels without the falloff of near lamps, and the light directions.
+        normals: (P, 3) unit, in the capture's frame.
+    """
+    pixels = _PixelPlaces(mask)
+    blocks = Blocks.over(mask, _BLOCKS)
+    albedo = np.empty(len(normals), np.float32)
+    sums = np.zeros((np.count_nonzero(blocks.mask), 4 + observations.shape[1]))
+    for rows in _parts(np.arange(len(normals))):
+        albedo[rows] = _albedo(light_of(rows), normals[rows])
+        sent = np.minimum(observations[rows], _MOST_RADIANCE * albedo[rows, None])
+        number = blocks.numbers_at(*pixels.places(rows))
+        values = np.hstack((np.ones((len(rows), 1)), normals[rows], sent))
+        for column, summed in zip(values.T, sums.T, strict=True):
+            summed += np.bincount(number, column, len(sums))
+    count = sums[:, :1]
+    arriving = _exchange(blocks, count[:, 0] / blocks.step**2, unit(sums[:, 1:4]), sums[:, 4:] / count)
+    indirect = IndirectLight(blocks, blocks.spread(arriving), albedo, pixels)
+    exposure = _exposure(indirect, observations, light_of, normals)
+    if exposure is None:
+        return None
+    return replace(indirect, albedo=(exposure * albedo).astype(np.float16))
+
+
+def _exchange(blocks: Blocks, covered: Floats, normals: Floats, sent: Floats) -> Floats:
+    """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
+
+    Nothing between two blocks hides them from each other.
+
+    Args:
+        covered: (p,), the share of each block that the mask covers.
+        normals: (p, 3), unit.
+        sent: (p, F), the radiance of each block.
+    """
+    normal_map = np.zeros((*blocks.mask.shape, 3))
+    normal_map[blocks.mask] = normals
+    heights = integrate_normals(normal_map, blocks.mask)[blocks.mask]
+    rows, columns = np.nonzero(blocks.mask)
+    places = np.stack((columns, -rows, heights), axis=1)
+    towards = (places - places[:, None]).astype(np.float32)
+    square = np.square(towards).sum(axis=-1) + _NEAREST**2
+    leaving = -np.einsum("ijk,jk->ij", towards, normals).clip(max=0)
+    entering = np.einsum("ijk,ik->ij", towards, normals).clip(min=0)
+    area = covered / normals[:, 2].clip(min=_LEAST_Z)
+    # The form factor of a small part (Goral et al., "Modeling the interaction of light between diffuse surfaces", 1984)
+    factors = leaving * entering * area / (np.pi * np.square(square))
+    factors /= factors.sum(axis=1, keepdims=True).clip(min=1)
+    return np.asarray(factors @ sent, np.float32)
+
+
+def _exposure(
+    indirect: IndirectLight, observations: Floats, light_of: LightOf, normals: Floats
+) -> float | None:
+    """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
+
+    It is fitted to the attached shadows, together with ambient light that arrives everywhere alike.
+    """
+    found = []
+    step = max(1, len(normals) // _SHADOW_PIXELS)
+    for rows in _parts(np.arange(0, len(normals), step)):
+        light = light_of(rows)
+        gathered = indirect.at(rows)
+        shadow = (_cosines(light, normals[rows]) < _SHADOW_COSINE) & (gathered > 0)
+        albedo = np.broadcast_to(indirect.albedo[rows, None], shadow.shape)
+        found.append(np.stack((observations[rows][shadow], gathered[shadow], albedo[shadow])))
+    seen, gathered, albedo = np.hstack(found).astype(np.float64)
+    if len(seen) < _FEWEST_SHADOWS or not np.corrcoef(seen, gathered)[0, 1] >= _LEAST_CORRELATION:
+        return None
+    exposure, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
+    if ambient < 0:
+        exposure = (seen @ gathered) / (gathered @ gathered)
+    bright = float(np.quantile(indirect.albedo, _BRIGHT_QUANTILE))
+    return float(min(exposure, _MOST_ALBEDO / bright)) if exposure > 0 else None
+
+
+def _parts(rows: Rows) -> Iterator[Rows]:
+    """Yield a few rows at a time, because under near lamps each pixel has its own lights."""
+    for start in range(0, len(rows), _AT_ONCE):
+        yield rows[start : start + _AT_ONCE]
+
+
+def _albedo(light: LampLight, normals: Floats) -> Floats:
+    """Return the albedos (n,) of matte pixels, in the unit of the observations."""
+    cosines = _cosines(light, normals).clip(min=0)
+    shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
+    return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
+
+
+def _cosines(light: LampLight, normals: Floats) -> Floats:
+    """Return the cosines (n, F) of the angles between normals (n, 3) and lights."""
+    own, directions = light.in_frame_of_pixels(normals), light.directions.astype(np.float32)
+    if directions.ndim == 2:
+        return np.asarray(own @ directions.T, np.float32)
+    return np.asarray(np.einsum("nk,nfk->nf", own, directions), np.float32)
