@@ -28,6 +28,7 @@ from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
 Rows = NDArray[np.integer]
+Stage = Callable[[str], AbstractContextManager[Progress]]
 
 _UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
 
@@ -65,7 +66,7 @@ def estimate_normals(
     *,
     tile_pixels: int | None = None,
     progress: Progress | None = None,
-    stage: Callable[[str], AbstractContextManager[Progress]] | None = None,
+    stage: Stage | None = None,
 ) -> NormalEstimate:
     """Estimate the normals of a capture. Under near lamps, find its surface first (see find_surface).
 
@@ -83,38 +84,7 @@ def estimate_normals(
     """
     started = time.perf_counter()
     capture = find_surface(capture)
-    if tile_pixels is None:
-        tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
-    normals = np.empty((capture.n_pixels, 3), np.float32)
-    errors = np.empty((capture.n_pixels, 2), np.float32) if tells_confidence(estimator) else None
-    light_of = partial(_light_on, capture)
-
-    def estimate(rows: Rows, progress: Progress | None) -> None:
-        light = light_of(rows)
-        if errors is not None and tells_confidence(estimator):
-            found, errors[rows] = estimator.estimate_with_error(
-                light.observations, light.directions, progress=progress
-            )
-        else:
-            found = estimator.estimate(light.observations, light.directions, progress=progress)
-        normals[rows] = light.in_frame_of_capture(found)
-
-    for rows in _tiles(capture.n_pixels, tile_pixels):
-        estimate(rows, progress)
-    refiner = refiner_of(estimator)
-    if refiner is not None and errors is not None:
-        indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
-        if indirect is not None:
-            light_of = partial(_light_on, capture, without=indirect)
-            with nullcontext() if stage is None else stage("removing indirect light") as advance:
-                for rows in _tiles(capture.n_pixels, tile_pixels):
-                    changed = rows[indirect.counts_at(capture.observations[rows], rows)]
-                    if len(changed):
-                        estimate(changed, None)
-                    if advance is not None:
-                        advance(len(rows))
-        with nullcontext() if stage is None else stage("refining") as advance:
-            refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
+    normals, errors = _estimate(capture, estimator, tile_pixels, progress, stage)
     return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
@@ -132,6 +102,48 @@ def estimate_normals(
     return NormalEstimate(
         capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map
     )
+
+
+def _estimate(
+    capture: Capture,
+    estimator: Estimator,
+    tile_pixels: int | None,
+    progress: Progress | None,
+    stage: Stage | None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return the normals (P, 3) and, from a method with confidence, the distributions (P, 2) of their errors."""
+    if tile_pixels is None:
+        tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
+    normals = np.empty((capture.n_pixels, 3), np.float32)
+    errors = np.empty((capture.n_pixels, 2), np.float32) if tells_confidence(estimator) else None
+    begin = stage or (lambda _: nullcontext(lambda _: None))
+
+    def estimate(rows: Rows, light: LampLight, progress: Progress | None = None) -> None:
+        if errors is not None and tells_confidence(estimator):
+            found, errors[rows] = estimator.estimate_with_error(
+                light.observations, light.directions, progress=progress
+            )
+        else:
+            found = estimator.estimate(light.observations, light.directions, progress=progress)
+        normals[rows] = light.in_frame_of_capture(found)
+
+    light_of = partial(_light_on, capture)
+    for rows in _tiles(capture.n_pixels, tile_pixels):
+        estimate(rows, light_of(rows), progress)
+    refiner = refiner_of(estimator)
+    if refiner is not None and errors is not None:
+        indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
+        if indirect is not None:
+            light_of = partial(_light_on, capture, without=indirect)
+            with begin("removing indirect light") as advance:
+                for rows in _tiles(capture.n_pixels, tile_pixels):
+                    changed = rows[indirect.counts_at(capture.observations[rows], rows)]
+                    if len(changed):
+                        estimate(changed, light_of(changed))
+                    advance(len(rows))
+        with begin("refining") as advance:
+            refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
+    return normals, errors
 
 
 def _tiles(n_pixels: int, size: int) -> Iterator[Rows]:

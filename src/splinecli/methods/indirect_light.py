@@ -24,6 +24,7 @@ from splinecli.surface.integration import integrate_normals
 
 Rows = NDArray[np.integer]
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 LightOf = Callable[[Rows], LampLight]
 """From rows of a capture's pixels to their observations and light directions."""
@@ -51,7 +52,7 @@ _MOST_RADIANCE = 3.0
 """A block sends at most this many times the light of a matte one that faces the lamp. The rest is a highlight, which
 goes another way."""
 
-_NEAREST = 0.5  # added to the distances, in sides of a block: those of neighbours are not those of their middles
+_NEAREST = 0.5  # added to the distances, in sides of a block, because neighbours are not only their middles
 _LEAST_Z = 0.15  # of a block's normal, for its area
 _LEAST_LEFT = 0.02  # of an observation; what is gathered is never exact
 
@@ -88,11 +89,12 @@ class IndirectLight:
     def at(self, rows: Rows) -> Floats:
         """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
         arriving = self.blocks.sample(self.arriving, *self.pixels.places(rows))
-        return arriving * self.albedo[rows, None]
+        return np.asarray(arriving * self.albedo[rows, None], np.float32)
 
     def remove(self, observations: Floats, rows: Rows) -> Floats:
         """Return the observations (n, F) of some of the capture's pixels without their indirect part."""
-        return np.maximum(observations - self.at(rows), _LEAST_LEFT * observations)
+        left = np.maximum(observations - self.at(rows), _LEAST_LEFT * observations)
+        return np.asarray(left, np.float32)
 
     def counts_at(self, observations: Floats, rows: Rows) -> NDArray[np.bool_]:
         """Return for which of some pixels (n,) with observations (n, F) the indirect part is not negligible."""
@@ -124,7 +126,8 @@ def find_indirect_light(
         for column, summed in zip(values.T, sums.T, strict=True):
             summed += np.bincount(number, column, len(sums))
     count = sums[:, :1]
-    arriving = _exchange(blocks, count[:, 0] / blocks.step**2, unit(sums[:, 1:4]), sums[:, 4:] / count)
+    covered = count[:, 0] / blocks.step**2
+    arriving = _exchange(blocks, covered, unit(sums[:, 1:4]), sums[:, 4:] / count)
     indirect = IndirectLight(blocks, blocks.spread(arriving), albedo, pixels)
     exposure = _exposure(indirect, observations, light_of, normals)
     if exposure is None:
@@ -132,7 +135,7 @@ def find_indirect_light(
     return replace(indirect, albedo=(exposure * albedo).astype(np.float16))
 
 
-def _exchange(blocks: Blocks, covered: Floats, normals: Floats, sent: Floats) -> Floats:
+def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Floats:
     """Return the light (p, F) that arrives at each block from the others, relative to that which a white one reflects.
 
     Nothing between two blocks hides them from each other.
@@ -174,7 +177,11 @@ def _exposure(
         albedo = np.broadcast_to(indirect.albedo[rows, None], shadow.shape)
         found.append(np.stack((observations[rows][shadow], gathered[shadow], albedo[shadow])))
     seen, gathered, albedo = np.hstack(found).astype(np.float64)
-    if len(seen) < _FEWEST_SHADOWS or not np.corrcoef(seen, gathered)[0, 1] >= _LEAST_CORRELATION:
+    if len(seen) < _FEWEST_SHADOWS:
+        return None
+    with np.errstate(invalid="ignore"):  # black shadows have no correlation
+        correlation = np.corrcoef(seen, gathered)[0, 1]
+    if not correlation >= _LEAST_CORRELATION:
         return None
     exposure, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
     if ambient < 0:
