@@ -40,7 +40,9 @@ def direct_and_indirect(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the light (P, F) that a matte bowl reflects from the lamps, and from itself."""
     direct = ALBEDO * (normals @ LIGHTS.T).clip(0)
-    share = 1 / OUTWARDS[:, 2:] / (4 * np.pi * (SIZE / 2) ** 2)  # of each pixel in the area of the whole sphere
+    share = (
+        1 / OUTWARDS[:, 2:] / (4 * np.pi * (SIZE / 2) ** 2)
+    )  # of each pixel in the area of the whole sphere
     indirect = ALBEDO * (share * direct).sum(axis=0) / (1 - ALBEDO * share.sum())
     return (exposure * direct).astype(np.float32), np.broadcast_to(exposure * indirect, direct.shape).astype(
         np.float32

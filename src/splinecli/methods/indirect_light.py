@@ -152,13 +152,14 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
     square = np.square(towards).sum(axis=-1) + _NEAREST**2
-    leaving = -np.einsum("ijk,jk->ij", towards, normals).clip(max=0)
-    entering = np.einsum("ijk,ik->ij", towards, normals).clip(min=0)
-    area = covered / normals[:, 2].clip(min=_LEAST_Z)
+    facing = normals.astype(np.float32)
+    leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
+    entering = np.einsum("ijk,ik->ij", towards, facing).clip(min=0)
+    area = (covered / normals[:, 2].clip(min=_LEAST_Z)).astype(np.float32)
     # The form factor of a small part (Goral et al., "Modeling the interaction of light between diffuse surfaces", 1984)
     factors = leaving * entering * area / (np.pi * np.square(square))
     factors /= factors.sum(axis=1, keepdims=True).clip(min=1)
-    return np.asarray(factors @ sent, np.float32)
+    return np.asarray(factors @ sent.astype(np.float32))
 
 
 def _exposure(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +26,12 @@ class Blocks:
 
     @classmethod
     def over(cls, mask: NDArray[np.bool_], number: int) -> Blocks:
-        """Return about `number` blocks or fewer over the pixels of a mask (H, W)."""
-        return cls.of_step(mask, max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / number)))))
+        """Return about `number` blocks over the pixels of a mask (H, W), at most twice as many."""
+        step = max(1, math.ceil(math.sqrt(np.count_nonzero(mask) / number)))
+        blocks = cls.of_step(mask, step)
+        while (count := np.count_nonzero(blocks.mask)) > 2 * number:  # thin or scattered parts
+            blocks = cls.of_step(mask, math.ceil(blocks.step * math.sqrt(count / number)))
+        return blocks
 
     @classmethod
     def of_step(cls, mask: NDArray[np.bool_], step: int) -> Blocks:
