@@ -118,7 +118,7 @@ def find_indirect_light(
     blocks = Blocks.over(mask, _BLOCKS)
     albedo = np.empty(len(normals), np.float32)
     sums = np.zeros((np.count_nonzero(blocks.mask), 4 + observations.shape[1]))
-    for rows in _parts(np.arange(len(normals))):
+    for rows in _parts(len(normals)):
         albedo[rows] = _albedo(light_of(rows), normals[rows])
         sent = np.minimum(observations[rows], _MOST_RADIANCE * albedo[rows, None])
         number = blocks.numbers_at(*pixels.places(rows))
@@ -171,7 +171,7 @@ def _exposure(
     """
     found = []
     step = max(1, len(normals) // _SHADOW_PIXELS)
-    for rows in _parts(np.arange(0, len(normals), step)):
+    for rows in _parts(len(normals), step):
         light = light_of(rows)
         gathered = indirect.at(rows)
         shadow = (_cosines(light, normals[rows]) < _SHADOW_COSINE) & (gathered > 0)
@@ -191,10 +191,10 @@ def _exposure(
     return float(min(exposure, _MOST_ALBEDO / bright)) if exposure > 0 else None
 
 
-def _parts(rows: Rows) -> Iterator[Rows]:
-    """Yield a few rows at a time, because under near lamps each pixel has its own lights."""
-    for start in range(0, len(rows), _AT_ONCE):
-        yield rows[start : start + _AT_ONCE]
+def _parts(count: int, step: int = 1) -> Iterator[Rows]:
+    """Yield every step-th of so many rows, a few at a time: under near lamps, each pixel has its own lights."""
+    for start in range(0, count, step * _AT_ONCE):
+        yield np.arange(start, min(start + step * _AT_ONCE, count), step)
 
 
 def _albedo(light: LampLight, normals: Floats) -> Floats:

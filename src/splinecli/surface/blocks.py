@@ -36,11 +36,9 @@ class Blocks:
     @classmethod
     def of_step(cls, mask: NDArray[np.bool_], step: int) -> Blocks:
         """Return the blocks of step x step pixels over the pixels of a mask (H, W)."""
-        height, width = mask.shape
-        blocks = np.zeros((-(-height // step), -(-width // step)), np.bool_)
-        rows, columns = np.nonzero(mask)
-        blocks[rows // step, columns // step] = True
-        return cls(blocks, step)
+        for axis, size in enumerate(mask.shape):
+            mask = np.logical_or.reduceat(mask, np.arange(0, size, step), axis=axis)
+        return cls(mask, step)
 
     def centres(self) -> tuple[Floats, Floats]:
         """Return the rows and columns (p,) of the centres, in pixels of the capture."""
@@ -92,13 +90,15 @@ class Blocks:
         height, width, count = maps.shape
         found = np.zeros((len(rows), count), np.float32)
         y, x = (
-            ((axis - self._shift) / self.step).clip(0, size - 1)
+            ((axis.astype(np.float32) - self._shift) / self.step).clip(0, size - 1)
             for axis, size in ((rows, height), (columns, width))
         )
-        top, left = y.astype(np.int32), x.astype(np.int32)
-        for row, down in ((top, 1 - (y - top)), ((top + 1).clip(max=height - 1), y - top)):
-            for column, across in ((left, 1 - (x - left)), ((left + 1).clip(max=width - 1), x - left)):
-                found += maps[row, column] * (down * across)[:, None].astype(np.float32)
+        top, left = y.astype(np.intp), x.astype(np.intp)
+        down, across = y - top, x - left
+        cells = maps.reshape(-1, count)
+        for row, down_share in ((top, 1 - down), ((top + 1).clip(max=height - 1), down)):
+            for column, share in ((left, 1 - across), ((left + 1).clip(max=width - 1), across)):
+                found += cells.take(row * width + column, axis=0) * (down_share * share)[:, None]
         return found
 
     @property
