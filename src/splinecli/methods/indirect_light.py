@@ -53,6 +53,9 @@ _MOST_RADIANCE = 3.0
 goes another way."""
 
 _NEAREST = 0.5  # added to the distances, in sides of a block, because neighbours are not only their middles
+_ALIKE = 0.998  # cosine of gathered and ambient light, above which the two cannot be told apart
+_DARK_SHARE = 0.02  # of the bright pixels' albedo; darker ones are background
+_LARGEST_ALBEDO = 10.0  # pixels that all lamps graze may have any
 _LEAST_Z = 0.15  # of a block's normal, for its area
 _LEAST_LEFT = 0.02  # of an observation; what is gathered is never exact
 
@@ -115,12 +118,23 @@ def find_indirect_light(
         normals: (P, 3) unit, in the capture's frame.
     """
     pixels = _PixelPlaces(mask)
-    blocks = Blocks.over(mask, _BLOCKS)
     albedo = np.empty(len(normals), np.float32)
-    sums = np.zeros((np.count_nonzero(blocks.mask), 4 + observations.shape[1]))
     for rows in _parts(len(normals)):
         albedo[rows] = _albedo(light_of(rows), normals[rows])
-        sent = np.minimum(observations[rows], _MOST_RADIANCE * albedo[rows, None])
+    total = float(albedo.sum(dtype=np.float64))
+    if total <= 0:
+        return None
+    # A mean that hardly depends on how much dark background there is.
+    bright = float(albedo @ albedo) / total
+    lit = albedo > _DARK_SHARE * bright
+    object_mask = mask.copy()
+    object_mask[mask] = lit
+    blocks = Blocks.over(object_mask, _BLOCKS)
+    sums = np.zeros((np.count_nonzero(blocks.mask), 4 + observations.shape[1]))
+    for rows in _parts(len(normals)):
+        rows = rows[lit[rows]]
+        most = _MOST_RADIANCE * albedo[rows, None]
+        sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
         values = np.hstack((np.ones((len(rows), 1)), normals[rows], sent))
         for column, summed in zip(values.T, sums.T, strict=True):
@@ -132,7 +146,8 @@ def find_indirect_light(
     exposure = _exposure(indirect, observations, light_of, normals)
     if exposure is None:
         return None
-    return replace(indirect, albedo=(exposure * albedo).astype(np.float16))
+    exposure = min(exposure, _MOST_ALBEDO / float(np.quantile(albedo[lit], _BRIGHT_QUANTILE)))
+    return replace(indirect, albedo=(exposure * albedo).clip(max=_LARGEST_ALBEDO).astype(np.float16))
 
 
 def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles) -> Floats:
@@ -167,7 +182,8 @@ def _exposure(
 ) -> float | None:
     """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
 
-    It is fitted to the attached shadows, together with ambient light that arrives everywhere alike.
+    It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl
+    under a ring of lights, indirect light does so, too. It then counts as indirect.
     """
     found = []
     step = max(1, len(normals) // _SHADOW_PIXELS)
@@ -184,11 +200,11 @@ def _exposure(
         correlation = np.corrcoef(seen, gathered)[0, 1]
     if not correlation >= _LEAST_CORRELATION:
         return None
-    exposure, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
-    if ambient < 0:
-        exposure = (seen @ gathered) / (gathered @ gathered)
-    bright = float(np.quantile(indirect.albedo, _BRIGHT_QUANTILE))
-    return float(min(exposure, _MOST_ALBEDO / bright)) if exposure > 0 else None
+    exposure = float(seen @ gathered / (gathered @ gathered))
+    if gathered @ albedo < _ALIKE * np.linalg.norm(gathered) * np.linalg.norm(albedo):
+        with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
+        exposure = float(with_ambient) if ambient > 0 else exposure
+    return exposure if exposure > 0 else None
 
 
 def _parts(count: int, step: int = 1) -> Iterator[Rows]:
