@@ -20,8 +20,8 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
 from splinecli.methods.estimator import Progress
-from splinecli.methods.indirect_light import IndirectLight, LightOf, find_indirect_light
-from splinecli.methods.lamp_light import LampLight
+from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
+from splinecli.methods.lamp_light import LampLight, LightOf
 from splinecli.methods.refiner import Refiner
 from splinecli.normals import angle_between_deg
 

@@ -11,13 +11,13 @@ enough. Attached shadows tell both: under a light behind its tangent plane, a pi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.methods.lamp_light import LampLight
+from splinecli.methods.lamp_light import LampLight, LightOf
 from splinecli.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
@@ -25,9 +25,6 @@ from splinecli.surface.integration import integrate_normals
 Rows = NDArray[np.integer]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
-
-LightOf = Callable[[Rows], LampLight]
-"""From rows of a capture's pixels to their observations and light directions."""
 
 NEGLIGIBLE = 0.02
 """Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at most."""

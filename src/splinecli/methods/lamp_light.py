@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,10 @@ class LampLight:
     def in_frame_of_capture(self, normals: Floats) -> Floats:
         """Return normals (P, 3), given in the pixels' own frames, in the capture's."""
         return normals if self.turns is None else np.einsum("pji,pj->pi", self.turns, normals)
+
+
+LightOf = Callable[[NDArray[np.integer]], LampLight]
+"""From rows of a capture's pixels to their observations and light directions."""
 
 
 def estimate_under_lamps(estimator: Estimator, observations: NDArray[np.float32], lamps: NearLamps) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splinecli.memory import return_freed_memory
 from splinecli.methods.estimator import Progress
-from splinecli.methods.lamp_light import LampLight
+from splinecli.methods.lamp_light import LightOf
 from splinecli.networks.refine_features import (
     CHANNELS,
     Turn,
@@ -36,9 +36,6 @@ Larger tiles take less time, because their margins are smaller in all, and more 
 """
 
 _BLOCK = 1 << 14  # pixels whose features are computed at once; under near lamps, each has its own lights
-
-LightOf = Callable[[NDArray[np.integer]], LampLight]
-"""From rows of a capture's pixels to their observations and light directions."""
 
 Floats = NDArray[np.float32]
 

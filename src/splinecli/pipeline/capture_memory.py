@@ -19,6 +19,9 @@ BASE_BYTES = 500 * 2**20
 REFINED_PIXELS, REFINED_BYTES = 736**2, 1100
 """The most pixels that are refined at once: a tile with its margin. Bytes of each."""
 
+INDIRECT_BYTES = 4
+"""Bytes of each pixel of the capture for its indirect light."""
+
 _WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
 _ASKED = 16  # captures that stand for a batch
 
@@ -33,7 +36,8 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """
     from splinecli.capture.capture_size import capture_bytes
 
-    return capture_bytes(largest, n_pixels, n_lights) + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+    of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
+    return capture_bytes(largest, n_pixels, n_lights) + of_pixels
 
 
 def expected_bytes(member: Member, options: InferOptions) -> float:
