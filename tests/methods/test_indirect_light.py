@@ -131,7 +131,7 @@ def test_a_ball_receives_none_even_with_ambient_light() -> None:
     assert found_in(OUTWARDS, direct + np.float32(0.05)) is None
 
 
-def test_ambient_light_is_told_from_indirect_light() -> None:
+def test_ambient_light_is_separated_from_indirect_light() -> None:
     direct, indirect = direct_and_indirect(BOWL)
     found = found_in(BOWL, direct + indirect + (0.03 * ALBEDO).astype(np.float32))
     assert found is not None

@@ -6,7 +6,7 @@ from the rest of the object, and the pixel reflects it. (Nayar, Ikeuchi and Kana
 1991, also alternate between the shape and the light on it.)
 
 Two things are unknown: the exposure, that is which observation an albedo of 1 gives, and whether the object is matte
-enough. Attached shadows tell both: under a light behind its tangent plane, a pixel shows indirect light alone.
+enough. Attached shadows show both. Under a light behind its tangent plane, a pixel shows indirect light alone.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _MOST_RADIANCE = 3.0
 goes another way."""
 
 _NEAREST = 0.5  # added to the distances, in sides of a block, because neighbours are not only their middles
-_ALIKE = 0.998  # cosine of gathered and ambient light, above which the two cannot be told apart
+_ALIKE = 0.998  # cosine of gathered and ambient light, above which the two cannot be separated
 _DARK_SHARE = 0.02  # of the bright pixels' albedo; darker ones are background
 _LARGEST_ALBEDO = 10.0  # pixels that all lamps graze may have any
 _LEAST_Z = 0.15  # of a block's normal, for its area
