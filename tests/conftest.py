@@ -32,21 +32,23 @@ def shared_data() -> Path:
     return folder.resolve()
 
 
+def directions_at(azimuth: NDArray[np.float64], zenith: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Return the unit directions (count, 3) at these angles in radians."""
+    x, y, z = np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)
+    return np.stack((x, y, np.broadcast_to(z, x.shape)), axis=1)
+
+
 def cap_directions(count: int, limit_deg: float, seed: int = 0) -> NDArray[np.float64]:
     """Random unit vectors (count, 3) within limit_deg of the view axis."""
     rng = np.random.default_rng(seed)
     azimuth, zenith = rng.uniform(0, 2 * np.pi, count), np.radians(rng.uniform(0, limit_deg, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+    return directions_at(azimuth, zenith)
 
 
 def spiral_lights(count: int, limit_deg: float = 35) -> NDArray[np.float64]:
     """Lights (count, 3) on a spiral, 5 to limit_deg degrees from the view axis."""
     azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(5, limit_deg, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+    return directions_at(azimuth, zenith)
 
 
 @pytest.fixture

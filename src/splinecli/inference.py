@@ -9,7 +9,7 @@ capture.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -23,11 +23,10 @@ from splinecli.memory import return_freed_memory
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
 from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
-from splinecli.methods.lamp_light import LampLight
+from splinecli.methods.lamp_light import LampLight, Rows, parts_of_rows
 from splinecli.methods.near_light import find_surface
 from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 
-Rows = NDArray[np.integer]
 Stage = Callable[[str], AbstractContextManager[Progress]]
 
 _UNIT_TOLERANCE = 1e-2  # accepts float16 and bfloat16 normals, rejects zero vectors and NaN
@@ -128,7 +127,7 @@ def _estimate(
         normals[rows] = light.in_frame_of_capture(found)
 
     light_of = partial(_light_on, capture)
-    for rows in _tiles(capture.n_pixels, tile_pixels):
+    for rows in parts_of_rows(capture.n_pixels, tile_pixels):
         estimate(rows, light_of(rows), progress)
     refiner = refiner_of(estimator)
     if refiner is not None and errors is not None:
@@ -136,7 +135,7 @@ def _estimate(
         if indirect is not None:
             light_of = partial(_light_on, capture, without=indirect)
             with begin("removing indirect light") as advance:
-                for rows in _tiles(capture.n_pixels, tile_pixels):
+                for rows in parts_of_rows(capture.n_pixels, tile_pixels):
                     changed = rows[indirect.counts_at(capture.observations[rows], rows)]
                     if len(changed):
                         estimate(changed, light_of(changed))
@@ -144,11 +143,6 @@ def _estimate(
         with begin("refining") as advance:
             refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
     return normals, errors
-
-
-def _tiles(n_pixels: int, size: int) -> Iterator[Rows]:
-    for start in range(0, n_pixels, size):
-        yield np.arange(start, min(start + size, n_pixels))
 
 
 def _light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conftest import directions_at
 from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
@@ -28,9 +29,7 @@ from splinecli.normals import angle_between_deg
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)
 ZENITH = np.radians(np.where(np.arange(10) % 2, 35, 60))
-LIGHTS = np.stack(
-    (np.sin(ZENITH) * np.cos(AZIMUTH), np.sin(ZENITH) * np.sin(AZIMUTH), np.cos(ZENITH)), axis=1
-)
+LIGHTS = directions_at(AZIMUTH, ZENITH)
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
 X, Y = (COLUMNS - (SIZE - 1) / 2) / (SIZE / 2), ((SIZE - 1) / 2 - ROWS) / (SIZE / 2)
 MASK = X**2 + Y**2 < 0.9**2
@@ -99,7 +98,7 @@ def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None
 
 def test_a_ring_of_lights_shows_it_too() -> None:
     """All lamps then light the bowl equally, so its own light looks like ambient light."""
-    ring = np.stack((np.cos(AZIMUTH) / 2**0.5, np.sin(AZIMUTH) / 2**0.5, np.full(10, 0.5**0.5)), axis=1)
+    ring = directions_at(AZIMUTH, np.radians(45))
     direct, indirect = direct_and_indirect(BOWL, ring)
     found = found_in(BOWL, direct + indirect, ring)
     assert found is not None

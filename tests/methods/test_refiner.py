@@ -136,7 +136,7 @@ def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -
 
     at_once = refined(True)
     asked.clear()
-    monkeypatch.setattr(refiner, "_BLOCK", 200)
+    monkeypatch.setattr(refiner, "LIT_AT_ONCE", 200)
     np.testing.assert_allclose(refined(True), at_once, atol=1e-5)
     assert asked == 2 * [200, 200, 200, 200, 100]
     asked.clear()

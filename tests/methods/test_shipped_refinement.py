@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conftest import directions_at
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import MethodOptions, make_estimator
@@ -17,9 +18,7 @@ from splinecli.normals import angle_between_deg, unit
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)
 ZENITH = np.radians(np.where(np.arange(10) % 2, 25, 50))
-LIGHTS = np.stack(
-    (np.sin(ZENITH) * np.cos(AZIMUTH), np.sin(ZENITH) * np.sin(AZIMUTH), np.cos(ZENITH)), axis=1
-)
+LIGHTS = directions_at(AZIMUTH, ZENITH)
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
 PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
 

@@ -11,18 +11,16 @@ enough. Attached shadows show both. Under a light behind its tangent plane, a pi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.methods.lamp_light import LampLight, LightOf
+from splinecli.methods.lamp_light import LampLight, LightOf, Rows, parts_of_rows
 from splinecli.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
 
-Rows = NDArray[np.integer]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
@@ -30,7 +28,6 @@ NEGLIGIBLE = 0.02
 """Indirect light up to this share of a pixel's largest observation changes mean errors by 0.01 degrees at most."""
 
 _BLOCKS = 1200  # parts of the surface that exchange light
-_AT_ONCE = 1 << 14  # pixels; under near lamps, each has its own lights
 
 _SHADOW_PIXELS = 50_000
 _FEWEST_SHADOWS = 50
@@ -116,7 +113,7 @@ def find_indirect_light(
     """
     pixels = _PixelPlaces(mask)
     albedo = np.empty(len(normals), np.float32)
-    for rows in _parts(len(normals)):
+    for rows in parts_of_rows(len(normals)):
         albedo[rows] = _albedo(light_of(rows), normals[rows])
     total = float(albedo.sum(dtype=np.float64))
     if total <= 0:
@@ -128,7 +125,7 @@ def find_indirect_light(
     object_mask[mask] = lit
     blocks = Blocks.over(object_mask, _BLOCKS)
     sums = np.zeros((np.count_nonzero(blocks.mask), 4 + observations.shape[1]))
-    for rows in _parts(len(normals)):
+    for rows in parts_of_rows(len(normals)):
         rows = rows[lit[rows]]
         most = _MOST_RADIANCE * albedo[rows, None]
         sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
@@ -184,7 +181,7 @@ def _exposure(
     """
     found = []
     step = max(1, len(normals) // _SHADOW_PIXELS)
-    for rows in _parts(len(normals), step):
+    for rows in parts_of_rows(len(normals), step=step):
         light = light_of(rows)
         gathered = indirect.at(rows)
         shadow = (_cosines(light, normals[rows]) < _SHADOW_COSINE) & (gathered > 0)
@@ -202,12 +199,6 @@ def _exposure(
         with_ambient, ambient = np.linalg.lstsq(np.stack((gathered, albedo), axis=1), seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure
     return exposure if exposure > 0 else None
-
-
-def _parts(count: int, step: int = 1) -> Iterator[Rows]:
-    """Yield every step-th of so many rows, a few at a time: under near lamps, each pixel has its own lights."""
-    for start in range(0, count, step * _AT_ONCE):
-        yield np.arange(start, min(start + step * _AT_ONCE, count), step)
 
 
 def _albedo(light: LampLight, normals: Floats) -> Floats:

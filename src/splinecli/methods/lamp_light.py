@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,8 +74,20 @@ class LampLight:
         return normals if self.turns is None else np.einsum("pji,pj->pi", self.turns, normals)
 
 
-LightOf = Callable[[NDArray[np.integer]], LampLight]
+Rows = NDArray[np.integer]
+"""Numbers of some of a capture's pixels, in the order of its mask."""
+
+LightOf = Callable[[Rows], LampLight]
 """From rows of a capture's pixels to their observations and light directions."""
+
+LIT_AT_ONCE = 1 << 14
+"""Pixels whose light is asked for at once: under near lamps, each has its own lights."""
+
+
+def parts_of_rows(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iterator[Rows]:
+    """Yield every step-th of the rows below `count`, `size` at a time."""
+    for start in range(0, count, step * size):
+        yield np.arange(start, min(start + step * size, count), step)
 
 
 def estimate_under_lamps(estimator: Estimator, observations: NDArray[np.float32], lamps: NearLamps) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splinecli.memory import return_freed_memory
 from splinecli.methods.estimator import Progress
-from splinecli.methods.lamp_light import LightOf
+from splinecli.methods.lamp_light import LIT_AT_ONCE, LightOf
 from splinecli.networks.refine_features import (
     CHANNELS,
     Turn,
@@ -34,8 +34,6 @@ TILE = 640
 
 Larger tiles take less time, because their margins are smaller in all, and more memory.
 """
-
-_BLOCK = 1 << 14  # pixels whose features are computed at once; under near lamps, each has its own lights
 
 Floats = NDArray[np.float32]
 
@@ -176,10 +174,10 @@ class Refiner:
 
         features = torch.zeros(*tile.mask.shape, CHANNELS, device=device)
         rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(device)
-        for start in range(0, len(rows), _BLOCK):
-            block = rows[start : start + _BLOCK]
+        for start in range(0, len(rows), LIT_AT_ONCE):
+            block = rows[start : start + LIT_AT_ONCE]
             light = light_of(block)
-            features.view(-1, CHANNELS)[places[start : start + _BLOCK]] = refine_features(
+            features.view(-1, CHANNELS)[places[start : start + LIT_AT_ONCE]] = refine_features(
                 tensor(light.observations),
                 tensor(light.directions),
                 tensor(light.in_frame_of_pixels(normals[block])),
@@ -191,8 +189,8 @@ class Refiner:
         inside = tile.mask[tile.inner]
         refined, refined_errors = (values.permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
         own = tile.rows[tile.inner][inside]
-        for start in range(0, len(own), _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for start in range(0, len(own), LIT_AT_ONCE):
+            part = slice(start, start + LIT_AT_ONCE)
             light = light_of(own[part])
             if light.turns is None:
                 break

@@ -64,11 +64,10 @@ class Blocks:
         """Return the depths (P,) of the pixels of a mask (H, W) from those of the blocks (h, w)."""
         if self.step == 1:
             return depth[mask]
-        from scipy.ndimage import distance_transform_edt, map_coordinates
+        from scipy.ndimage import map_coordinates
 
-        nearest = distance_transform_edt(~self.mask, return_distances=False, return_indices=True)
         places = [(axis - self._shift) / self.step for axis in np.nonzero(mask)]
-        return np.asarray(map_coordinates(depth[tuple(nearest)], places, order=1, mode="nearest"))
+        return np.asarray(map_coordinates(self.spread(depth[self.mask]), places, order=1, mode="nearest"))
 
     def numbers_at(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.integer]:
         """Return the numbers (P,) of the blocks of some pixels."""
@@ -76,7 +75,7 @@ class Blocks:
         return np.asarray(number[rows // self.step, columns // self.step])
 
     def spread(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the map (h, w, F) of the values (p, F) of the blocks. Other cells have the values of the nearest."""
+        """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells have those of the nearest."""
         from scipy.ndimage import distance_transform_edt
 
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
