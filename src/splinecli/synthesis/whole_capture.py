@@ -27,6 +27,10 @@ _GRAINY_SHARE = 2 / 3
 _MOST_SATURATED = 0.03
 """Largest share of clipped observations in an overexposed capture."""
 
+_UNMEASURED_SHARE = 0.3
+_MOST_UNMEASURED = 0.5
+"""Of the captures with errors of the intensities, this share has large ones, with a sigma of up to so many stops."""
+
 
 def photograph_scene(
     radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
@@ -37,7 +41,9 @@ def photograph_scene(
     places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 %
     of the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also
     have a grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where
-    images are shifted by a part of a pixel or light arrives from neighbours.
+    images are shifted by a part of a pixel or light arrives from neighbours. Of the captures with errors of the
+    intensities, 30 % have a further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are
+    then wrong by many degrees, and their detail is still right.
 
     Args:
         radiance: (P, F).
@@ -62,6 +68,8 @@ def photograph_scene(
         exposed = quantise(row, config.eight_bit_share, generator).view_as(exposed)
     exposed = torch.where(clipped, 1, exposed)
     errors = disturb_light_intensities(torch.ones(1, lights), config.light_intensity_error_share, generator)
+    if uniform() < _UNMEASURED_SHARE * config.light_intensity_error_share:
+        errors = errors * 2 ** (uniform(0, _MOST_UNMEASURED) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
     calibrated = disturb_light_directions(directions[None], config.light_direction_error_share, generator)[0]
     if saturated:
