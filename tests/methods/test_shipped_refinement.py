@@ -24,14 +24,22 @@ PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
 
 
 def scene(
-    normals: NDArray[np.floating], albedo: NDArray[np.floating] | float, *, noise: float, gloss: float = 0.0
+    normals: NDArray[np.floating],
+    albedo: NDArray[np.floating] | float,
+    *,
+    noise: float,
+    gloss: float = 0.0,
+    unmeasured: NDArray[np.floating] | float = 1.0,
 ) -> Capture:
-    """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale."""
+    """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full scale.
+
+    The lamps are `unmeasured` times as strong as the capture says.
+    """
     rng = np.random.default_rng(0)
     flat = normals.reshape(-1, 3)
     half = unit(LIGHTS + np.array((0, 0, 1)))
     observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
-    observations = observations + gloss * (flat @ half.T).clip(0) ** 60
+    observations = unmeasured * (observations + gloss * (flat @ half.T).clip(0) ** 60)
     observations += noise * observations.max() * rng.normal(size=observations.shape)
     mask = np.ones(normals.shape[:2], np.bool_)
     return Capture(
@@ -45,10 +53,15 @@ def scene(
 
 
 def refined_and_not(
-    normals: NDArray[np.floating], albedo: NDArray[np.floating] | float, *, noise: float, gloss: float = 0.0
+    normals: NDArray[np.floating],
+    albedo: NDArray[np.floating] | float,
+    *,
+    noise: float,
+    gloss: float = 0.0,
+    unmeasured: NDArray[np.floating] | float = 1.0,
 ) -> tuple[NormalEstimate, NormalEstimate]:
     """Estimate a scene with and without refinement; see `scene`."""
-    capture = scene(normals, albedo, noise=noise, gloss=gloss)
+    capture = scene(normals, albedo, noise=noise, gloss=gloss, unmeasured=unmeasured)
     refined, pixelwise = (
         estimate_normals(capture, make_estimator(name)) for name in ("spline-net", "spline-net-pixelwise")
     )
@@ -81,20 +94,35 @@ def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss: float) -> N
     assert step_deg(refined) < step_deg(pixelwise) + 0.1
 
 
-@pytest.mark.parametrize("gloss", [0.0, 0.5])
-@pytest.mark.parametrize("width", [2, 4])
-def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
-    """Slopes of 17 degrees, `width` pixels to either side."""
+def grooves(width: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Normals of grooves `width` pixels to either side, and their slopes of 17 degrees."""
     slope = np.where((COLUMNS // width) % 2 == 1, 0.3, -0.3)
-    normals = unit(np.stack((-slope, np.zeros_like(slope), np.ones_like(slope)), axis=-1))
+    return unit(np.stack((-slope, np.zeros_like(slope), np.ones_like(slope)), axis=-1)), slope
 
-    def depth(estimate: NormalEstimate) -> float:
-        """The mean slope along the grooves' own, of which 1 is true."""
-        found = -estimate.normal_map[..., 0] / estimate.normal_map[..., 2]
-        return float((found / slope).mean())
 
+def depth(estimate: NormalEstimate, slope: NDArray[np.floating]) -> float:
+    """The mean slope along the grooves' own, of which 1 is true."""
+    found = -estimate.normal_map[..., 0] / estimate.normal_map[..., 2]
+    return float(((found - found.mean()) / slope).mean())
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+@pytest.mark.parametrize("width", [1, 2, 4])
+def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
+    normals, slope = grooves(width)
     refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
-    assert depth(refined) == pytest.approx(depth(pixelwise), rel=0.1)
+    assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.1)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.02])
+@pytest.mark.parametrize("width", [1, 2])
+def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -> None:
+    """They turn normals by 17 degrees, which says nothing about detail. The net alone takes most of it for noise."""
+    normals, slope = grooves(width)
+    stronger = 1 + 0.5 * (LIGHTS[:, 0] > 0)
+    refined, pixelwise = refined_and_not(normals, 0.5, noise=noise, unmeasured=stronger)
+    assert mean_error_deg(pixelwise) > 10
+    assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.15)
 
 
 @pytest.mark.parametrize("behind", [0.002, 0.3])
@@ -134,5 +162,5 @@ def test_seams_of_tiles_do_not_show() -> None:
         )
         found.append((normals, errors))
     assert angle_between_deg(found[0][0], before).mean() > 0.2
-    assert angle_between_deg(found[0][0], found[1][0]).max() < 0.03
-    assert np.abs(found[0][1] - found[1][1]).max() < 0.03
+    assert angle_between_deg(found[0][0], found[1][0]).max() < 0.006  # 1e-4 radians
+    assert np.abs(found[0][1] - found[1][1]).max() < 0.006

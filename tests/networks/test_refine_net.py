@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from splinecli.fits.two_halves import alternating_signs
 from splinecli.networks.refine_features import (
     CHANNELS,
     Turn,
@@ -39,7 +40,7 @@ def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]
 def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Tensor) -> Tensor:
     """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H, W)."""
     rows = [maps.flatten(1).T.contiguous() for maps in (observations, normals, error)]
-    features = refine_features(rows[0], lights, rows[1], rows[2], 0.7)
+    features = refine_features(rows[0], lights, rows[1], rows[2], 0.7, alternating_signs(lights))
     return features.T.view(-1, *observations.shape[1:])
 
 
@@ -48,7 +49,7 @@ def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Te
 def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     generator = torch.Generator().manual_seed(1)
     lights = torch.nn.functional.normalize(
-        torch.randn(7, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
+        torch.randn(8, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
     )
     normals = (
         torch.randn(3, HEIGHT, WIDTH, generator=generator) + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
@@ -56,7 +57,7 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     normals = torch.nn.functional.normalize(normals, dim=0)
     error = torch.randn(2, HEIGHT, WIDTH, generator=generator)
     shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)
-    observations = shading**1.5 + 0.05 * torch.rand(7, HEIGHT, WIDTH, generator=generator)
+    observations = shading**1.5 + 0.05 * torch.rand(8, HEIGHT, WIDTH, generator=generator)
 
     def turned(vectors: Tensor) -> Tensor:
         """Vectors (3, ...), turned."""

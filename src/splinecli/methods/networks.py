@@ -71,7 +71,9 @@ class NetworkEstimator:
         self.refiner = Refiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.refiner is not None:
-            self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns"
+            self.fingerprint += (
+                f", without indirect light, refined in {self.refiner.turns} turns, with detail"
+            )
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._layers = LayerProgress(self.network)
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splinecli.fits.two_halves import alternating_signs
 from splinecli.memory import return_freed_memory
 from splinecli.methods.estimator import Progress
 from splinecli.methods.lamp_light import LIT_AT_ONCE, LightOf
+from splinecli.networks.detail import FEWEST_LIGHTS, restore_detail
+from splinecli.networks.detail import REACH as DETAIL_REACH
 from splinecli.networks.refine_features import (
     CHANNELS,
     Turn,
@@ -22,14 +26,13 @@ from splinecli.networks.refine_features import (
 )
 from splinecli.networks.refine_net import COARSEST, Part, RefineNet
 
-MARGIN = 48
+MARGIN = 64
 """Pixels around a tile that are seen, a multiple of COARSEST.
 
-The net can see twice as far (REACH), but what lies beyond the margin turns normals by less than 0.01 degrees, which is
-a third of what bfloat16 does.
+The net can see further (REACH), but what lies beyond the margin turns no normal by more than 0.01 degrees.
 """
 
-TILE = 640
+TILE = 608
 """Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin comes on top.
 
 Larger tiles take less time, because their margins are smaller in all, and more memory.
@@ -122,7 +125,15 @@ class Refiner:
             normals, errors: of the estimator, in the capture's frame.
             progress: called after each tile with the number of its pixels.
         """
-        reference = brightness(torch.from_numpy(observations))
+        device = self.network.enter.weight.device
+        middle = light_of(np.array([len(normals) // 2])).directions.reshape(
+            -1, 3
+        )  # as one pixel sees the lights
+        features_of = partial(
+            refine_features,
+            reference=brightness(torch.from_numpy(observations)),
+            signs=alternating_signs(torch.as_tensor(middle, dtype=torch.float32, device=device)),
+        )
         lit = observations.max(axis=1) > 0
         mask = _around_object(mask)
         above = _Band(slice(0, 0), normals, errors)
@@ -131,7 +142,7 @@ class Refiner:
             band = _Band(pixels, normals, errors)
             for tile in tiles:
                 own = tile.rows[tile.inner][tile.mask[tile.inner]]
-                refined, refined_errors = self._refine(tile, light_of, normals, errors, reference)
+                refined, refined_errors = self._refine(tile, light_of, normals, errors, features_of)
                 # Nothing is known of a pixel that is dark under every light.
                 known = lit[own]
                 band.put(own[known], refined[known], refined_errors[known])
@@ -164,7 +175,12 @@ class Refiner:
                 yield _Tile(seen, rows[:, outer], inner)
 
     def _refine(
-        self, tile: _Tile, light_of: LightOf, normals: Floats, errors: Floats, reference: float
+        self,
+        tile: _Tile,
+        light_of: LightOf,
+        normals: Floats,
+        errors: Floats,
+        features_of: Callable[..., torch.Tensor],
     ) -> tuple[Floats, Floats]:
         """Return the refined normals and errors of a tile without its margin."""
         device = self.network.enter.weight.device
@@ -177,17 +193,22 @@ class Refiner:
         for start in range(0, len(rows), LIT_AT_ONCE):
             block = rows[start : start + LIT_AT_ONCE]
             light = light_of(block)
-            features.view(-1, CHANNELS)[places[start : start + LIT_AT_ONCE]] = refine_features(
+            features.view(-1, CHANNELS)[places[start : start + LIT_AT_ONCE]] = features_of(
                 tensor(light.observations),
                 tensor(light.directions),
                 tensor(light.in_frame_of_pixels(normals[block])),
                 tensor(errors[block]),
-                reference,
             )
-        mask = torch.from_numpy(tile.mask).to(device, torch.float32)
-        maps = self._average_turns(features.permute(2, 0, 1), mask[None], tile.inner)
+        mask = torch.from_numpy(tile.mask).to(device, torch.float32)[None]
+        seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
+        features = features.permute(2, 0, 1)
+        found, found_errors = self._average_turns(features, mask, seen)
+        if light.observations.shape[1] >= FEWEST_LIGHTS:
+            found = restore_detail(found, features[:, *seen], mask[:, *seen])
         inside = tile.mask[tile.inner]
-        refined, refined_errors = (values.permute(1, 2, 0).cpu().numpy()[inside] for values in maps)
+        refined, refined_errors = (
+            values[:, *inner].permute(1, 2, 0).cpu().numpy()[inside] for values in (found, found_errors)
+        )
         own = tile.rows[tile.inner][inside]
         for start in range(0, len(own), LIT_AT_ONCE):
             part = slice(start, start + LIT_AT_ONCE)
@@ -198,15 +219,15 @@ class Refiner:
         return refined, refined_errors
 
     def _average_turns(
-        self, features: torch.Tensor, mask: torch.Tensor, inner: Part
+        self, features: torch.Tensor, mask: torch.Tensor, wanted: Part
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return normals (3, h, w) and errors (2, h, w) of the inner part, averaged over the turns of the map."""
+        """Return normals (3, h, w) and errors (2, h, w) of a part of the map, averaged over the turns of the map."""
         normals = errors = torch.zeros((), device=mask.device)
         for turn in map(Turn, range(self.turns)):
-            seen, seen_mask = turn_features(features, turn), turn_maps(mask, turn)
-            part = _turned_part(inner, mask.shape[-2:], turn.quarters)
+            turned, turned_mask = turn_features(features, turn), turn_maps(mask, turn)
+            part = _turned_part(wanted, mask.shape[-2:], turn.quarters)
             with torch.autocast(mask.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-                found, found_errors = self.network(seen[None], seen_mask[None], part)
+                found, found_errors = self.network(turned[None], turned_mask[None], part)
             normals = normals + turn_maps(found[0], turn.back, vectors=((0, 1),))
             errors = errors + turn_maps(found_errors[0], turn.back)
         return torch.nn.functional.normalize(normals, dim=0), errors / self.turns
@@ -221,6 +242,18 @@ def _around_object(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     part = mask[tuple(bounds)]
     missing = [(0, side.stop - side.start - length) for side, length in zip(bounds, part.shape, strict=True)]
     return np.pad(part, missing)
+
+
+def _with_neighbours(part: Part, shape: Sequence[int]) -> tuple[Part, Part]:
+    """Return a part of a map of this shape with all pixels that its detail depends on, and where the part is in it."""
+    margin = -(-DETAIL_REACH // COARSEST) * COARSEST
+    grown, within = [], []
+    for side, length in zip(part, shape, strict=True):
+        start, stop, _ = side.indices(length)
+        first = max(0, start - margin)
+        grown.append(slice(first, min(stop + margin, length)))
+        within.append(slice(start - first, stop - first))
+    return (grown[0], grown[1]), (within[0], within[1])
 
 
 def _turned_part(part: Part, shape: Sequence[int], quarters: int) -> Part:

@@ -10,26 +10,43 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
-from splinecli.fits.weighted_least_squares import weighted_least_squares, weighted_sum
+from splinecli.fits.two_halves import compare_halves
+from splinecli.fits.weighted_least_squares import weighted_sum
 from splinecli.observation_map import dot, map_scale
 
-VECTORS = ((0, 1), (3, 4), (6, 7), (9, 10), (11, 12))
+VECTORS = ((0, 1), (3, 4), (6, 7), (9, 10), (11, 12), (24, 25))
 """Channels that hold the x and y of vectors, and turn with the image."""
 
 TENSOR = (13, 14, 15)
 """Channels that hold the xx, yy and xy of the lights' second moments."""
 
-CHANNELS = 24
+PLAIN = slice(6, 9)
+"""Channels that hold the normal of least squares, minus the estimated one."""
+
+HALVES = slice(24, 27)
+"""Channels in which two halves of the lights are compared. Their sign means nothing."""
+
+NOISE = slice(27, 28)
+"""The channel that the net does not read. It serves restore_detail of networks/detail.py."""
+
+READ = 27
+CHANNELS = 28
 MEDIAN, SHAPE = 16, 17
 """Channels that hold the two numbers of the error's distribution; see networks/error_head.py."""
 
 _MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
 _LARGEST_LOG = 4.0
+_HALVES_SCALE = 3.0  # brings these small numbers near the others
 
 
 @torch.no_grad()
 def refine_features(
-    observations: Tensor, light_directions: Tensor, normals: Tensor, error: Tensor, reference: float
+    observations: Tensor,
+    light_directions: Tensor,
+    normals: Tensor,
+    error: Tensor,
+    reference: float,
+    signs: Tensor,
 ) -> Tensor:
     """Return the features (P, CHANNELS) of pixels, each about -1 to 1.
 
@@ -37,7 +54,8 @@ def refine_features(
     9, 10: x and y of the mean light direction, weighted by what a matte surface with this normal does not explain.
     11 to 15: mean and second moments of the lights' x and y. 16, 17: the error's distribution. 18: logarithm of the
     largest observation, relative to the capture. 19, 20: mean and standard deviation over the largest. 21: root mean
-    square of what is not explained. 22: share of dark observations. 23: logarithm of the number of lights.
+    square of what is not explained. 22: share of dark observations. 23: logarithm of the number of lights. 24 to 26:
+    how two halves of the lights differ, and 27: the noise of least squares that follows; see fits/two_halves.py.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.
@@ -45,14 +63,14 @@ def refine_features(
         normals: (P, 3), unit.
         error: (P, 2), see networks/error_head.py.
         reference: the brightness of the capture, see `brightness`.
+        signs: (F,), the halves of the capture's lights, see alternating_signs of fits/two_halves.py.
     """
     scale = map_scale(observations)
     observed = observations / scale
     count = observed.shape[1]
     robust = torch.nn.functional.normalize(fit_lambertian(observed, light_directions), dim=-1)
-    wide = observed.double()
-    plain = weighted_least_squares(wide, light_directions.double(), torch.ones_like(wide[:1]))[0]
-    plain = torch.nn.functional.normalize(plain, dim=-1).to(observed)
+    halves = compare_halves(observed.double(), light_directions.double(), signs)
+    plain, change, noise = (found.to(observed) for found in halves)
     cosine = dot(normals, light_directions).clamp_(min=0)
     # Products with ones are faster than sums over so few columns.
     mean = observed.new_full((count, 1), 1 / count)
@@ -77,6 +95,8 @@ def refine_features(
             3 * (unexplained.square() @ mean).sqrt(),
             (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
             torch.full_like(scale, math.log(count / 10)),
+            (_HALVES_SCALE * change).clamp(-1, 1),
+            noise.clamp(-1, 1),
         ),
         dim=1,
     )

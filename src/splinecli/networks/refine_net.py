@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from types import EllipsisType
@@ -11,8 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
+from splinecli.networks.gaussian import gaussian_sum
 from splinecli.networks.layers import zeroed
-from splinecli.networks.refine_features import CHANNELS, split_features
+from splinecli.networks.refine_features import READ, split_features
 
 WIDTHS = (32, 64, 96, 64)
 """Channels at the full resolution, and at a half, a quarter and an eighth of it."""
@@ -51,7 +51,7 @@ class RefineNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.enter = nn.Conv2d(CHANNELS + 1 + 3 * len(SIGMAS), WIDTHS[0], 3, padding=1)
+        self.enter = nn.Conv2d(READ + 1 + 3 * len(SIGMAS), WIDTHS[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
@@ -86,7 +86,8 @@ class RefineNet(nn.Module):
         normals, error = (part.contiguous() for part in split_features(features))
         towards = [smooth - normals for smooth in _smoothed(normals, error[:, :1], mask)]
         # In place where possible: a tile's maps of 32 channels decide how much memory is needed.
-        x = self.enter(_joined((features, *towards, mask), border, layers)).mul_(masks[0]).to(stream)
+        read = features[:, :READ], *towards, mask
+        x = self.enter(_joined(read, border, layers)).mul_(masks[0]).to(stream)
         mask, normals, error, *towards = (
             maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards)
         )
@@ -166,19 +167,7 @@ def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
     weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
     found = []
     for sigma in SIGMAS:
-        reach = math.ceil(3 * sigma)
-        kernel = [math.exp(-0.5 * (place / sigma) ** 2) for place in range(-reach, reach + 1)]
-        found.append(_unit(_filtered(_filtered(normals * weight, kernel, -1), kernel, -2)) * mask)
-    return found
-
-
-def _filtered(maps: Tensor, kernel: Sequence[float], axis: int) -> Tensor:
-    """Filter maps along an axis: faster than a convolution of so few channels."""
-    reach, size = len(kernel) // 2, maps.shape[axis]
-    padded = pad(maps, (reach, reach) if axis == -1 else (0, 0, reach, reach))
-    found = kernel[0] * padded.narrow(axis, 0, size)
-    for start, weight in enumerate(kernel[1:], 1):
-        found.add_(padded.narrow(axis, start, size), alpha=weight)
+        found.append(_unit(gaussian_sum(normals * weight, sigma)) * mask)
     return found
 
 

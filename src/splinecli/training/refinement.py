@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from splinecli.fits.two_halves import alternating_signs
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_features import (
+    HALVES,
     Turn,
     brightness,
     refine_features,
@@ -227,12 +229,13 @@ def pixel_features(network: SplineNet, observations: Tensor, light_directions: T
     network.eval()
     reference = brightness(observations)
     light_directions = light_directions.to(device)
+    signs = alternating_signs(light_directions)
     found = []
     for start in range(0, len(observations), _BATCH):
         batch = observations[start : start + _BATCH].to(device)
         normals, error = network(batch, light_directions)
         assert error is not None, "TrainingConfig asks for an error head"
-        found.append(refine_features(batch, light_directions, normals, error, reference))
+        found.append(refine_features(batch, light_directions, normals, error, reference, signs))
     return torch.cat(found)
 
 
@@ -250,10 +253,13 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
 
 
 def _turned(example: SceneMaps, generator: torch.Generator) -> SceneMaps:
-    draw = torch.rand(2, generator=generator, device=generator.device).tolist()
+    draw = torch.rand(3, generator=generator, device=generator.device).tolist()
     turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
+    features = turn_features(example.features, turn).clone()
+    if draw[2] < 0.5:
+        features[HALVES].neg_()
     return SceneMaps(
-        turn_features(example.features, turn),
+        features,
         turn_maps(example.normals, turn, vectors=((0, 1),)),
         turn_maps(example.mask, turn),
     )
