@@ -126,13 +126,12 @@ class Refiner:
             progress: called after each tile with the number of its pixels.
         """
         device = self.network.enter.weight.device
-        middle = light_of(np.array([len(normals) // 2])).directions.reshape(
-            -1, 3
-        )  # as one pixel sees the lights
+        middle = light_of(np.array([len(normals) // 2])).directions  # as one pixel sees the lights
+        directions = torch.as_tensor(middle, dtype=torch.float32, device=device).view(-1, 3)
         features_of = partial(
             refine_features,
             reference=brightness(torch.from_numpy(observations)),
-            signs=alternating_signs(torch.as_tensor(middle, dtype=torch.float32, device=device)),
+            signs=alternating_signs(directions),
         )
         lit = observations.max(axis=1) > 0
         mask = _around_object(mask)
