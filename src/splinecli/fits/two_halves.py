@@ -19,12 +19,14 @@ _TINY = 1e-9
 
 
 class TwoHalves(NamedTuple):
-    """Attributes:
-    normals: (P, 3), unit, of least squares with all lights.
-    change: (P, 3). By so much the normals change, to first order, where the residuals of one half of the lights are
-        added once more, and those of the other half subtracted.
-    noise: (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal
-        noise. Its sign means nothing. Three lights have no residuals, so they do not show it.
+    """The normals that all lights give, and what two halves of the lights disagree about. The signs mean nothing.
+
+    Attributes:
+        normals: (P, 3), unit, of least squares with all lights.
+        change: (P, 3), what least squares makes of the residuals where those of one half have the opposite sign, as a
+            share of the albedo. On a ring of lights, it is half the difference between the normals of the halves.
+        noise: (P, 1), in radians. Its mean square is that of the normals' random errors, if all observations have equal
+            noise. Three lights have no residuals, so they do not show it.
     """
 
     normals: Tensor
