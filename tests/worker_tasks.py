@@ -1,4 +1,4 @@
-"""Tasks for workers in other processes, which import this file. They note in a folder what happens."""
+"""Items for workers in other processes, which import this file. They note in a folder what happens."""
 
 from __future__ import annotations
 

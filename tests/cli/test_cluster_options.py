@@ -14,7 +14,6 @@ import pytest
         (("--workers", "0"), "--workers is '0'; expected a number from 1, or auto"),
         (("--workers", "many"), "--workers is 'many'; expected a number from 1, or auto"),
         (("--workers", "2", "--cluster", "tcp://a:1"), "--workers and --cluster contradict each other"),
-        (("--retries", "3"), "--retries concerns lost workers"),
         (("--shard", "3/2"), "--shard is 3/2; expected I/N with I from 1 to N"),
         (("--shard", "half"), "--shard is 'half'; expected I/N"),
         (

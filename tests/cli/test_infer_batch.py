@@ -398,7 +398,7 @@ def test_arguments_are_checked_before_the_first_capture(
 ):
     make_capture("second")
     touched = []
-    monkeypatch.setattr("splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1))
+    monkeypatch.setattr("splinecli.pipeline.member.infer_capture", lambda *_, **__: touched.append(1))
     method = () if "--method" in arguments else ("--method", "ls")
     result = run("infer", capture, "second", *method, *arguments)
     assert (result.code, result.out, touched) == (code, "", [])

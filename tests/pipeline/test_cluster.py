@@ -1,13 +1,13 @@
-"""Tasks on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many captures."""
+"""Items on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many captures."""
 
 from __future__ import annotations
 
 import json
 import re
 import socket
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,19 +19,17 @@ import pytest
 import worker_tasks
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
-from splinecli.pipeline import batch_on_workers, connection
-from splinecli.pipeline import cluster as cluster_module
+from splinecli.pipeline import batch, connection
+from splinecli.pipeline import distribution as distribution_module
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.capture_list import Member, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
-from splinecli.pipeline.cluster import Distributor
 from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.distribution import Distributor, Item, LostError, Work
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT
-from splinecli.pipeline.tasks import LostError, Task
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-from splinecli.pipeline.worker import Work  # noqa: E402 - it may be imported without Dask, too
 
 GB = 10**9
 
@@ -52,6 +50,7 @@ def client(cluster: Any) -> Iterator[Any]:
 @pytest.fixture
 def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Work]:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "probe").touch()
 
     def make(do: Callable[..., Any]) -> Work:
         return Work.of_this_process(str(tmp_path), worker_tasks.get_ready, do, tmp_path / "probe")
@@ -59,55 +58,46 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Work]
     return make
 
 
-def run(client: Any, work: Work, tasks: list[Task], **options: Any) -> dict[int, Any]:
+def run(client: Any, work: Work, items: list[Item], **options: Any) -> dict[int, Any]:
     distributor = Distributor(client, work, ClusterOptions(**options), SILENT)
-    return {task.args[0]: result for task, result in distributor.run(tasks)}
+    return {item.args[0]: result for item, result in distributor.run(items)}
 
 
-def numbered(numbers: range, memory: float = 0) -> list[Task]:
-    return [Task((number,), f"task{number}", memory) for number in numbers]
+def numbered(numbers: range, memory: float = 0) -> list[Item]:
+    return [Item((number,), f"task{number}", memory) for number in numbers]
 
 
-@pytest.mark.parametrize("retries", [0, 2])
-def test_a_task_that_kills_its_workers(client, work, tmp_path, retries):
-    results = run(client, work(worker_tasks.die_of_thirteen), numbered(range(20)), retries=retries)
+def test_an_item_that_kills_its_workers(client, work, tmp_path):
+    results = run(client, work(worker_tasks.die_of_thirteen), numbered(range(20)))
     error = results.pop(13)
     assert isinstance(error, LostError) and error.exit_code == 1
-    times = "once" if retries == 0 else "3 times"
-    assert str(error).startswith(f"task13: its worker was lost {times}, the last one tcp://")
-    assert (tmp_path / "begun-13").read_text() == "x" * (retries + 1)
+    assert str(error).startswith("task13: its worker was lost 3 times, the last one tcp://")
+    assert (tmp_path / "begun-13").read_text() == "xxx"
     assert results == {number: 2 * number for number in range(20) if number != 13}
-    assert all((tmp_path / f"begun-{number}").read_text() == "x" for number in results)
 
 
 def test_ctrl_c_leaves_workers_alone(client, work):
     """A terminal sends it to all processes; the command itself ends the workers."""
-    pids = run(client, work(worker_tasks.survive_an_interrupt), numbered(range(6)), retries=0)
+    pids = run(client, work(worker_tasks.survive_an_interrupt), numbered(range(6)))
     assert all(isinstance(pid, int) for pid in pids.values()) and len(set(pids.values())) <= 2
 
 
-def test_tasks_share_the_memory_of_a_machine(client, work, monkeypatch):
-    """Two tasks of two thirds of the memory run one after the other, small ones side by side."""
-    two_thirds = batch_on_workers_memory(client, work) * 2 / 3
-    alone = run(client, work(worker_tasks.count_neighbours), numbered(range(6), two_thirds))
+def test_items_share_the_memory_of_a_machine(client, work, monkeypatch):
+    """Two items of two thirds of the memory run one after the other, small ones side by side."""
+    monkeypatch.setattr(distribution_module, "available_memory", lambda: 3.0 * GB)
+    alone = run(client, work(worker_tasks.count_neighbours), numbered(range(6), 2 * GB))
     assert set(alone.values()) == {1}
-    beside = run(client, work(worker_tasks.count_neighbours), numbered(range(20), two_thirds / 4))
+    beside = run(client, work(worker_tasks.count_neighbours), numbered(range(20), GB / 2))
     assert 2 in beside.values()
-    # A machine without any task takes one that seems too large: the capture itself checks its memory.
+    # An item that seems too large runs alone: the capture itself checks its memory.
     assert set(run(client, work(worker_tasks.count_neighbours), numbered(range(2), 1e18)).values()) == {1}
-
-
-def batch_on_workers_memory(client: Any, work: Callable[..., Work]) -> float:
-    distributor = Distributor(client, work(worker_tasks.double), ClusterOptions(), SILENT)
-    list(distributor.run(numbered(range(1))))
-    return min(distributor._free_memory.values())
 
 
 def test_a_task_for_no_worker(client, work):
     """A limit that Dask holds a worker to is known before the task kills the worker."""
     client.run(worker_tasks.set_resources, MEMORY=4 * GB)
     try:
-        results = run(client, work(worker_tasks.double), [*numbered(range(2), GB), Task((2,), "big", 5 * GB)])
+        results = run(client, work(worker_tasks.double), [*numbered(range(2), GB), Item((2,), "big", 5 * GB)])
     finally:
         client.run(worker_tasks.set_resources, MEMORY=1000 * GB)
     assert str(results.pop(2)).startswith(
@@ -130,14 +120,14 @@ def test_workers_that_do_not_fit(client, work, tmp_path):
     for message, (kind, other) in cases.items():
         (tmp_path / "elsewhere").mkdir(exist_ok=True)
         distributor = Distributor(client, other, ClusterOptions(), SILENT)
-        distributor._make_probe = lambda: None
         with pytest.raises(kind, match=rf"{message}.* \(on the worker tcp://"):
             list(distributor.run(numbered(range(3))))
 
 
 def test_workers_without_splinecli(client, work, monkeypatch):
-    monkeypatch.setattr(connection, "_PACKAGE", "no-such-package")
-    with pytest.raises(UsageError, match="splinecli is not installed on the worker tcp://"):
+    missing = {"tcp://elsewhere:1": metadata.PackageNotFoundError("splinecli")}
+    monkeypatch.setattr(client, "run", lambda *_, **__: missing)
+    with pytest.raises(UsageError, match="splinecli is not installed on the worker tcp://elsewhere:1"):
         run(client, work(worker_tasks.double), numbered(range(3)))
 
 
@@ -149,45 +139,6 @@ def test_gpu_workers_only(client, work):
         assert run(client, work(worker_tasks.double), numbered(range(3)), gpu=True) == {0: 0, 1: 2, 2: 4}
     finally:
         client.run(worker_tasks.set_resources, GPU=0)
-
-
-def test_workers_without_a_gpu_are_not_asked(client, work, monkeypatch):
-    with_gpu, _ = client.scheduler_info(n_workers=-1)["workers"]
-    asked: list[str] = []
-    monkeypatch.setattr(cluster_module, "workers_without_splinecli", lambda _, new: asked.extend(new) or [])
-    client.run(worker_tasks.set_resources, GPU=1, workers=[with_gpu])
-    try:
-        assert run(client, work(worker_tasks.double), numbered(range(3)), gpu=True) == {0: 0, 1: 2, 2: 4}
-    finally:
-        client.run(worker_tasks.set_resources, GPU=0)
-    assert asked == [with_gpu]
-
-
-def test_workers_that_come_late_and_do_not_fit(client, work, monkeypatch):
-    """If none fits, the command ends, however long it has waited for the first worker."""
-    clock, look = [0.0], client.scheduler_info
-
-    def nobody_at_first(**options: Any) -> Any:
-        if clock[0]:
-            return look(**options)
-        clock[0] = 1000.0
-        return {"workers": {}}
-
-    monkeypatch.setattr(client, "scheduler_info", nobody_at_first)
-    now = SimpleNamespace(monotonic=lambda: time.monotonic() + clock[0])
-    monkeypatch.setattr(cluster_module, "time", now)
-    good = work(worker_tasks.double)
-    other = replace(good, versions={**good.versions, "splinecli": "9.9"})
-    with pytest.raises(UsageError, match=r"expected 9\.9"):
-        run(client, other, numbered(range(3)), address="tcp://elsewhere")
-
-
-def test_workers_that_get_ready_are_no_early_losses(client, work):
-    """Workers that machines take back in a long command are not counted together."""
-    distributor = Distributor(client, work(worker_tasks.double), ClusterOptions(), SILENT)
-    distributor._lost_early = cluster_module._MOST_LOST_EARLY
-    assert len(list(distributor.run(numbered(range(2))))) == 2
-    assert distributor._lost_early == 0
 
 
 def write_captures(names: list[str]) -> list[str]:
@@ -264,7 +215,7 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folders = [Path(name) for name in write_captures(["a"])]
     weights = SimpleNamespace(weights={"sha256": "1234"})
-    monkeypatch.setattr(batch_on_workers, "make_method", lambda options: weights)
+    monkeypatch.setattr(batch, "make_method", lambda options: weights)
     options = ClusterOptions(address=cluster.scheduler_address)
     with pytest.raises(ModelError, match="expected 1234 as on the machine of the command"):
         list(infer_batch(folders, InferOptions(method="cnn-ps"), cluster=options))
@@ -298,9 +249,9 @@ def test_no_scheduler(address, tmp_path, monkeypatch):
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     """The command sees the folder, so it is not missing for it."""
     monkeypatch.chdir(tmp_path)
-    settings = batch_on_workers._Settings(InferOptions(method="ls"), "nothing", None)
+    settings = batch._Settings(InferOptions(method="ls"), "nothing", None)
     member = Member(tmp_path / "unseen", "unseen")
-    outcome, _ = client.submit(batch_on_workers._infer, settings, 0, member, pure=False).result()
+    outcome, _ = client.submit(batch._infer, settings, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
 

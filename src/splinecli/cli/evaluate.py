@@ -48,7 +48,6 @@ def evaluate(
     jobs: int | None = computing.JOBS,
     workers: str = distribution.TRIAL_WORKERS,
     cluster: str | None = distribution.TRIAL_CLUSTER,
-    retries: int | None = distribution.TRIAL_RETRIES,
     figures: bool = outputs.FIGURES,
     pixel: list[str] | None = outputs.FIGURE_PIXELS,
     output: Path = outputs.EVALUATION_FOLDER,
@@ -91,7 +90,7 @@ def evaluate(
         pixels=tuple(parse_pixel(text) for text in pixel or []),
         output=str(output),
         overwrite=overwrite,
-        cluster=parse_cluster(workers, cluster, retries, gpu=device is Device.cuda),
+        cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
     )
     talk = Messages(quiet=quiet)
     outcome = evaluate_captures(datasets, options, talk)

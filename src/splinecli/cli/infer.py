@@ -26,7 +26,7 @@ from splinecli.errors import UsageError, printable
 from splinecli.surface.surface_files import MESH_FILES
 
 if TYPE_CHECKING:
-    from splinecli.pipeline.batch import Outcome, Redo
+    from splinecli.pipeline.member import Outcome, Redo
     from splinecli.results.index import Row
 
 
@@ -88,7 +88,6 @@ def infer(
     strict: bool = outputs.STRICT,
     workers: str = distribution.WORKERS,
     cluster: str | None = distribution.CLUSTER,
-    retries: int | None = distribution.RETRIES,
     shard: str | None = distribution.SHARD,
     as_json: bool = outputs.JSON_LIST,
     as_json_lines: bool = outputs.JSON_LINES,
@@ -164,7 +163,7 @@ def infer(
             messages,
             redo=redo,
             shard=None if shard is None else Shard.parse(shard),
-            cluster=parse_cluster(workers, cluster, retries, gpu=device is Device.cuda),
+            cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
         )
         return _show_all(
             batch, output, messages, documents, summaries=not (quiet or as_json or as_json_lines)

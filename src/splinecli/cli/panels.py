@@ -42,7 +42,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--quiet",
         ),
         "Speed": ("--distil", *SPEED),
-        "Processes and machines": ("--workers", "--cluster", "--retries", "--shard"),
+        "Processes and machines": ("--workers", "--cluster", "--shard"),
     },
     "info": {
         "Input": ("--mask", *PART, "--ground-truth", *VALUES, *LIMITS),
@@ -79,7 +79,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Method": ("--method", "--weights", "--rotations"),
         "Output": ("--output", "--figures", "--pixel", *REPEAT),
         "Speed": ("--jobs", *SPEED),
-        "Processes and machines": ("--workers", "--cluster", "--retries"),
+        "Processes and machines": ("--workers", "--cluster"),
     },
     "prepare": {
         "Input": ("--as-stored", "--update", "--white-level", *LIMITS),

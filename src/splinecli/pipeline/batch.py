@@ -1,53 +1,25 @@
-"""Run `infer` on many captures: skip what is done, and go on past a capture that fails."""
+"""Run `infer` on many captures, in this process or on others, and go on past a capture that fails."""
 
 from __future__ import annotations
 
-import errno
-import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
-from splinecli.errors import InputError, OutputError, SplinecliError
-from splinecli.memory import is_out_of_memory
+from splinecli.errors import InputError, ModelError, SplinecliError
 from splinecli.pipeline.capture_list import Member, Shard, list_captures
-from splinecli.pipeline.finished import find_earlier
-from splinecli.pipeline.infer import infer_capture, make_method
+from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.member import Outcome, Redo, failed, run_member
 from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
-    from splinecli.methods import Estimator
+    from splinecli.methods import Estimator, MethodOptions
     from splinecli.pipeline.connection import ClusterOptions
     from splinecli.results.index import Entry
-
-Redo = Literal["nothing", "changed", "all"]
-"""What to do with captures that have results: keep them all, redo what changed, or redo everything."""
-
-Status = Literal["done", "skipped", "changed", "missing", "failed"]
-
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of one capture.
-
-    Args:
-        capture: its name.
-        status: done, skipped (results are up to date), changed (results are out of date and were kept), missing
-            (there is no such folder) or failed.
-        report: the report of the results, or the document {capture, error, exit_code}.
-        exit_code: of this capture.
-        trace: the Python traceback of an error that splinecli did not expect.
-    """
-
-    capture: str
-    status: Status
-    report: dict[str, Any]
-    exit_code: int = 0
-    trace: str = ""
 
 
 def infer_batch(
@@ -117,9 +89,7 @@ def _outcomes(
     if cluster is None:
         yield from enumerate(_one_by_one(members, options, observer, redo))
         return
-    from splinecli.pipeline.batch_on_workers import infer_on_workers
-
-    yield from infer_on_workers(members, options, observer, redo=redo, cluster=cluster)
+    yield from _on_workers(members, options, observer, redo, cluster)
 
 
 def _one_by_one(
@@ -137,100 +107,110 @@ def _one_by_one(
         yield run_member(member, options, redo, method, observer)
 
 
-def run_member(
-    member: Member, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
-) -> Outcome:
-    """Compute one capture of a batch, unless its results are up to date or are to be kept.
+def _on_workers(
+    members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
+) -> Iterator[tuple[int, Outcome]]:
+    """Yield the number and the outcome of each capture as it ends on another process."""
+    from splinecli.pipeline.capture_memory import expected_bytes
+    from splinecli.pipeline.distribution import Item, LostError, distributor
 
-    Args:
-        member: the capture.
-        options, observer: see infer_capture.
-        redo: see infer_batch.
-        method: returns the estimator; it is called if the capture is computed.
+    # On any device: the machine of the command may have none of the workers' GPUs.
+    weights = make_method(replace(options, device="cpu") if cluster.address else options).weights
+    settings = _Settings(options, redo, None if weights is None else weights["sha256"])
+    items = (
+        Item((number, member), str(member.folder), expected_bytes(member, options))
+        for number, member in enumerate(members)
+    )
+    with (
+        distributor(settings, _prepare, _infer, Path(options.output), cluster, observer) as workers,
+        observer.progress("captures", len(members), unit="captures") as advance,
+    ):
+        began, n_failed, n_pixels = time.monotonic(), 0, 0
+        for n_ended, (item, result) in enumerate(workers.run(items), start=1):
+            number, member = item.args
+            if isinstance(result, LostError):
+                outcome = failed(member.name, result)
+            else:
+                outcome, warnings = result
+                for warning in warnings:
+                    observer.warn(warning)
+            n_failed += outcome.exit_code != 0
+            n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
+            advance(
+                1,
+                f"{n_ended - n_failed} done, {n_failed} failed, {len(workers.running)} running,"
+                f" {n_pixels / (time.monotonic() - began):,.0f} pixels/s",
+            )
+            yield number, outcome
 
-    Raises:
-        UsageError, ModelError: what `method` raises. It is wrong for every capture.
-        OutputError: the output folder cannot be written, or the disk is full.
-    """
-    if member.missing is not None:
-        return replace(failed(member.name, member.missing), status="missing")
-    try:
-        outcome = _earlier_outcome(member, options, observer, redo)
-    except Exception as error:
-        outcome = _failure(member, error)
-    if outcome is not None:
-        return outcome
-    estimator = method()
-    try:
-        return Outcome(
-            member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator)
+
+@dataclass(frozen=True)
+class _Settings:
+    """What all captures of a batch share, and the checksum of the weights on the machine of the command."""
+
+    options: InferOptions
+    redo: Redo
+    weights_sha256: str | None
+
+
+class _Warnings(Observer):
+    """Keeps warnings, which go back with the report."""
+
+    def __init__(self) -> None:
+        self.found: list[str] = []
+
+    def warn(self, message: str) -> None:
+        self.found.append(message)
+
+
+def _prepare(settings: _Settings) -> None:
+    """Check on a worker the files that the options name, and the weights."""
+    settings.options.check_files()
+    _method(settings)
+
+
+def _infer(settings: _Settings, number: int, member: Member) -> tuple[Outcome, list[str]]:
+    """Compute a capture on a worker, and return what became of it and the warnings."""
+    from splinecli.pipeline.distribution import SAME_STORAGE, this_worker
+
+    observer = _Warnings()
+    if member.missing is None and not os.path.lexists(member.folder):
+        here = this_worker()
+        member = replace(
+            member,
+            missing=InputError(
+                f"the folder does not exist on the worker {here}", path=member.folder, hint=SAME_STORAGE
+            ),
         )
-    except Exception as error:
-        return _failure(member, error)
+    outcome = run_member(member, settings.options, settings.redo, lambda: _method(settings), observer)
+    return outcome, observer.found
+
+
+_made: dict[tuple[str, MethodOptions, str | None], Estimator] = {}
+"""The estimator of this worker; loading it takes a second."""
+
+
+def _method(settings: _Settings) -> Estimator:
+    options, sha256 = settings.options, settings.weights_sha256
+    key = (options.method, options.method_options, sha256)
+    if key not in _made:
+        estimator = make_method(options)
+        found = None if estimator.weights is None else estimator.weights["sha256"]
+        if found != sha256:
+            raise ModelError(
+                f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
+                path=options.weights,
+                hint="Use the same file, and the same version of splinecli, everywhere",
+            )
+        _made.clear()
+        _made[key] = estimator
+    return _made[key]
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
     """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
-
-
-def _error_document(error: SplinecliError, capture: str) -> dict[str, Any]:
-    """Return the document that stands in place of the report of a capture."""
-    return {"capture": capture, "error": str(error), "exit_code": error.exit_code}
-
-
-def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, redo: Redo) -> Outcome | None:
-    """Return the outcome of a capture that is not to be computed, or None."""
-    from splinecli.files import check_writable
-    from splinecli.publishing import held_folder
-
-    target = Path(options.output) / member.name
-    check_writable(target)
-    if redo == "all":
-        return None
-    with held_folder(target, observer.warn):
-        earlier = find_earlier(target, member.folder, options)
-    if earlier.report is not None:
-        return Outcome(member.name, "skipped", earlier.report)
-    if not earlier.changed or (redo == "changed" and earlier.ours):
-        return None
-    update = "--update to redo what changed, " if earlier.ours else ""
-    error = OutputError(
-        earlier.changed,
-        path=target,
-        hint=f"Add {update}--overwrite to redo everything, or choose another place with -o",
-    )
-    return Outcome(member.name, "changed", _error_document(error, member.name), error.exit_code)
-
-
-def _failure(member: Member, error: Exception) -> Outcome:
-    """Return what became of a capture that failed. Raises OutputError again, but for BusyError: it ends the batch."""
-    from splinecli.locks import BusyError
-
-    name = member.name
-    if isinstance(error, OutputError) and not isinstance(error, BusyError):
-        raise error
-    if isinstance(error, SplinecliError):
-        return failed(name, error)
-    if isinstance(error, OSError) and not is_out_of_memory(error):
-        reason = error.strerror or str(error)
-        if error.errno in _NO_ROOM:
-            raise OutputError(f"cannot be written ({reason})", path=error.filename) from error
-        return failed(name, InputError(f"cannot be read ({reason})", path=error.filename or member.folder))
-    if is_out_of_memory(error):
-        hint = "Use smaller images, or lower --batch-size"
-        return failed(name, SplinecliError("there is not enough memory", path=member.folder, hint=hint))
-    defect = SplinecliError(
-        f"{name}: {type(error).__name__}: {error}. This is a defect of splinecli",
-        hint="Please report it with the lines above",
-    )
-    return failed(name, defect, "".join(traceback.format_exception(error)))
-
-
-def failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
-    """Return the outcome of a capture that failed."""
-    return Outcome(name, "failed", _error_document(error, name), error.exit_code, trace)
 
 
 def _write_index(entries: Sequence[Entry], output: Path, observer: Observer) -> None:

@@ -6,10 +6,9 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from importlib import metadata
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -25,9 +24,8 @@ if TYPE_CHECKING:
     from distributed import Client
 
 RETRIES = 2
-"""How often a task is done again whose worker was lost, unless the user says otherwise."""
+"""How often an item is repeated whose worker of this machine was lost. A running cluster has a setting of its own."""
 
-_PACKAGE = "splinecli"
 _CONNECT_SECONDS = 5.0
 _ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0
@@ -50,30 +48,28 @@ _QUIET = {
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterOptions:
-    """Where tasks are done.
+    """Where items are done.
 
     Args:
         workers: the number of processes of this machine, if there is no `address`. 0 for as many as it can use.
         address: the address of a Dask scheduler, or its scheduler file.
-        retries: how often a task is done again whose worker was lost.
         gpu: whether only workers with the Dask resource GPU are used.
     """
 
     workers: int = 1
     address: str | None = None
-    retries: int = RETRIES
     gpu: bool = False
 
-    def on_cores(self, n_tasks: int | None = None) -> ClusterOptions | None:
-        """Return these options with a process for each core in place of 0, and at most one for each task.
+    def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
+        """Return these options with a process for each core in place of 0, and at most one for each item.
 
-        Return None where this process can do the tasks as well.
+        Return None where this process can do the items as well.
         """
         if self.address is not None:
             return self
         workers = self.workers or count_available_cores()
-        if n_tasks is not None:
-            workers = min(workers, n_tasks)
+        if n_items is not None:
+            workers = min(workers, n_items)
         return None if workers < 2 else replace(self, workers=workers)
 
 
@@ -139,6 +135,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         **_QUIET,
+        "distributed.scheduler.allowed-failures": RETRIES,
         "distributed.worker.preload": [_IGNORE_INTERRUPTS],
         "logging": dict.fromkeys(_LOGGERS, "critical"),
     }
@@ -179,20 +176,6 @@ def _threads_of_user() -> float:
     """Return the threads that OMP_NUM_THREADS allows."""
     number = os.environ.get("OMP_NUM_THREADS", "")
     return int(number) if number.isdecimal() else math.inf
-
-
-def workers_without_splinecli(client: Client, addresses: Iterable[str]) -> list[str]:
-    """Return those of some workers on which splinecli is not installed.
-
-    A task would end such a worker without a message, because it cannot be unpickled there.
-    """
-    workers = list(addresses)
-    if not workers:
-        return []
-    versions = client.run(metadata.version, _PACKAGE, workers=workers, on_error="return")
-    return [
-        address for address, found in versions.items() if isinstance(found, metadata.PackageNotFoundError)
-    ]
 
 
 def _address(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The trials of `evaluate` on several processes or machines: one task a draw of lights."""
+"""The trials of `evaluate` on several processes or machines: one item a draw of lights."""
 
 from __future__ import annotations
 
@@ -12,13 +12,10 @@ from splinecli.errors import ModelError
 from splinecli.evaluation.draws_elsewhere import DrawScorer, DrawScores, DrawTask
 from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import Estimator, MethodOptions, make_estimator
-from splinecli.pipeline.batch_on_workers import shared_probe
 from splinecli.pipeline.capture_memory import source_bytes
-from splinecli.pipeline.cluster import Distributor
-from splinecli.pipeline.connection import ClusterOptions, connected
+from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import Observer
-from splinecli.pipeline.tasks import LostError, Task
-from splinecli.pipeline.worker import Work
 
 
 @dataclass(frozen=True)
@@ -64,24 +61,22 @@ class OnWorkers:
             tuple(self.protocols),
         )
         lost: LostError | None = None
-        with shared_probe(self.output) as probe, connected(self.cluster) as client:
-            work = Work.of_this_process(settings, _scorer, _score, probe)
-            distributor = Distributor(client, work, self.cluster, self.observer)
-            for task, result in distributor.run(_tasks(draws)):
+        with distributor(settings, _scorer, _score, self.output, self.cluster, self.observer) as workers:
+            for item, result in workers.run(_items(draws)):
                 if isinstance(result, LostError):
                     lost = result
                 else:
-                    yield task.args[0], result
+                    yield item.args[0], result
         if lost is not None:
             raise lost
 
 
-def _tasks(draws: Iterable[DrawTask]) -> Iterator[Task]:
+def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
     folder, memory = None, 0.0
     for draw in draws:
         if draw.folder != folder:
             folder, memory = draw.folder, source_bytes(lambda: open_capture(draw.folder))  # noqa: B023 - called here
-        yield Task((draw,), draw.name, memory)
+        yield Item((draw,), draw.name, memory)
 
 
 _scorers: dict[str, DrawScorer] = {}

@@ -1,4 +1,4 @@
-"""The scenes of `prepare` on several processes: one task a scene."""
+"""The scenes of `prepare` on several processes: one item a scene."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from splinecli.files import UNFINISHED
-from splinecli.pipeline.batch_on_workers import shared_probe
-from splinecli.pipeline.cluster import Distributor
-from splinecli.pipeline.connection import ClusterOptions, connected
+from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import Observer
-from splinecli.pipeline.tasks import LostError, Task
-from splinecli.pipeline.worker import Work
 from splinecli.pixel_sets.rendered import (
     ScenePlan,
     add_rendered,
@@ -70,12 +67,10 @@ def render_on_workers(
             position += 1
 
     try:
-        with shared_probe(writer.folder) as probe, connected(cluster) as client:
-            work = Work.of_this_process(settings, _prepare, _render, probe)
-            tasks = (Task((number,), plan.names[number]) for number in missing)
+        with distributor(settings, _prepare, _render, writer.folder, cluster, observer) as workers:
             add_those_in_order()
-            for task, result in Distributor(client, work, cluster, observer).run(tasks):
-                rendered[task.args[0]] = result
+            for item, result in workers.run(Item((number,), plan.names[number]) for number in missing):
+                rendered[item.args[0]] = result
                 add_those_in_order()
     finally:
         for number in missing:

@@ -24,13 +24,6 @@ TRIAL_CLUSTER = Option(
     help="Score trials on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file"
     " (needs the extra 'cluster').",
 )
-TRIAL_RETRIES = Option(
-    None,
-    "--retries",
-    metavar="N",
-    min=0,
-    help="If the worker of a draw is lost, repeat the draw on another, up to N times. [default: 2]",
-)
 SCENE_WORKERS = Option(
     "1",
     "--workers",
@@ -44,14 +37,8 @@ CLUSTER = Option(
     help="Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file (needs"
     " the extra 'cluster').",
 )
-RETRIES = Option(
-    None,
-    metavar="N",
-    min=0,
-    help="If the worker of a capture is lost, repeat it on another, up to N times. [default: 2]",
-)
 SHARD = Option(
     None,
     metavar="I/N",
-    help="Take every N-th capture only, from the I-th on. Together, 1/N to N/N are all captures.",
+    help="Process shard I of N: captures I, I+N, I+2N, ...",
 )

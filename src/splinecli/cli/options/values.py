@@ -89,11 +89,9 @@ def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
     return items
 
 
-def parse_cluster(
-    workers: str, address: str | None = None, retries: int | None = None, *, gpu: bool = False
-) -> ClusterOptions | None:
+def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False) -> ClusterOptions | None:
     """Return where --workers and --cluster let tasks be done; None for this process. Raises UsageError."""
-    from splinecli.pipeline.connection import RETRIES, ClusterOptions
+    from splinecli.pipeline.connection import ClusterOptions
 
     if workers != "auto" and (not workers.isdecimal() or len(workers) > 4 or int(workers) < 1):
         raise UsageError(f"--workers is {workers!r}; expected a number from 1, or auto")
@@ -103,13 +101,9 @@ def parse_cluster(
             hint="Leave --workers out: the cluster has its workers",
         )
     if address is None and workers == "1":
-        if retries is not None:
-            raise UsageError("--retries concerns lost workers", hint="Add --workers or --cluster")
         return None
     number = 0 if workers == "auto" else int(workers)
-    return ClusterOptions(
-        workers=number, address=address, retries=RETRIES if retries is None else retries, gpu=gpu
-    )
+    return ClusterOptions(workers=number, address=address, gpu=gpu)
 
 
 def parse_indices(text: str, option: str) -> list[int]:

@@ -1,0 +1,334 @@
+"""Map a function over items on other processes: those of this machine, or the workers of a Dask cluster.
+
+Paths travel to the workers and reports back, arrays never do. Dask repeats an item whose worker was lost.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from importlib import metadata
+from itertools import count
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+from splinecli import __version__
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.extras import import_extra
+from splinecli.files import UNFINISHED, refusals_as_output_errors
+from splinecli.memory import available_memory, keep_freed_memory
+from splinecli.pipeline.connection import ClusterOptions, connected
+from splinecli.pipeline.observer import Observer
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
+SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
+
+_LOOK_SECONDS = 0.5  # between two looks at which workers there are
+_NO_WORKER_SECONDS = 60.0  # after which a cluster of this machine counts as lost
+_PROBE_SECONDS = 3.0  # a network drive may show a new file a little later
+
+_ONE_AT_A_TIME = Lock()
+"""A worker process does one item at a time, whatever its number of threads: the working folder, the limits on what is
+read and PyTorch's threads belong to the process."""
+
+
+class LostError(SplinecliError):
+    """A worker was lost, or has too little memory: the item was not done, others may be."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """The arguments of Work.do, a name for messages, and the bytes of memory that the item takes."""
+
+    args: tuple[Any, ...]
+    name: str
+    memory: float = 0.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all items of a command share. It travels with each item.
+
+    Args:
+        settings: of the command.
+        prepare: called with the settings before each item. It raises what is wrong with the worker.
+        do: called with the settings and the arguments of an item. It returns the result.
+        folder: the working folder of the command, which its relative paths start from.
+        probe: a file in the output folder. Workers that do not see it have another storage.
+        versions: of the packages that must be the same.
+        max_pixels, images_elsewhere: the limits on what is read; see cli/reading_limits.py.
+    """
+
+    settings: Any
+    prepare: Callable[[Any], object]
+    do: Callable[..., Any]
+    folder: str
+    probe: str
+    versions: dict[str, str]
+    max_pixels: int
+    images_elsewhere: bool
+
+    @classmethod
+    def of_this_process(
+        cls, settings: Any, prepare: Callable[[Any], object], do: Callable[..., Any], probe: Path
+    ) -> Work:
+        """Return the work of a command under the folder and the limits of this process."""
+        from splinecli.capture.formats.image_size import most_pixels
+        from splinecli.capture.layouts.image_lists import images_elsewhere_allowed
+
+        limits = most_pixels(), images_elsewhere_allowed()
+        return cls(settings, prepare, do, str(Path.cwd()), str(probe), _versions(), *limits)
+
+    def enter(self) -> None:
+        """Make this worker ready. Raises UsageError or InputError if it does not fit, and what `prepare` raises."""
+        from splinecli.capture.formats.image_size import limit_pixels
+        from splinecli.capture.layouts.image_lists import allow_images_elsewhere
+
+        for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
+            if found != expected:
+                raise UsageError(
+                    f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS
+                )
+        try:
+            os.chdir(self.folder)
+        except OSError as error:
+            raise InputError(
+                f"the folder cannot be entered ({error.strerror})", path=self.folder, hint=SAME_STORAGE
+            ) from None
+        deadline = time.monotonic() + _PROBE_SECONDS
+        while not (probe := Path(self.probe)).exists():
+            if not probe.parent.exists() or time.monotonic() > deadline:
+                raise InputError(
+                    "the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE
+                )
+            time.sleep(0.1)
+        limit_pixels(self.max_pixels)
+        allow_images_elsewhere(self.images_elsewhere)
+        keep_freed_memory()
+        self.prepare(self.settings)
+
+
+def this_worker() -> str:
+    """Return the address of the worker that this code runs on."""
+    return str(import_extra("distributed", "cluster").get_worker().address)
+
+
+def _do(work: Work, *args: Any) -> Any:
+    """Do an item on a worker, and return its result. The message of an error names the worker."""
+    try:
+        with _ONE_AT_A_TIME:
+            work.enter()
+            return work.do(work.settings, *args)
+    except SplinecliError as error:
+        problem = f"{error.problem} (on the worker {this_worker()})"
+        raise type(error)(problem, path=error.path, line=error.line, hint=error.hint) from None
+
+
+@dataclass
+class Distributor:
+    """Gives items to the workers of a Dask cluster, at most one for each worker. Workers may come and go.
+
+    Args:
+        client: see connected.
+        work: what all items share.
+        options: of the cluster.
+        observer: hears that there are no workers yet.
+    """
+
+    client: Client
+    work: Work
+    options: ClusterOptions
+    observer: Observer
+    running: dict[Future, Item] = field(default_factory=dict)
+    _done: SimpleQueue[Future] = field(default_factory=SimpleQueue)
+
+    def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Any]]:
+        """Yield each item with its result as it ends, or with a LostError.
+
+        Raises:
+            SplinecliError: what an item raised, or what is wrong with a worker. The message names the worker.
+            SplinecliError: the scheduler was lost.
+        """
+        self._check_installed()
+        source, following = iter(items), None
+        free_memory, began = available_memory(), time.monotonic()
+        for n_looks in count():
+            workers = self._workers()
+            if not workers and n_looks == 0:
+                self.observer.say("waiting for workers")
+            while len(self.running) < len(workers):
+                following = following or next(source, None)
+                if following is None:
+                    break
+                largest = max(map(_memory_limit, workers.values()))
+                if following.memory > largest:
+                    yield following, _too_large(following, largest)
+                elif self._has_room(following, free_memory):
+                    self._submit(following, workers)
+                else:
+                    break
+                following = None
+            if workers:
+                began = time.monotonic()
+                if following is None and not self.running:
+                    return
+            elif not self.options.address and time.monotonic() - began > _NO_WORKER_SECONDS:
+                raise SplinecliError(
+                    "the workers end while they are getting ready",
+                    hint="If there is too little memory, use fewer. Dask's output says more",
+                )
+            yield from self._take_results()
+
+    def _check_installed(self) -> None:
+        """Raise UsageError if splinecli is not installed on a worker: it could not even read an item."""
+        for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
+            if isinstance(found, metadata.PackageNotFoundError):
+                raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
+
+    def _workers(self) -> dict[str, dict[str, Any]]:
+        """Return what Dask says of the workers that may be used. Raises SplinecliError if the scheduler is lost."""
+        try:
+            found = dict(self.client.scheduler_info(n_workers=-1)["workers"])
+        except (OSError, TimeoutError, RuntimeError) as error:
+            raise _scheduler_lost() from error
+        if self.client.status != "running":
+            raise _scheduler_lost()
+        if not self.options.gpu:
+            return found
+        with_gpu = {address: info for address, info in found.items() if _resources(info).get("GPU", 0) >= 1}
+        if found and not with_gpu and not self.running:
+            raise UsageError(
+                "no worker has the Dask resource GPU",
+                hint="Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'",
+            )
+        return with_gpu
+
+    def _has_room(self, item: Item, free_memory: float) -> bool:
+        """Return whether this machine's memory holds one more item. The workers of a cluster have limits of Dask."""
+        used = sum(other.memory for other in self.running.values())
+        return bool(self.options.address) or not used or used + item.memory <= free_memory
+
+    def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
+        needed = {"GPU": 1.0} if self.options.gpu else {}
+        if any("MEMORY" in _resources(info) for info in workers.values()):
+            needed["MEMORY"] = item.memory
+        try:
+            future = self.client.submit(
+                _do,
+                self.work,
+                *item.args,
+                key=f"splinecli-{uuid.uuid4().hex}",
+                resources=needed or None,
+                pure=False,
+            )
+        except (OSError, RuntimeError) as error:
+            raise _scheduler_lost() from error
+        self.running[future] = item
+        future.add_done_callback(self._done.put)
+
+    def _take_results(self) -> Iterator[tuple[Item, Any]]:
+        """Wait a moment for results, and yield those that there are."""
+        with suppress(Empty):
+            future = self._done.get(timeout=_LOOK_SECONDS)
+            while True:
+                yield from self._take_result(future)
+                future = self._done.get_nowait()
+
+    def _take_result(self, future: Future) -> Iterator[tuple[Item, Any]]:
+        from distributed.scheduler import KilledWorker
+
+        if future.cancelled():
+            raise _scheduler_lost()
+        item = self.running[future]
+        try:
+            result = future.result(timeout=_LOOK_SECONDS)
+        except TimeoutError:
+            if future.status == "error":  # of the item itself
+                raise
+            future.add_done_callback(self._done.put)  # the worker was lost with the result: Dask repeats it
+            return
+        except KilledWorker as error:
+            result = _lost(item, error)
+        del self.running[future]
+        yield item, result
+
+
+def _resources(info: dict[str, Any]) -> dict[str, float]:
+    return info.get("resources") or {}
+
+
+def _memory_limit(info: dict[str, Any]) -> float:
+    """Return the bytes of memory of a worker."""
+    return float(_resources(info).get("MEMORY") or info.get("memory_limit") or math.inf)
+
+
+def _too_large(item: Item, largest: float) -> LostError:
+    return LostError(
+        f"it takes about {item.memory / 1e9:.1f} GB of memory, but the largest worker has {largest / 1e9:.1f} GB",
+        path=item.name,
+        hint="Start fewer workers on each machine, with more memory each",
+    )
+
+
+def _lost(item: Item, error: Any) -> LostError:
+    last = error.last_worker
+    return LostError(
+        f"its worker was lost {error.allowed_failures + 1} times, the last one {getattr(last, 'address', last)}",
+        path=item.name,
+        hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
+    )
+
+
+def _scheduler_lost() -> SplinecliError:
+    return SplinecliError(
+        "the connection to the Dask scheduler was lost",
+        hint="Run the same command again. It skips what is done",
+    )
+
+
+def _versions() -> dict[str, str]:
+    return {"splinecli": __version__, "distributed": metadata.version("distributed")}
+
+
+@contextmanager
+def distributor(
+    settings: Any,
+    prepare: Callable[[Any], object],
+    do: Callable[..., Any],
+    output: Path,
+    options: ClusterOptions,
+    observer: Observer,
+) -> Iterator[Distributor]:
+    """Yield a Distributor with a connection to its workers; see Work for the first three arguments.
+
+    Args:
+        output: the output folder, by which workers show that they have the same storage. It is made as needed.
+
+    Raises:
+        UsageError: Dask is not installed, or there is no scheduler at the address.
+        OutputError: the folder cannot be made.
+    """
+    probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
+    with refusals_as_output_errors(output):
+        made = [place for place in (output, *output.parents) if not place.exists()]
+        output.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+    try:
+        with connected(options) as client:
+            work = Work.of_this_process(settings, prepare, do, probe.absolute())
+            yield Distributor(client, work, options, observer)
+    finally:
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)
+            for place in made:
+                place.rmdir()

@@ -1,0 +1,138 @@
+"""One capture of a batch of `infer`: skip it if its results are up to date, and keep its error if it fails."""
+
+from __future__ import annotations
+
+import errno
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from splinecli.errors import InputError, OutputError, SplinecliError
+from splinecli.memory import is_out_of_memory
+from splinecli.pipeline.capture_list import Member
+from splinecli.pipeline.finished import find_earlier
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.observer import Observer
+
+if TYPE_CHECKING:
+    from splinecli.methods import Estimator
+
+Redo = Literal["nothing", "changed", "all"]
+"""What to do with captures that have results: keep them all, redo what changed, or redo everything."""
+
+Status = Literal["done", "skipped", "changed", "missing", "failed"]
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of one capture.
+
+    Args:
+        capture: its name.
+        status: done, skipped (results are up to date), changed (results are out of date and were kept), missing
+            (there is no such folder) or failed.
+        report: the report of the results, or the document {capture, error, exit_code}.
+        exit_code: of this capture.
+        trace: the Python traceback of an error that splinecli did not expect.
+    """
+
+    capture: str
+    status: Status
+    report: dict[str, Any]
+    exit_code: int = 0
+    trace: str = ""
+
+
+def run_member(
+    member: Member, options: InferOptions, redo: Redo, method: Callable[[], Estimator], observer: Observer
+) -> Outcome:
+    """Compute one capture of a batch, unless its results are up to date or are to be kept.
+
+    Args:
+        member: the capture.
+        options, observer: see infer_capture.
+        redo: see infer_batch.
+        method: returns the estimator; it is called if the capture is computed.
+
+    Raises:
+        UsageError, ModelError: what `method` raises. It is wrong for every capture.
+        OutputError: the output folder cannot be written, or the disk is full.
+    """
+    if member.missing is not None:
+        return replace(failed(member.name, member.missing), status="missing")
+    try:
+        outcome = _earlier_outcome(member, options, observer, redo)
+    except Exception as error:
+        outcome = _failure(member, error)
+    if outcome is not None:
+        return outcome
+    estimator = method()
+    try:
+        return Outcome(
+            member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator)
+        )
+    except Exception as error:
+        return _failure(member, error)
+
+
+def _error_document(error: SplinecliError, capture: str) -> dict[str, Any]:
+    """Return the document that stands in place of the report of a capture."""
+    return {"capture": capture, "error": str(error), "exit_code": error.exit_code}
+
+
+def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, redo: Redo) -> Outcome | None:
+    """Return the outcome of a capture that is not to be computed, or None."""
+    from splinecli.files import check_writable
+    from splinecli.publishing import held_folder
+
+    target = Path(options.output) / member.name
+    check_writable(target)
+    if redo == "all":
+        return None
+    with held_folder(target, observer.warn):
+        earlier = find_earlier(target, member.folder, options)
+    if earlier.report is not None:
+        return Outcome(member.name, "skipped", earlier.report)
+    if not earlier.changed or (redo == "changed" and earlier.ours):
+        return None
+    update = "--update to redo what changed, " if earlier.ours else ""
+    error = OutputError(
+        earlier.changed,
+        path=target,
+        hint=f"Add {update}--overwrite to redo everything, or choose another place with -o",
+    )
+    return Outcome(member.name, "changed", _error_document(error, member.name), error.exit_code)
+
+
+def _failure(member: Member, error: Exception) -> Outcome:
+    """Return what became of a capture that failed. Raises OutputError again, but for BusyError: it ends the batch."""
+    from splinecli.locks import BusyError
+
+    name = member.name
+    if isinstance(error, OutputError) and not isinstance(error, BusyError):
+        raise error
+    if isinstance(error, SplinecliError):
+        return failed(name, error)
+    if isinstance(error, OSError) and not is_out_of_memory(error):
+        reason = error.strerror or str(error)
+        if error.errno in _NO_ROOM:
+            raise OutputError(f"cannot be written ({reason})", path=error.filename) from error
+        return failed(name, InputError(f"cannot be read ({reason})", path=error.filename or member.folder))
+    if is_out_of_memory(error):
+        hint = "Use smaller images, or lower --batch-size"
+        return failed(name, SplinecliError("there is not enough memory", path=member.folder, hint=hint))
+    defect = SplinecliError(
+        f"{name}: {type(error).__name__}: {error}. This is a defect of splinecli",
+        hint="Please report it with the lines above",
+    )
+    return failed(name, defect, "".join(traceback.format_exception(error)))
+
+
+def failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
+    """Return the outcome of a capture that failed."""
+    return Outcome(name, "failed", _error_document(error, name), error.exit_code, trace)
