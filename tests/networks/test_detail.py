@@ -11,7 +11,7 @@ from torch.nn.functional import normalize, pad
 from conftest import directions_at, spiral_lights
 from splinecli.fits.two_halves import alternating_signs
 from splinecli.networks.detail import REACH, restore_detail
-from splinecli.networks.refine_features import CHANNELS, PLAIN, refine_features
+from splinecli.networks.refine_features import CHANNELS, channels, refine_features
 
 SIDE = 48
 LIGHTS = torch.tensor(spiral_lights(10, 55), dtype=torch.float32)
@@ -62,8 +62,8 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
     crease = normalize(torch.stack((-slope, torch.zeros_like(slope), torch.ones_like(slope))), dim=0)
     truth = crease if creased else FLAT
     noisy = photographed(truth, 0.03, lights)
-    noisy[:3] += noisy[PLAIN]  # SPLINE-Net has the noise of least squares
-    noisy[PLAIN] = 0
+    noisy[:3] += noisy[channels("plain")]  # SPLINE-Net has the noise of least squares
+    noisy[channels("plain")] = 0
     found = restore_detail(truth, noisy, EVERYWHERE)
     assert (found - truth).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
@@ -74,8 +74,8 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
 def test_the_more_noise_the_less_comes_back(noise: float, least: float, most: float) -> None:
     """The noise has 9, 27 and 45 % of the energy of what is missing here."""
     noisy = photographed(GROOVES, noise)
-    noisy[:3] += noisy[PLAIN]
-    noisy[PLAIN] = 0
+    noisy[:3] += noisy[channels("plain")]
+    noisy[channels("plain")] = 0
     found = restore_detail(FLAT, noisy, EVERYWHERE)
     assert least < float((found[0] * GROOVES[0]).mean() / GROOVES[0].square().mean()) < most
 
@@ -85,8 +85,8 @@ def test_black_pixels_change_nothing_beside_them() -> None:
     black = torch.arange(SIDE) < SIDE // 2
     truth = torch.where(black, 0.0, FLAT)
     noisy = photographed(truth, 0.03)
-    noisy[:3] += noisy[PLAIN]
-    noisy[PLAIN] = 0
+    noisy[:3] += noisy[channels("plain")]
+    noisy[channels("plain")] = 0
     noisy[:, :, black] = 0
     found = restore_detail(FLAT, noisy, EVERYWHERE)
     torch.testing.assert_close(found[..., black], FLAT[..., black])

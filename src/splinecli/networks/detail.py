@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from splinecli.networks.gaussian import gaussian_sum, reach_of
-from splinecli.networks.refine_features import NOISE, PLAIN
+from splinecli.networks.refine_features import channels
 
 FINE = 1.5
 """Detail is what a Gaussian filter with this sigma in pixels removes."""
@@ -46,10 +46,11 @@ def restore_detail(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
     Returns:
         Unit normals (3, H, W), zero outside the mask. Black pixels stay as they are.
     """
-    normals, least_squares = features[:3], features[:3] + features[PLAIN]
+    normals, least_squares = features[:3], features[:3] + features[channels("plain")]
     mask = mask * least_squares.any(dim=0)  # black pixels show nothing
     removed, missing, noise = (
-        _detail(maps, mask) for maps in (normals - refined, least_squares - refined, features[NOISE])
+        _detail(maps, mask)
+        for maps in (normals - refined, least_squares - refined, features[channels("noise")])
     )
 
     def energy(one: Tensor, other: Tensor) -> Tensor:

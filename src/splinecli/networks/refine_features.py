@@ -14,25 +14,46 @@ from splinecli.fits.two_halves import compare_halves
 from splinecli.fits.weighted_least_squares import weighted_sum
 from splinecli.observation_map import dot, map_scale
 
-VECTORS = ((0, 1), (3, 4), (6, 7), (9, 10), (11, 12), (24, 25))
+WIDTHS = {
+    "normal": 3,  # the estimated one
+    "robust": 3,  # the normal of the robust Lambertian fit, minus the estimated one
+    "plain": 3,  # the normal of least squares, minus the estimated one
+    "unexplained_light": 2,  # mean light direction, weighted by what a matte surface with this normal leaves
+    "mean_light": 2,
+    "light_moments": 3,  # xx, yy and xy of the light directions
+    "error_median": 1,  # of the error's distribution; see networks/error_head.py
+    "error_shape": 1,
+    "largest": 1,  # logarithm of the largest observation, relative to the capture
+    "mean": 1,  # of the observations, over the largest; the next two likewise
+    "deviation": 1,
+    "residual": 1,  # root mean square
+    "dark_share": 1,  # share of dark observations
+    "n_lights": 1,  # logarithm
+    "halves": 3,  # how two halves of the lights differ; the sign means nothing. See fits/two_halves.py
+    "noise": 1,  # of least squares. The net does not read it: it serves restore_detail of networks/detail.py
+}
+"""The features and their numbers of channels. Vectors have x and y first."""
+
+_VECTORS = ("normal", "robust", "plain", "unexplained_light", "mean_light", "halves")
+
+
+def channels(name: str) -> slice:
+    """Return the channels of a feature."""
+    names = list(WIDTHS)
+    start = sum(WIDTHS[other] for other in names[: names.index(name)])
+    return slice(start, start + WIDTHS[name])
+
+
+CHANNELS = sum(WIDTHS.values())
+READ = channels("noise").start
+"""Number of the channels that the net reads."""
+
+VECTORS = tuple((channels(name).start, channels(name).start + 1) for name in _VECTORS)
 """Channels that hold the x and y of vectors, and turn with the image."""
 
-TENSOR = (13, 14, 15)
-"""Channels that hold the xx, yy and xy of the lights' second moments."""
-
-PLAIN = slice(6, 9)
-"""Channels that hold the normal of least squares, minus the estimated one."""
-
-HALVES = slice(24, 27)
-"""Channels in which two halves of the lights are compared. Their sign means nothing."""
-
-NOISE = slice(27, 28)
-"""The channel that the net does not read. It serves restore_detail of networks/detail.py."""
-
-READ = 27
-CHANNELS = 28
-MEDIAN, SHAPE = 16, 17
-"""Channels that hold the two numbers of the error's distribution; see networks/error_head.py."""
+_FIRST = channels("light_moments").start
+TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)
+"""Channels that hold the xx, yy and xy of a tensor."""
 
 _MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
 _LARGEST_LOG = 4.0
@@ -48,14 +69,7 @@ def refine_features(
     reference: float,
     signs: Tensor,
 ) -> Tensor:
-    """Return the features (P, CHANNELS) of pixels, each about -1 to 1.
-
-    0 to 2: the estimated normal. 3 to 8: the normals of the robust Lambertian fit and of least squares, minus it.
-    9, 10: x and y of the mean light direction, weighted by what a matte surface with this normal does not explain.
-    11 to 15: mean and second moments of the lights' x and y. 16, 17: the error's distribution. 18: logarithm of the
-    largest observation, relative to the capture. 19, 20: mean and standard deviation over the largest. 21: root mean
-    square of what is not explained. 22: share of dark observations. 23: logarithm of the number of lights. 24 to 26:
-    how two halves of the lights differ, and 27: the noise of least squares that follows; see fits/two_halves.py.
+    """Return the features (P, CHANNELS) of pixels in the order of WIDTHS, each about -1 to 1.
 
     Args:
         observations: (P, F), linear, divided by the light intensities.
@@ -80,26 +94,25 @@ def refine_features(
     x, y = across.unbind(-1)
     moments = torch.stack((x, y, x * x, y * y, x * y), dim=-1).mean(dim=-2)
     level = observed @ mean
-    return torch.cat(
-        (
-            normals,
-            robust - normals,
-            plain - normals,
-            4 / count * weighted_sum(unexplained, across),
-            moments.expand(len(observed), -1),
-            error[:, :1] + _MEDIAN_OFFSET,
-            error[:, 1:] - 1,
-            (scale / reference).log().clamp(-_LARGEST_LOG, _LARGEST_LOG) / 2,
-            level,
-            ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
-            3 * (unexplained.square() @ mean).sqrt(),
-            (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
-            torch.full_like(scale, math.log(count / 10)),
-            (_HALVES_SCALE * change).clamp(-1, 1),
-            noise.clamp(-1, 1),
-        ),
-        dim=1,
-    )
+    features = {
+        "normal": normals,
+        "robust": robust - normals,
+        "plain": plain - normals,
+        "unexplained_light": 4 / count * weighted_sum(unexplained, across),
+        "mean_light": moments[..., :2].expand(len(observed), -1),
+        "light_moments": moments[..., 2:].expand(len(observed), -1),
+        "error_median": error[:, :1] + _MEDIAN_OFFSET,
+        "error_shape": error[:, 1:] - 1,
+        "largest": (scale / reference).log().clamp(-_LARGEST_LOG, _LARGEST_LOG) / 2,
+        "mean": level,
+        "deviation": ((observed - level).square() @ mean * (count / (count - 1))).sqrt(),
+        "residual": 3 * (unexplained.square() @ mean).sqrt(),
+        "dark_share": (observed < SHADOW_SHARE).to(observed.dtype) @ mean,
+        "n_lights": torch.full_like(scale, math.log(count / 10)),
+        "halves": (_HALVES_SCALE * change).clamp(-1, 1),
+        "noise": noise.clamp(-1, 1),
+    }
+    return torch.cat([features[name] for name in WIDTHS], dim=1)
 
 
 def brightness(observations: Tensor) -> float:
@@ -110,7 +123,8 @@ def brightness(observations: Tensor) -> float:
 def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
     """Return normals (B, 3, H, W) and error (B, 2, H, W) from maps of features (B, CHANNELS, H, W)."""
     offset = features.new_tensor((-_MEDIAN_OFFSET, 1.0))[:, None, None]
-    return features[:, :3], features[:, MEDIAN : SHAPE + 1] + offset
+    error = features[:, channels("error_median").start : channels("error_shape").stop]
+    return features[:, channels("normal")], error + offset
 
 
 class Turn(NamedTuple):

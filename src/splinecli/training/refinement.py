@@ -15,9 +15,9 @@ from torch.nn.functional import pad
 from splinecli.fits.two_halves import alternating_signs
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.refine_features import (
-    HALVES,
     Turn,
     brightness,
+    channels,
     refine_features,
     split_features,
     turn_features,
@@ -257,7 +257,7 @@ def _turned(example: SceneMaps, generator: torch.Generator) -> SceneMaps:
     turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
     features = turn_features(example.features, turn).clone()
     if draw[2] < 0.5:
-        features[HALVES].neg_()
+        features[channels("halves")].neg_()
     return SceneMaps(
         features,
         turn_maps(example.normals, turn, vectors=((0, 1),)),
