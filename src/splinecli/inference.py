@@ -73,8 +73,7 @@ def estimate_normals(
 
     Args:
         tile_pixels: number of pixels that the estimator gets at once. None takes the estimator's own number.
-        progress: called with the number of pixels just finished: after each batch of the estimator, and up to 128 times
-            a batch of a network, not only after each tile.
+        progress: called with the number of pixels just finished, after each batch of the estimator.
         stage: called with the name of each later stage where it begins; its function is called with the number of
             pixels just finished.
 

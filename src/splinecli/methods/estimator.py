@@ -50,7 +50,7 @@ class Estimator(Protocol):
         A pixel that is dark under every light has no normal. It gets (0, 0, 1).
 
         Args:
-            progress: called after each batch with the number of its pixels. Networks call it several times a batch.
+            progress: called after each batch with the number of its pixels.
         """
         ...
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, Progress
-from splinecli.methods.layer_progress import LayerProgress, PixelSteps
 from splinecli.methods.refiner import Refiner
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
@@ -75,7 +74,6 @@ class NetworkEstimator:
                 f", without indirect light, refined in {self.refiner.turns} turns, with detail"
             )
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
-        self._layers = LayerProgress(self.network)
 
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
@@ -108,33 +106,16 @@ class NetworkEstimator:
         light_directions: Directions,
         progress: Progress | None,
     ) -> NDArray[np.float32]:
-        work_per_pixel = 0 if progress is None else self._work_per_pixel(light_directions.shape[-2])
-
-        def solve(batch: Tensor, lights: Tensor) -> Tensor:
-            if progress is None:
-                return self._average_rotations(batch, lights)
-            steps = PixelSteps(progress, len(batch), len(batch) * work_per_pixel)
-            with self._layers.counting(steps.add):
-                solved = self._average_rotations(batch, lights)
-            steps.finish()
-            return solved
-
         return estimate_in_batches(
-            solve,
+            self._average_rotations,
             observations,
             light_directions,
             batch_size=self.batch_size,
             device=self.device,
             dtype=torch.float32,
             columns=5,
+            progress=progress,
         )
-
-    @torch.inference_mode()
-    def _work_per_pixel(self, n_lights: int) -> int:
-        """Return the multiplications for a pixel. The set branch, if there is one, has some for each light."""
-        observations = torch.ones(1, n_lights, device=self.device)
-        lights = torch.tensor((0.0, 0.0, 1.0), device=self.device).expand(n_lights, 3)
-        return len(self._rotations) * self._layers.work_of(lambda: self.network(observations, lights))
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
         """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""
