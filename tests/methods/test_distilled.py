@@ -17,7 +17,7 @@ from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.methods.pupil_size import PupilSize, pupil_sizes
-from splinecli.methods.refiner import Refiner
+from splinecli.methods.refiner import NetworkRefiner
 from splinecli.networks.refine_net import RefineNet
 from splinecli.normals import angle_between_deg, unit
 
@@ -204,7 +204,7 @@ def test_its_map_is_refined_by_the_net_of_its_teacher_with_turns_where_it_is_sma
     normals, observations = glossy(3000)
     teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
     assert refiner_of(distil(teacher, observations, LIGHTS, SMALL)) is None
-    teacher.refiner = Refiner(RefineNet(), "float32")  # type: ignore[attr-defined]
+    teacher.refiner = NetworkRefiner(RefineNet(), "float32")  # type: ignore[attr-defined]
     for most, turns in ((3000, 4), (2999, 1)):
         monkeypatch.setattr("splinecli.methods.distilled.TURNED_PIXELS", most)
         refiner = refiner_of(distil(teacher, observations, LIGHTS, SMALL))

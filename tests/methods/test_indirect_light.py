@@ -23,7 +23,7 @@ from splinecli.methods import make_estimator
 from splinecli.methods.estimator import Progress
 from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
 from splinecli.methods.lamp_light import LampLight, LightOf
-from splinecli.methods.refiner import Refiner
+from splinecli.methods.refiner import NetworkRefiner
 from splinecli.normals import angle_between_deg
 
 SIZE = 64
@@ -189,12 +189,12 @@ def test_the_refinement_sees_what_is_left() -> None:
         return nullcontext(count)
 
     def refine(
-        _: Refiner, __: object, ___: object, light_of: LightOf, *____: object, **_____: object
+        _: NetworkRefiner, __: object, ___: object, light_of: LightOf, *____: object, **_____: object
     ) -> None:
         seen.append(light_of(EVERYWHERE).observations)
 
     seen: list[Floats] = []
-    with patch.object(Refiner, "refine", refine):
+    with patch.object(NetworkRefiner, "refine", refine):
         estimate_normals(capture, make_estimator("spline-net"), stage=stage)
     assert np.abs(seen[0] - direct)[INSIDE].mean() < 0.5 * indirect.mean()
     assert stages == [["removing indirect light", len(BOWL)], ["refining", 0]]

@@ -19,7 +19,7 @@ from splinecli.methods import refiner
 from splinecli.methods.estimator import UNKNOWN_ERROR
 from splinecli.methods.lamp_light import LampLight
 from splinecli.methods.networks import NetworkEstimator
-from splinecli.methods.refiner import Refiner
+from splinecli.methods.refiner import NetworkRefiner
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.refine_net import REACH, RefineNet
 from splinecli.networks.spline_net import SplineNet
@@ -53,7 +53,7 @@ def refine(
     assert isinstance(net, RefineNet)
     refined = normals.copy()
     done: list[int] = []
-    Refiner(net, "float32", tile=tile, margin=REACH).refine(
+    NetworkRefiner(net, "float32", tile=tile, margin=REACH).refine(
         mask,
         observations,
         lambda rows: LampLight(observations[rows], LIGHTS),
@@ -104,7 +104,7 @@ def test_a_turned_capture_gets_turned_normals() -> None:
         found = (np.rot90(normals, turns)[seen] @ turn.T).astype(np.float32)
         observations = (found @ lights.T).clip(0).astype(np.float32)
         errors = np.tile(np.float32((-3, 1)), (len(found), 1))
-        Refiner(net, "float32").refine(
+        NetworkRefiner(net, "float32").refine(
             seen, observations, lambda rows: LampLight(observations[rows], lights), found, errors
         )
         result = np.zeros((*seen.shape, 3), np.float32)
@@ -131,7 +131,9 @@ def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -
             return LampLight(observations[rows], LIGHTS, turns[rows] if turned else None)
 
         found, errors = normals.copy(), np.tile(np.float32((-3, 1)), (900, 1))
-        Refiner(net, "float32").refine(np.ones((30, 30), np.bool_), observations, light_of, found, errors)
+        NetworkRefiner(net, "float32").refine(
+            np.ones((30, 30), np.bool_), observations, light_of, found, errors
+        )
         return found
 
     at_once = refined(True)

@@ -12,7 +12,7 @@ from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.methods.lamp_light import LampLight
-from splinecli.methods.refiner import MARGIN, Refiner
+from splinecli.methods.refiner import MARGIN, NetworkRefiner
 from splinecli.normals import angle_between_deg, unit
 
 SIZE = 64
@@ -151,7 +151,7 @@ def test_seams_of_tiles_do_not_show() -> None:
     whole = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32")))
     assert whole is not None
     found = []
-    for refiner in (whole, Refiner(whole.network, "float32", tile=MARGIN)):
+    for refiner in (whole, NetworkRefiner(whole.network, "float32", tile=MARGIN)):
         normals, errors = before.copy(), errors_before.copy()
         refiner.refine(
             capture.mask,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from splinecli.methods.refiner import Refiner
+    from splinecli.methods.lamp_light import LightOf
 
 Observations = NDArray[np.float32]
 """(P, F): linear, already divided by the light intensities."""
@@ -82,6 +82,27 @@ class ConfidentEstimator(Estimator, Protocol):
 
         networks/error_head.py describes the two numbers. A pixel that is dark under every light gets UNKNOWN_ERROR.
         """
+        ...
+
+
+class Refiner(Protocol):
+    """Corrects a map of normals by what lies around each pixel."""
+
+    def without_turns(self) -> Refiner:
+        """Return the refiner that sees the map once, for captures whose pixels are estimated quickly."""
+        ...
+
+    def refine(
+        self,
+        mask: NDArray[np.bool_],
+        observations: Observations,
+        light_of: LightOf,
+        normals: NDArray[np.float32],
+        errors: NDArray[np.float32],
+        *,
+        progress: Progress | None = None,
+    ) -> None:
+        """Replace normals (P, 3) and the distributions (P, 2) of their errors by refined ones."""
         ...
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.methods.estimator import Estimator
 from splinecli.normals import unit
 from splinecli.surface.camera import focal_length, ray_basis
 
@@ -88,12 +87,6 @@ def parts_of_rows(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iter
     """Yield every step-th of the rows below `count`, `size` at a time."""
     for start in range(0, count, step * size):
         yield np.arange(start, min(start + step * size, count), step)
-
-
-def estimate_under_lamps(estimator: Estimator, observations: NDArray[np.float32], lamps: NearLamps) -> Floats:
-    """Return the normals (P, 3) that a method estimates at the points of `lamps` from observations (P, F)."""
-    light = LampLight.of(observations, lamps)
-    return light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
 
 
 def _plane_distance(lamps: NearLamps) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.methods.lamp_light import estimate_under_lamps, flat_depth, surface_points
+from splinecli.methods.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
 
@@ -45,7 +45,8 @@ def find_surface(capture: Capture) -> Capture:
     depth = np.full(blocks.mask.shape, flat_depth(lamps))
     for _ in range(ROUNDS):
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
-        normals = estimate_under_lamps(estimator, observations, replace(lamps, points=points))
+        light = LampLight.of(observations, replace(lamps, points=points))
+        normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
         depth = _integrate(normals, blocks, lamps.camera_matrix)
     rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
     points = surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))

@@ -12,7 +12,7 @@ from torch import Tensor
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, Progress
-from splinecli.methods.refiner import Refiner
+from splinecli.methods.refiner import NetworkRefiner
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.observation_map import rotate_about_view_axis, sparse_map
@@ -67,7 +67,9 @@ class NetworkEstimator:
         self.batch_size = batch_size
         self.network = loaded.network.to(device)
         refine_net = self.network.refine_net
-        self.refiner = Refiner(refine_net, self.precision) if refines and refine_net is not None else None
+        self.refiner = (
+            NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
+        )
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.refiner is not None:
             self.fingerprint += (

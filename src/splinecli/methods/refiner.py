@@ -79,7 +79,7 @@ class _Band:
             whole[self._pixels] = kept
 
 
-class Refiner:
+class NetworkRefiner:
     """Corrects the normals of a capture, and the distributions of their errors, by what lies around each pixel.
 
     Args:
@@ -99,9 +99,9 @@ class Refiner:
         self.turns = turns
         self.tile, self.margin = tile, margin
 
-    def without_turns(self) -> Refiner:
+    def without_turns(self) -> NetworkRefiner:
         """Return the refiner that sees the map once, for captures whose pixels are estimated quickly."""
-        return Refiner(self.network, self.precision, turns=1, tile=self.tile, margin=self.margin)
+        return NetworkRefiner(self.network, self.precision, turns=1, tile=self.tile, margin=self.margin)
 
     @torch.inference_mode()
     def refine(
