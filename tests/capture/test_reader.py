@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -70,18 +68,6 @@ def test_channels_are_divided_by_their_own_intensity(
     )
 
 
-def test_gray_images_are_equal_in_all_channels(
-    capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
-) -> None:
-    np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
-    gray = np.repeat(photographs[..., :1], 3, axis=-1)
-    for number, pixels in enumerate(gray, start=8):
-        write_image(f"vase/img{number}.png", pixels[..., 0])
-    np.testing.assert_allclose(
-        read_capture(capture_folder).observations, expected(gray, INTENSITIES), rtol=1e-6
-    )
-
-
 def test_mask_and_ground_truth(
     capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
 ) -> None:
@@ -144,12 +130,6 @@ def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> Non
     assert str(caught.value) == f"{image}: found an image of 7 x 5 pixels, expected 6 x 5 as in img8.png."
 
 
-def test_counts_that_differ(capture_folder: Path) -> None:
-    np.savetxt(capture_folder / "light_directions.txt", LIGHTS[[0, 1, 2, 3, 1]])
-    with pytest.raises(InputError, match=r"found 5 light directions, expected 4, one for each image\."):
-        open_capture(capture_folder)
-
-
 def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
     capture_folder: Path, write_image: WriteImage
 ) -> None:
@@ -165,17 +145,6 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
     (capture_folder / "mask.png").unlink()
     with pytest.raises(InputError, match=r"8\.tif: found a value that is not finite"):
         read_capture(capture_folder)
-
-
-def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
-    pixels = np.full((10, 10, 3), 200, np.uint8)
-    pixels[0, :5, 1] = 255
-    for number in range(8, 12):
-        write_image(f"vase/img{number}.png", pixels)
-    assert texts(read_capture(capture_folder).warnings) == (
-        "5.0 % of the observations are saturated; a shorter exposure gives better normals.",
-        "The images have 8 bits; 16-bit linear images give better normals.",
-    )
 
 
 @pytest.mark.parametrize(("n_black", "share"), [(1, None), (2, "2.0"), (100, "100.0")])
@@ -210,10 +179,3 @@ def test_psbox_s_transposed_lights(shared_data: Path) -> None:
     source = open_capture(shared_data / "psbox/Objects", lights=shared_data / "psbox/light_directions.txt")
     assert source.n_lights == 12
     assert source.read([0, 4, 8]).n_pixels == 430 * 550
-
-
-def test_importing_is_light() -> None:
-    heavy = {"cv2", "scipy", "tifffile", "torch", "rich"}
-    code = f"import splinecli.capture, sys; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"

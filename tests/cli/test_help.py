@@ -12,9 +12,7 @@ import pytest
 import typer
 
 from splinecli.cli.app import app
-from splinecli.cli.man import EXAMPLES, FILES, man_pages
-from splinecli.results.files import OWN_FILES
-from splinecli.results.index import INDEX
+from splinecli.cli.man import EXAMPLES, man_pages
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -35,30 +33,12 @@ def test_man_pages_are_up_to_date():
     assert found == man_pages()
 
 
-def test_every_command_has_a_man_page():
-    assert man_pages().keys() == {"splinecli.1", *(f"splinecli-{command}.1" for command in COMMANDS)}
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_man_page_names_every_option(command, run):
-    page = man_pages()[f"splinecli-{command}.1"].replace("\\-", "-")
-    options = [word for word in run(command, "--help").out.split() if word.startswith("--")]
-    assert options
-    for option in options:
-        assert option.rstrip(",.;") in page
-
-
 @pytest.mark.skipif(shutil.which("groff") is None, reason="no groff to check the man pages with")
 def test_man_pages_are_typeset_without_warnings():
     for name, page in man_pages().items():
         # -ww: all warnings; -z: no output but those.
         done = subprocess.run(["groff", "-man", "-ww", "-z"], input=page, capture_output=True, text=True)
         assert (name, done.returncode, done.stderr) == (name, 0, "")
-
-
-def test_man_page_names_what_infer_writes():
-    named = " ".join(part for row in FILES for part in row)
-    assert [name for name in (*OWN_FILES, INDEX) if name not in named] == []
 
 
 @pytest.mark.parametrize("example", [example for example, _ in EXAMPLES])
@@ -69,10 +49,6 @@ def test_examples_of_the_man_pages_are_valid(example, run, tmp_path, monkeypatch
         monkeypatch.chdir(tmp_path)
         # Past all that is checked about the command line, up to files that are not there.
         assert run(command, *args).code in (3, 4)
-
-
-def test_every_command_has_an_example():
-    assert {shlex.split(example)[1] for example, _ in EXAMPLES} == set(COMMANDS)
 
 
 def test_the_page_of_infer_shows_the_help(run, request):

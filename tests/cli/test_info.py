@@ -49,30 +49,6 @@ def test_the_plot_of_the_lights(run, capture, tmp_path):
     assert orange > 8 * 20  # eight markers
 
 
-def test_warnings(run, capture):
-    photographs = sorted(capture.glob("image*.png"))
-    stored = cv2.imread(str(photographs[0]), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(photographs[0]), (stored // 256).astype(np.uint8))
-    cv2.imwrite(str(photographs[1]), np.full_like(stored, 65_535))
-    cv2.imwrite(str(photographs[2]), stored // 30)
-    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
-    assert warnings[:3] == [
-        "The images have 8 bits; 16-bit linear images give better normals.",
-        "Images saturated in more than 1 % of the pixels: 1, most of all image2.png (100.0 %);"
-        " a shorter exposure gives better normals.",
-        "Images that use less than 5 % of the range: 1, such as image3.png; a longer exposure gives less noise.",
-    ]
-    cv2.imwrite(str(photographs[3]), stored[:20])
-    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
-    assert "The images have 2 different sizes; all images need the same size." in warnings
-
-
-def test_no_capture(run, tmp_path):
-    result = run("info", tmp_path / "nowhere")
-    assert (result.code, result.out) == (3, "")
-    assert "the folder does not exist" in result.err
-
-
 def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
     before = (capture / "image1.png").read_bytes()
     for name in ("image1.png", "sky.png"):
@@ -117,27 +93,3 @@ def test_the_white_level_of_12_bit_data(run, capture):
     assert report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
     assert report["exposure"]["saturated"] > 0.1
     assert report["exposure"]["bright"][1] == pytest.approx(1)
-
-
-def test_a_white_level_given_by_the_user(run, capture):
-    clip_at_12_bits(capture, times=0.5)
-    result = run("info", capture, "--white-level", 2000)
-    assert "white level  2000, given by --white-level\n" in result.out
-    given = json.loads(run("info", capture, "--white-level", 1000, "--json").out)
-    assert (
-        given["exposure"]["saturated"]
-        > json.loads(run("info", capture, "--json").out)["exposure"]["saturated"]
-    )
-    assert run("info", capture, "--white-level", -1).code == 2
-
-
-@pytest.mark.parametrize("option", ["--plot", "--lights", "--mask"])
-def test_home_folder_in_paths(run, capture, tmp_path, monkeypatch, option):
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    (tmp_path / "home").mkdir()
-    for name in ("light_directions.txt", "mask.png"):
-        (tmp_path / "home" / name).write_bytes((capture / name).read_bytes())
-    name = {"--plot": "sky.png", "--lights": "light_directions.txt", "--mask": "mask.png"}[option]
-    assert run("info", capture, f"{option}=~/{name}").code == 0
-    assert (tmp_path / "home" / name).exists()
-    assert not Path("~").exists()

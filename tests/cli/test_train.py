@@ -157,15 +157,6 @@ def test_settings_come_from_preset_file_and_options(run, no_pictures):
     assert json.loads(Path("other/config.json").read_text()) == values | {"seed": 9}
 
 
-def test_alternating_updates_with_every_term(run, no_pictures):
-    terms = ["updates=alternating", "symmetric_weight=0.02", "asymmetric_weight=2e-5", "li_net_norm=sum"]
-    options = [word for term in terms for word in ("--param", term)]
-    assert run("train", "-o", "run", "--steps", 6, *options, "--quiet").code == 0
-    (row,) = rows()
-    assert float(row["symmetric"]) > 0
-    assert float(row["asymmetric"]) > 0
-
-
 def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
@@ -275,12 +266,3 @@ def test_refusals(run, golden, no_pictures):
     golden("train_refusals.txt", "".join(messages))
     assert not Path("other").exists()
     assert [row["step"] for row in rows()] == ["1"]
-
-
-def test_another_preset_is_refused_by_its_network(run, no_pictures):
-    # The compact network of these tests is smaller, but the message gives the name of its size.
-    run("train", "-o", "run", "--steps", 1)
-    result = run("train", "-o", "run", "--resume", "--steps", 2, "--preset", "paper")
-    assert (result.code, result.out) == (4, "")
-    message = "run/checkpoint.safetensors: the run was started with network.size = 'compact', not 'paper'"
-    assert message in result.err

@@ -81,15 +81,6 @@ def test_every_pair_on_every_capture_and_on_their_average() -> None:
         assert [c.p_holm for c in of_one] == pytest.approx(holm([c.p_value or 0 for c in of_one]))
 
 
-def test_exchanging_methods_changes_the_sign_alone() -> None:
-    there, _ = compare(evaluation_of(ball={"ls": FIRST, "iw12": SECOND}))
-    back, _ = compare(evaluation_of(ball={"iw12": SECOND, "ls": FIRST}))
-    assert back.difference_deg == -there.difference_deg
-    assert (back.p_value, back.std_deg) == pytest.approx((there.p_value, there.std_deg))
-    assert there.interval_deg and back.interval_deg
-    assert back.interval_deg == pytest.approx((-there.interval_deg[1], -there.interval_deg[0]))
-
-
 @pytest.mark.parametrize(
     ("first", "second", "interval", "p_value", "differs"),
     [

@@ -7,21 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from scenes import cap_directions, ring_lights
 from splinecli.fits.lambertian import fit_lambertian
 from splinecli.normals import angle_between_deg
 
 
-def normals_under(limit_deg: float, count: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    azimuth = 2 * torch.pi * torch.rand(count, generator=generator)
-    zenith = torch.deg2rad(limit_deg * torch.rand(count, generator=generator).sqrt())
-    return torch.stack((zenith.sin() * azimuth.cos(), zenith.sin() * azimuth.sin(), zenith.cos()), dim=1)
+def normals_under(limit_deg: float, count: int) -> Tensor:
+    return torch.tensor(cap_directions(count, limit_deg), dtype=torch.float32)
 
 
 def ring(count: int, zenith_deg: float) -> Tensor:
-    azimuth = torch.arange(count) * (2 * torch.pi / count) + 0.1
-    zenith = torch.deg2rad(torch.tensor(zenith_deg)).expand(count)
-    return torch.stack((zenith.sin() * azimuth.cos(), zenith.sin() * azimuth.sin(), zenith.cos()), dim=1)
+    return torch.tensor(ring_lights(count, zenith_deg, 0.1), dtype=torch.float32)
 
 
 def error_deg(scaled_normals: Tensor, truth: Tensor) -> np.ndarray:

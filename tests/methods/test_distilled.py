@@ -11,12 +11,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from conftest import cap_directions, spiral_lights
+from scenes import cap_directions, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.methods.pupil_size import PupilSize, pupil_sizes
+from splinecli.methods.pupil_size import PupilSize
 from splinecli.methods.refiner import Refiner
 from splinecli.networks.refine_net import RefineNet
 from splinecli.normals import angle_between_deg, unit
@@ -129,23 +129,6 @@ def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
     assert found.report()["unlike_pixels"] == found.n_unlike
 
 
-def test_pixels_unlike_all_others_are_left_to_the_teacher() -> None:
-    normals, observations = glossy()
-    stranger = np.zeros((1, 8), np.float32)
-    stranger[0, 2] = 0.4
-    teacher = Teacher(
-        np.concatenate((observations, stranger)),
-        np.concatenate((normals, [(0.0, -0.6, 0.8)])),
-        np.tile(log_median(2), (8001, 1)),
-    )
-    found = distil(teacher, observations, LIGHTS, SIZE)
-    asked = teacher.asked
-    estimate, errors = found.estimate_with_error(stranger, LIGHTS)
-    assert teacher.asked == asked + 1
-    np.testing.assert_allclose(estimate, [(0.0, -0.6, 0.8)], atol=1e-6)
-    np.testing.assert_allclose(errors, [log_median(2)], atol=1e-6)
-
-
 def test_dark_pixels_have_no_normal() -> None:
     normals, observations = glossy(3000)
     observations[::100] = 0
@@ -153,14 +136,6 @@ def test_dark_pixels_have_no_normal() -> None:
     estimate, errors = distil(teacher, observations, LIGHTS, SIZE).estimate_with_error(observations, LIGHTS)
     np.testing.assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
     np.testing.assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
-
-
-def test_the_scale_of_a_pixel_does_not_matter() -> None:
-    normals, observations = glossy(3000)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
-    found = distil(teacher, observations, LIGHTS, SMALL)
-    common = observations[~np.isin(np.arange(3000), np.flatnonzero(found._apply(observations)[2]))]
-    np.testing.assert_allclose(found._apply(common)[0], found._apply(common * 64)[0], atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
@@ -219,13 +194,3 @@ def test_too_few_pixels() -> None:
     teacher = Teacher(observations, normals, np.tile(log_median(2), (127, 1)))
     with pytest.raises(UsageError, match="127 pixels are lit, too few to distil the network"):
         distil(teacher, observations, LIGHTS, SIZE)
-
-
-def test_sizes_grow_with_the_capture() -> None:
-    assert pupil_sizes(100_000)[0] == PupilSize(sample=10_000, steps=1000, width=192)
-    assert pupil_sizes(1_600_000)[0].sample == 20_000
-    assert pupil_sizes(8_000)[0].sample == 2000
-    for n_pixels in (1000, 100_000, 24_000_000):
-        usual, larger = pupil_sizes(n_pixels)
-        assert usual.sample < larger.sample < n_pixels
-        assert usual.width < larger.width

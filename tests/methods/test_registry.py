@@ -12,7 +12,7 @@ import torch
 
 from splinecli.devices import count_available_cores
 from splinecli.errors import ModelError, UsageError
-from splinecli.methods import DEFAULT_METHOD, MethodOptions, make_estimator, method_names
+from splinecli.methods import MethodOptions, make_estimator, method_names
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import save_weights
@@ -36,10 +36,6 @@ def weights(tmp_path: Path) -> str:
 def test_unknown_method() -> None:
     with pytest.raises(UsageError, match="no method named 'l2'; expected one of spline-net, cnn-ps, ls"):
         make_estimator("l2")
-
-
-def test_the_default_is_one_of_them() -> None:
-    assert DEFAULT_METHOD in method_names()
 
 
 def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
@@ -79,13 +75,6 @@ def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
     assert len(fingerprints) == 3
     same = make_estimator("spline-net", replace(options, batch_size=3))
     assert same.fingerprint in fingerprints
-
-
-def test_cnn_ps_averages_ten_rotations(tmp_path: Path) -> None:
-    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
-    assert make_estimator("cnn-ps", MethodOptions(weights=alone)).fingerprint.endswith("10 views")
-    one = make_estimator("cnn-ps", MethodOptions(weights=alone, rotations=1))
-    assert one.fingerprint.endswith("1 views")
 
 
 def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:

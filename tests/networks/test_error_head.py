@@ -10,8 +10,6 @@ import pytest
 import torch
 from scipy import stats
 
-from splinecli.errors import ModelError
-from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import error_negative_log_likelihood, probability_within
 from splinecli.networks.spline_net import SplineNet
 
@@ -45,8 +43,3 @@ def test_it_changes_no_normal(random_network: Callable[..., SplineNet]) -> None:
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turned = telling(observations, lights @ turn.T).error
     torch.testing.assert_close(turned, error, atol=1e-4, rtol=0)
-
-
-def test_the_paper_s_size_has_none() -> None:
-    with pytest.raises(ModelError, match="'error_head' needs the size 'compact'"):
-        NetworkConfig.from_dict({"size": "paper", "error_head": True})

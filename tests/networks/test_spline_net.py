@@ -35,17 +35,6 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
 
-@pytest.mark.parametrize("settings", [{}, {"map_size": 16}, SET, PAPER])
-def test_normals_are_unit_vectors(
-    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
-) -> None:
-    observations, lights = pixels
-    with torch.no_grad():
-        normals = random_network(**settings)(observations.float(), lights.float()).normals
-    assert normals.shape == (64, 3)
-    assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
-
-
 @pytest.mark.parametrize("settings", [{}, SET, PAPER])
 def test_dense_map_ends_with_the_unit_disc(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
@@ -100,37 +89,6 @@ def test_compact_estimates_turn_with_the_lights(
     assert (here - torch.nn.functional.normalize(fit, dim=1)).abs().max() > 0.01
 
 
-@pytest.mark.parametrize("settings", [{}, SET, PAPER])
-def test_brightness_does_not_matter(
-    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
-) -> None:
-    observations, lights = pixels[0][:8], pixels[1]
-    network = random_network(**settings).double()
-    with torch.no_grad():
-        torch.testing.assert_close(
-            network(observations, lights).normals,
-            network(observations * 137.5, lights).normals,
-            atol=1e-5,
-            rtol=0,
-        )
-
-
-@pytest.mark.parametrize("settings", [{}, SET, PAPER])
-def test_order_of_the_lights_does_not_matter(
-    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
-) -> None:
-    observations, lights = pixels[0][:8], pixels[1]
-    order = torch.tensor([3, 1, 4, 0, 5, 9, 2, 6, 8, 7])
-    network = random_network(**settings).double()
-    with torch.no_grad():
-        torch.testing.assert_close(
-            network(observations, lights).normals,
-            network(observations[:, order], lights[order]).normals,
-            atol=1e-5,
-            rtol=0,
-        )
-
-
 @pytest.mark.parametrize("settings", [{}, SET])
 def test_observations_that_are_not_valid_do_not_matter(
     random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
@@ -142,16 +100,6 @@ def test_observations_that_are_not_valid_do_not_matter(
     with torch.no_grad():
         expected = network(observations[:, :7], lights[:7]).normals
         torch.testing.assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("settings", [{}, SET, PAPER])
-def test_all_zero_pixels_give_a_unit_normal(
-    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
-) -> None:
-    with torch.no_grad():
-        normals = random_network(**settings)(torch.zeros(3, 10), pixels[1].float()).normals
-    assert torch.isfinite(normals).all()
-    assert normals.norm(dim=1).sub(1).abs().max() < 1e-5
 
 
 def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError
-from pathlib import Path
-
-import pytest
-
-from splinecli.pipeline.capture_memory import REFINED_PIXELS
-from splinecli.pipeline.info import ORIGINS, InfoOptions, summary_lines
+from splinecli.pipeline.info import ORIGINS, summary_lines
 
 REPORT = {
     "capture": "cat",
@@ -32,12 +26,6 @@ REPORT = {
 }
 
 
-def test_options_are_frozen() -> None:
-    options = InfoOptions(capture=Path("cat"))
-    with pytest.raises(FrozenInstanceError):
-        options.overwrite = True  # type: ignore[misc]
-
-
 def test_lines_of_a_report() -> None:
     assert summary_lines(REPORT) == [
         "capture      cat (plain folder)",
@@ -54,12 +42,6 @@ def test_lines_of_a_report() -> None:
         {**REPORT, "reads": "5 x 4 pixels from (1, 2)"}
     )
     assert "white level  none: floating-point" in summary_lines({**REPORT, "white_level": None})
-
-
-def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
-    from splinecli.methods.refiner import MARGIN, TILE
-
-    assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
 
 
 def test_every_origin_of_a_white_level_has_words() -> None:

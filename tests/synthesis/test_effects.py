@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage, stats
-from torch import Tensor
+from scipy import stats
 
 from distributions import SHARE, N, assert_uniform, generator
-from splinecli.observation_map import cell_directions, dot, rotate_about_view_axis
+from splinecli.observation_map import cell_directions, dot
 from splinecli.synthesis.effects import (
     Wall,
     draw_ambient,
@@ -21,13 +20,6 @@ from splinecli.synthesis.effects import (
 )
 from splinecli.synthesis.pixels import draw_visible_normals
 from splinecli.synthesis.principled import PrincipledMaterial
-
-
-def test_dot_of_shared_and_of_own_directions() -> None:
-    vectors, directions = torch.randn(5, 3, generator=generator()), torch.randn(7, 3, generator=generator(1))
-    expected = np.asarray(vectors) @ np.asarray(directions).T
-    np.testing.assert_allclose(dot(vectors, directions), expected, atol=1e-6)
-    np.testing.assert_allclose(dot(vectors, directions.expand(5, 7, 3)), expected, atol=1e-6)
 
 
 def test_walls_have_the_stated_shapes() -> None:
@@ -141,48 +133,6 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
     assert seen[0] == pytest.approx(9)  # both highlights are limited to three times a matte white
     assert seen[1] < 0.5
     assert wall.reflected(away, mirror(1), lights).max() < 0.5
-
-
-def test_walls_can_be_switched_off() -> None:
-    normals = draw_visible_normals(200, generator(1))
-    directions, inside = cell_directions()
-
-    def reflected(wall: Wall) -> Tensor:
-        return wall.reflected(normals, matte(200), directions[inside])
-
-    nothing = draw_wall(normals, 0.0, generator())
-    assert (nothing.visibility(directions[inside]) == 1).all()
-    assert not reflected(nothing).any()
-    shadows_only = draw_wall(normals, 1.0, generator(), interreflections=False)
-    assert not reflected(shadows_only).any()
-    assert (shadows_only.visibility(directions[inside]) < 1).any(dim=1).float().mean() > 0.8
-    light_only = draw_wall(normals, 1.0, generator(), shadows=False)
-    assert (light_only.visibility(directions[inside]) == 1).all()
-    lit = (normals * light_only.towards).sum(dim=1) > 0
-    assert lit.float().mean() > 0.6
-    assert (reflected(light_only)[lit] > 0).any(dim=1).all()
-
-
-def test_the_zenith_is_never_hidden() -> None:
-    wall = draw_wall(draw_visible_normals(N, generator(1)), 1.0, generator())
-    assert (wall.visibility(torch.tensor([[0.0, 0.0, 1.0]])) == 1).all()
-
-
-def test_the_hidden_lights_are_one_connected_sector() -> None:
-    # A picture of elevation by azimuth, the wall in its middle: the map, but without cells too coarse for its rim.
-    wall = draw_wall(draw_visible_normals(300, generator(1)), 1.0, generator())
-    elevation, azimuth = np.meshgrid(np.geomspace(1e-4, np.pi / 2, 100), np.radians(np.arange(-180, 180, 2)))
-    grid = np.stack(
-        (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation))
-    )
-    cosine, sine = wall.azimuth[:, :1], wall.azimuth[:, 1:2]
-    directions = torch.from_numpy(grid).float().reshape(3, -1).T.expand(300, -1, 3)
-    hidden = wall.visibility(rotate_about_view_axis(directions, cosine, sine)).numpy() < 1
-    for picture in hidden.reshape(300, *elevation.shape):
-        assert ndimage.label(picture)[1] == 1
-        # Towards the wall, from the horizon up.
-        assert picture[90, 0]
-        assert not picture[0].any()
 
 
 def test_a_known_wall_hides_the_lights_behind_it() -> None:

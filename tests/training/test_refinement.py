@@ -211,20 +211,6 @@ def test_unknown_normals_count_for_nothing(refining: TrainingConfig, bumpy_set: 
     torch.testing.assert_close(refinement_losses(network, maps._replace(normals=normals)), half)
 
 
-def test_enlarged_maps_mix_nothing_from_outside_of_the_mask() -> None:
-    """Each half of the object has a value of its own; everything outside is far off."""
-    mask = torch.zeros(20, 30, dtype=torch.bool)
-    mask[4:16, 5:25] = True
-    maps = torch.full((1, 20, 30), 1000.0)
-    maps[0, :, :15], maps[0, :, 15:] = 2.0, 5.0
-    enlarged, inside = refinement._enlarged(maps, mask, 2.5)
-    assert inside.shape == (50, 75)
-    assert int(inside.sum()) == pytest.approx(2.5**2 * 240, rel=0.05)
-    found = enlarged[0, inside]
-    assert (float(found.min()), float(found.max())) == pytest.approx((2, 5))
-    assert float((found < 2.001).float().mean()) == pytest.approx(0.5, abs=0.05)
-
-
 def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="rendered scenes"):
         Trainer(replace(refining, sources={"generator": 1.0}), tmp_path, CPU)

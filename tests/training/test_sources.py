@@ -62,17 +62,6 @@ def test_batches_of_other_numbers_of_lights_are_padded() -> None:
     assert not batch.observations[~batch.valid].any()
 
 
-def test_a_mixture_follows_its_seed() -> None:
-    def exposures(seed: int) -> torch.Tensor:
-        parts = [Constant(1.0, 3), Constant(2.0, 3)]
-        mixed = MixedSource(parts, (0.02, 1.0), seeded(seed))
-        drawn = torch.cat([mixed.draw(4).exposure for _ in range(40)])
-        return drawn
-
-    assert torch.equal(exposures(3), exposures(3))
-    assert not torch.equal(exposures(3), exposures(4))
-
-
 def entries_of(*scenes: str) -> list[Entry]:
     return [Entry(f"e{i}", scene, "", {}, 1, 3, {}) for i, scene in enumerate(scenes)]
 
@@ -100,16 +89,6 @@ def test_validation_takes_whole_scenes_and_never_all(
     # The order of the entries does not matter.
     again = split_scenes(entries[::-1], share)[1]
     assert {entry.scene for entry in again} == for_validation
-
-
-def test_validation_scenes_stay_the_same_when_a_set_grows() -> None:
-    for_validation = {
-        entry.scene for entry in split_scenes(entries_of(*(f"s{i}" for i in range(40))), 0.25)[1]
-    }
-    grown = {entry.scene for entry in split_scenes(entries_of(*(f"s{i}" for i in range(80))), 0.25)[1]}
-    assert len(for_validation) == 10
-    # Only scenes at the edge of the share may change, because the hashes are uniform.
-    assert len(for_validation & grown) >= 7
 
 
 def rows_of(pixel_set: PixelSet, *names: str) -> set[tuple[float, ...]]:
@@ -191,12 +170,6 @@ def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
         open_sources(
             replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}), seeded(), seeded()
         )
-
-
-def test_a_set_of_one_scene_is_named(make_set: MakeSet, tiny: TrainingConfig) -> None:
-    alone = make_set("alone", entries=[("a", "one", 20, 20)])
-    opened = open_sources(replace(tiny, sources={str(alone.folder): 1.0}), seeded(), seeded())
-    assert opened.single_scene_sets == (str(alone.folder),)
 
 
 def test_sources_without_weight_are_not_opened(tiny: TrainingConfig) -> None:

@@ -59,11 +59,6 @@ def test_directions(tmp_path: Path, text: str, n_images: int | None, encoding: s
     np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
 
 
-def test_three_lights_are_read_as_rows(tmp_path: Path) -> None:
-    directions = read_light_directions(write(tmp_path, "0 0 1\n3 0 4\n0 3 4"), 3)
-    np.testing.assert_allclose(directions, [[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
-
-
 def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> None:
     directions = read_light_directions(write(tmp_path, "0 3e300 4e300\n0 3e-300 4e-300\n0 0 1"))
     np.testing.assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)

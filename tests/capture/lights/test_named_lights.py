@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.capture import find_captures, open_capture, read_capture
+from splinecli.capture import open_capture, read_capture
 from splinecli.errors import InputError
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
@@ -132,12 +132,6 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(
     assert open_capture(folder, intensities=file).light_intensities.tolist() == [[3.0] * 3] * 5
 
 
-def test_a_folder_with_an_lp_file_is_a_capture(write_folder: WriteFolder) -> None:
-    folder = write_folder("set/dome")
-    (folder / "a.lp").write_text(f"5\n{rows(NAMES)}")
-    assert find_captures(folder.parent) == [folder]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -192,14 +186,6 @@ def test_refused_json_files(write_folder: WriteFolder, text: str, message: str) 
     assert message in str(refused.value)
 
 
-def test_several_light_files(write_folder: WriteFolder) -> None:
-    folder = write_folder("dome")
-    for name in ("a.lp", "b.lp"):
-        (folder / name).write_text(f"5\n{rows(NAMES)}")
-    with pytest.raises(InputError, match=r"found 2 light files: a\.lp, b\.lp"):
-        open_capture(folder)
-
-
 def test_umlauts_of_older_programs_and_images_that_are_not_named(write_folder: WriteFolder) -> None:
     names = ["schräg 1.png", "schräg 2.png", "schräg 3.png", "schräg 4.png", "rest.png"]
     folder = write_folder("umlauts", names)
@@ -209,10 +195,3 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(write_folder: W
     assert [path.name for path in source.files.images] == names[:4]
     assert [warning.code for warning in source.warnings] == ["images_left_out"]
     assert "names 4 of the 5 images; the others are left out" in str(source.warnings[0])
-
-
-def test_psbox_with_calibrated_lights_alone(write_folder: WriteFolder, tmp_path: Path) -> None:
-    folder = write_folder("kitten/Objects", [f"{number}.png" for number in range(5)]).parent
-    (tmp_path / "lights.txt").write_text(rows(), "utf-8")
-    source = open_capture(folder, lights=tmp_path / "lights.txt")
-    assert (source.files.layout, source.files.name, source.n_lights) == ("PSBox", "kitten", 5)

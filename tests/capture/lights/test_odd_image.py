@@ -99,12 +99,6 @@ def test_an_image_half_in_shadow_is_odd(known: bool) -> None:
     assert odd is not None and odd.place == ODD
 
 
-def test_exchanged_images_are_not_odd() -> None:
-    observations = shade(sphere()[0], lights())
-    observations[:, [2, 7]] = observations[:, [7, 2]]
-    assert find(observations) is None
-
-
 def test_the_other_images_are_judged_without_the_odd_one() -> None:
     normals, mask = sphere()
     observations = shade(normals, lights())
