@@ -93,14 +93,6 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lig
     assert restored < as_stored / 2
 
 
-def test_draws_from_a_file(dataset, run):
-    Path("draws.txt").write_text("# without the shadowed light\n1 2 3 4\n4,5,6,7\n")
-    document = json.loads(run("evaluate", dataset, "--method", "ls", "--draws", "draws.txt", "--json").out)
-    assert document["protocol"]["draws"] == "draws.txt"
-    assert [(r["trials"], r["n_lights"]) for r in document["results"]] == [(2, 4), (2, 4)]
-    assert all(result["mae_deg"] < 1e-3 for result in document["results"])
-
-
 def test_several_light_counts_and_all(dataset, run, golden):
     arguments = ["--n-lights", 4, "--n-lights", "all", "--trials", 2, "--max-pixels", 50]
     result = run("evaluate", dataset, "--method", "ls", *arguments)

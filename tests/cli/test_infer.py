@@ -113,13 +113,6 @@ def test_options_of_the_surface_that_are_refused(capture, run, arguments, messag
     assert (result.code, message in result.err) == (2, True), result.err
 
 
-def test_a_missing_library_is_named_before_the_work(capture, run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    result = run("infer", capture, "--method", "ls", "--surface", "--decimate", 50)
-    assert (result.code, "pip install 'splinecli[mesh]'" in result.err) == (2, True), result.err
-    assert not Path("out").exists()
-
-
 def test_how_sure_the_network_is(capture, run):
     assert run("infer", capture, "--maps", "confidence", "--html", "--overwrite").code == 0
     out, mask = Path("out/sphere"), cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0

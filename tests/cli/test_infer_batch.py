@@ -222,18 +222,6 @@ def test_a_failure_is_that_of_its_capture(failure, place, capture, make_capture,
     assert f"splinecli: {first['error']}\n" in result.err
 
 
-def test_a_folder_without_permission(capture, make_capture, run_without_privileges):
-    """The parser must not refuse it: it would end the batch before the first capture."""
-    make_capture("second")
-    capture.chmod(0)
-    result = run_without_privileges("infer", capture, "second", "--method", "ls", "--json")
-    capture.chmod(0o755)
-    first, second = json.loads(result.out)
-    assert (result.code, first["capture"], first["exit_code"]) == (3, "sphere", 3)
-    assert first["error"] == "sphere: the folder cannot be read (Permission denied)."
-    assert second == read_report(Path("out/second"))
-
-
 def test_a_missing_folder_is_the_failure_of_its_capture(capture, run):
     result = run("infer", "nowhere", capture, "--method", "ls", "--json")
     first, second = json.loads(result.out)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import cv2
@@ -171,14 +170,6 @@ def test_a_white_level_is_used_and_named(run, capture):
     refused = run("prepare", capture, "-o", "set")
     assert refused.code == 5
     assert "was made with white_level = 3500.0, not None" in refused.err
-
-
-def test_a_missing_extra_is_named_before_captures_are_read(run, capture, monkeypatch):
-    monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    result = run("prepare", capture, "--scenes", 1, "-o", "set")
-    assert (result.code, result.out) == (2, "")
-    assert "splinecli[render]" in result.err
-    assert not Path("set").exists()
 
 
 @pytest.fixture

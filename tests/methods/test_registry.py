@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.devices import count_available_cores
 from splinecli.errors import ModelError, UsageError
 from splinecli.methods import MethodOptions, make_estimator, method_names
 from splinecli.networks.config import NetworkConfig
@@ -107,14 +106,3 @@ def test_options_that_cannot_be(options: MethodOptions, error: type[Exception]) 
 def test_counts_from_one(options: MethodOptions, weights: str) -> None:
     with pytest.raises(UsageError, match="whole numbers from 1"):
         make_estimator("spline-net", replace(options, weights=weights))
-
-
-@pytest.mark.parametrize("name", ["spline-net", "iw12"])
-def test_torch_methods_use_no_more_threads_than_the_process_has_cores(
-    name: str, weights: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen: list[int] = []
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 64)
-    monkeypatch.setattr(torch, "set_num_threads", chosen.append)
-    make_estimator(name, MethodOptions(weights=weights, device="cpu"))
-    assert chosen == [count_available_cores()]

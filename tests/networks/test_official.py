@@ -1,6 +1,7 @@
-"""The authors' weights: their architecture, built here from its description, is the oracle of the import.
+"""The paper's size: its published numbers of parameters, and the authors' weights.
 
-Both networks get random weights, are saved as the authors save theirs, imported, and asked the same questions.
+The authors' architecture, built here from its description, is the oracle of the import: both networks get random
+weights, are saved as the authors save theirs, imported, and asked the same questions.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
+from splinecli.networks.li_net import PaperLINet
+from splinecli.networks.ne_net import PaperNENet
 from splinecli.networks.official import import_official
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_weights, save_weights
@@ -261,3 +264,25 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
     ):
         with pytest.raises(ModelError, match=reason):
             import_official(missing, files[1])
+
+
+def parameters(network: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def test_paper_li_net_has_the_published_number_of_parameters() -> None:
+    # Weights: 1*64*7*7, 64*128*4*4, 128*256*4*4; 12 times 256*256*3*3; 256*128*4*4, 128*64*4*4, 64*1*7*7.
+    weights = 3_136 + 131_072 + 524_288 + 12 * 589_824 + 524_288 + 131_072 + 3_136
+    # A scale and an offset for each normalised channel.
+    norms = 2 * (64 + 128 + 256 + 12 * 256 + 128 + 64)
+    expected = weights + norms
+    assert parameters(PaperLINet()) == expected == 8_402_304
+    assert expected / 1e6 == pytest.approx(8.40, abs=0.01)
+
+
+def test_paper_ne_net_has_the_published_number_of_parameters() -> None:
+    # 2*16*9 + 16; dense block 16*16*9 + 16, 32*16*9 + 16; 48*48 + 48; dense block 48*16*9 + 16, 64*16*9 + 16;
+    # 80*80 + 80; 80*16*16 * 128 + 128; 128*3 + 3.
+    expected = 304 + 2_320 + 4_624 + 2_352 + 6_928 + 9_232 + 6_480 + 2_621_568 + 387
+    assert parameters(PaperNENet(2, 32)) == expected == 2_654_195
+    assert expected / 1e6 == pytest.approx(2.65, abs=0.01)

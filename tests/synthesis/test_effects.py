@@ -61,17 +61,6 @@ def test_walls_stand_where_the_surface_looks() -> None:
     assert stats.kstest(degrees, cdf).pvalue > 1e-3
 
 
-def test_walls_reflect_what_they_see_of_the_sky() -> None:
-    wall = draw_wall(draw_visible_normals(N, generator(1)), 1.0, generator())
-    seen = 1 - (1 + wall.tan_height.double() ** 2) ** -0.5
-    share = (wall.reflectance / seen).numpy().ravel()
-    same = wall.has_pixel_material.numpy().ravel()
-    fresh = np.random.default_rng(0)
-    expected = fresh.uniform(0.5, 2, N) * fresh.uniform(size=N)
-    assert stats.ks_2samp(share[same], expected).pvalue > 1e-3
-    assert stats.ks_2samp(share[~same], expected * fresh.uniform(0.05, 0.9, N)).pvalue > 1e-3
-
-
 def matte(pixels: int) -> PrincipledMaterial:
     """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection away."""
     zero = torch.zeros(pixels, 1)

@@ -90,9 +90,7 @@ def test_matte_pixels_obey_lambert_s_law() -> None:
 def test_a_scene_turned_by_90_degrees_turns_its_map(config: PixelGeneratorConfig) -> None:
     scene = draw_scene(300, config, torch.Generator().manual_seed(0))
     turned = scene.rotate(torch.zeros(300), torch.ones(300))
-    torch.testing.assert_close(
-        turned.dense_map(), scene.dense_map().rot90(1, (2, 3)), rtol=2e-3, atol=1e-4
-    )
+    torch.testing.assert_close(turned.dense_map(), scene.dense_map().rot90(1, (2, 3)), rtol=2e-3, atol=1e-4)
 
 
 def test_each_pixel_is_turned_by_its_own_angle() -> None:

@@ -212,22 +212,6 @@ def test_drawn_materials_have_the_stated_classes() -> None:
         0.5 * np.log10(0.05 / 10**-1.7) / 1.7, abs=0.01
     )
     assert values["base"][metal].min() >= 0.05
-    ranges = {
-        "base": (0.02, 1),
-        "specular": (0, 4),
-        "sheen": (0, 1),
-        "clearcoat": (0, 4),
-        "clearcoat_gloss": (0, 1),
-        "interface_loss": (0, 1),
-        "minnaert": (0.85, 1.5),
-        "tail_exponent": (1.1, 2),
-        "second_share": (0, 0.7),
-        "second_roughness": (0.1, 0.8),
-        "retro": (0, 1),
-    }
-    for name, (low, high) in ranges.items():
-        assert low - 1e-3 <= values[name].min() <= low + 0.01, name
-        assert high - 0.01 <= values[name].max() <= high, name
     rough = values["roughness"]
     assert 0.1 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9
     assert rough[~(metal | blend)].min() == pytest.approx(0.05, abs=0.01)

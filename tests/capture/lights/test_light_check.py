@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import scenes
+from scenes import ring_lights, spiral_lights
 from splinecli.capture import read_capture
 from splinecli.capture.lights.light_check import LightCheck, check_lights
 from splinecli.capture.lights.light_fit import find_factors, random_misfits
@@ -20,20 +22,13 @@ MEDALLION = Path(__file__).resolve().parents[3] / "examples/medallion"
 SIZE = 64
 
 
-def ring(count: int, axis_deg: float = 40) -> Array:
-    azimuth, zenith = 0.3 + np.arange(count) * 2 * np.pi / count, np.radians(axis_deg)
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.full(count, np.cos(zenith))),
-        axis=1,
-    )
+def ring(count: int) -> Array:
+    return ring_lights(count, 40, 0.3)
 
 
 def scattered(count: int = 14) -> Array:
     """Lights on a spiral, so that no shift or exchange takes them to each other."""
-    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(12, 55, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+    return spiral_lights(count, 55, 12)
 
 
 def vase() -> tuple[Array, NDArray[np.bool_]]:
@@ -52,12 +47,7 @@ def vase() -> tuple[Array, NDArray[np.bool_]]:
 
 def shade(normals: Array, lights: Array) -> Array:
     """Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise."""
-    half = lights + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    cosine = np.clip(normals @ lights.T, 0, None)
-    highlight = 0.3 * np.clip(normals @ half.T, 0, None) ** 30 * (cosine > 0)
-    noise = np.random.default_rng(5).normal(0, 0.01, cosine.shape)
-    return np.clip(cosine + highlight + noise, 0, None)
+    return scenes.shade(normals, lights, gloss=0.3, noise=0.01)
 
 
 def check_vase(lights: Array, read_as: Array) -> LightCheck:
@@ -132,10 +122,8 @@ def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
 
 def metal(normals: Array, lights: Array) -> Array:
     """A highlight, whose brightness varies from image to image, and hardly any matte reflection."""
-    half = lights + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
     lit = np.clip(normals @ lights.T, 0, None)
-    return 0.02 * lit + np.clip(normals @ half.T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
+    return 0.02 * lit + np.clip(normals @ scenes.halfway(lights).T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
 
 
 @pytest.mark.parametrize(
