@@ -19,7 +19,7 @@ def directions_at(azimuth: Floats, zenith: Floats | float) -> Floats:
 
 
 def cap_directions(count: int, limit_deg: float, seed: int = 0, *, even: bool = False) -> Floats:
-    """Random unit vectors (count, 3) within limit_deg of the view axis: evenly by angle, or evenly spread over the cap."""
+    """Random unit vectors (count, 3) within limit_deg of the view axis: even by angle, or even over the cap."""
     rng = np.random.default_rng(seed)
     azimuth, limit = rng.uniform(0, 2 * np.pi, count), np.radians(limit_deg)
     zenith = limit * (np.sqrt(rng.uniform(0, 1, count)) if even else rng.uniform(0, 1, count))

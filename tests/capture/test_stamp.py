@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import RadiometricCalibration, open_capture
 from splinecli.capture.stamp import digest, stamp_capture
+from splinecli.errors import InputError
 from splinecli.pixel_sets.captures import add_capture
 from splinecli.pixel_sets.writer import PixelSetWriter
 
@@ -78,3 +79,11 @@ def test_a_new_ambient_image_replaces_the_pixels_that_prepare_kept(
     assert recipe() == before
     write_image("vase/ambient.png", np.full((4, 5), 200, np.uint16))
     assert recipe() != before
+
+
+@pytest.mark.parametrize("name", ["mask.png", "1.png"])
+def test_a_file_that_is_gone_is_named(folder: Path, name: str) -> None:
+    source = open_capture(folder)
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: the file cannot be read"):
+        stamp_capture(source)

@@ -91,6 +91,11 @@ def test_two_rotations_of_a_canonical_network_make_it_mirror_symmetric() -> None
         assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
 
 
+def test_several_rotations_give_unit_vectors() -> None:
+    network = estimator(random_network(COMPACT), precision="float32", rotations=5)
+    np.testing.assert_allclose(np.linalg.norm(network.estimate(*pixels(30)), axis=1), 1, rtol=1e-5)
+
+
 @pytest.mark.parametrize("rotations", [1, 3])
 @pytest.mark.parametrize("config", [COMPACT, PAPER, CNN_PS], ids=["compact", "paper", "cnn-ps"])
 def test_progress_follows_the_layers_within_a_batch_and_changes_no_bit(

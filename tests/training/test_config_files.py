@@ -16,6 +16,7 @@ from splinecli.training.config_files import (
     configure_resumed,
     parse_light_counts,
     parse_parameter,
+    parse_sources,
     read_config_file,
 )
 
@@ -120,11 +121,13 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("seed=3", {"seed": 3}),
         ("pixels.cast_shadows=false", {"pixels": {"cast_shadows": False}}),
         ("updates=alternating", {"updates": "alternating"}),
+        ('updates="alternating"', {"updates": "alternating"}),
         ("network.size = paper", {"network": {"size": "paper"}}),
         (
             "pixels.measured_materials=/data/a=b.npz",
             {"pixels": {"measured_materials": "/data/a=b.npz"}},
         ),
+        ("a.b.c=1", {"a": {"b": {"c": 1}}}),
         ("sources={generator = 1.0}", {"sources": {"generator": 1.0}}),
         ("seed=", {"seed": ""}),
     ],
@@ -193,3 +196,11 @@ def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: 
 )
 def test_light_counts(text: str, expected: tuple[int, int, int]) -> None:
     assert tuple(parse_light_counts(text).values()) == expected
+
+
+def test_sources_of_the_command_line() -> None:
+    sets = [Path("a"), Path("b")]
+    assert parse_sources([], None) == {GENERATOR: 1.0}
+    assert parse_sources(sets, None) == {"a": 1.0, "b": 1.0}
+    assert parse_sources(sets, 0.5) == {"a": 1.0, "b": 1.0, GENERATOR: 0.5}
+    assert parse_sources([], 0.0) == {}

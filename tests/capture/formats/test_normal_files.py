@@ -73,6 +73,11 @@ def test_pictures(
     np.testing.assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
 
 
+def test_a_gray_background_is_no_normal(write_image: WriteImage, normals: NDArray[np.float64]) -> None:
+    picture = encode_picture(normals, np.ones(SHAPE, bool), bits=8)  # zero vectors become 128, 128, 128
+    assert not read_normals(write_image("a.png", picture), SHAPE, np.ones(SHAPE, bool))[1, 2].any()
+
+
 def test_what_is_not_finite_or_outside_the_mask_is_no_ground_truth(
     tmp_path: Path, normals: NDArray[np.float64]
 ) -> None:
@@ -120,6 +125,14 @@ def test_wrong_size(tmp_path: Path, normals: NDArray[np.float64], name: str) -> 
         read_normals(write(tmp_path / name, normals[1:]), SHAPE, MASK)
 
 
+def test_text_with_a_wrong_number_of_rows(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+    path = write(tmp_path / "a.txt", normals[1:])
+    with pytest.raises(
+        InputError, match="found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"
+    ):
+        read_normals(path, SHAPE, MASK)
+
+
 def test_damaged_and_unknown_files(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     with pytest.raises(InputError, match="does not exist"):
         read_normals(tmp_path / "a.npy", SHAPE, MASK)
@@ -153,6 +166,11 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
         read_normals(tmp_path / "a.npy", SHAPE, MASK)
 
 
+def test_no_normal_inside_the_mask(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="found no normal inside the mask, expected at least one"):
+        read_normals(write(tmp_path / "a.npy", np.zeros((*SHAPE, 3))), SHAPE, MASK)
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> None:
     picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
@@ -170,6 +188,12 @@ def test_a_picture_saved_by_numpy(tmp_path: Path, normals: NDArray[np.float64], 
     read = read_normals(tmp_path / "a.npy", SHAPE, MASK)
     assert not read[~has_normal].any()
     assert angle_between_deg(read[has_normal], normals[has_normal]).max() < 0.5
+
+
+def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
+    plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
+    scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
+    np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", SHAPE, MASK), plane * MASK[..., None])
 
 
 def test_a_path_that_the_system_refuses(tmp_path: Path) -> None:
