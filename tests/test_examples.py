@@ -137,18 +137,6 @@ def test_the_normals_belong_to_the_height_field(script):
     assert np.median(up) < 1e-5
 
 
-def test_shadows_fall_away_from_the_light(script):
-    # A block in the middle of a table, a light from the upper right at 45 degrees.
-    heights = np.zeros((60, 60))
-    heights[28:32, 28:32] = 0.2  # at 45 degrees the shadow is 0.2 long too: 6 samples of 2 / 60
-    light = np.array((0.5, 0.5, np.sqrt(0.5)))
-    seen = script.visibility(heights, light)
-    assert seen[34, 25] == 0  # down and left of it
-    assert seen[25, 34] == 1 and seen[25, 25] == 1 and seen[34, 34] == 1
-    assert seen[29, 30] == 1  # its own top
-    assert seen[42, 17] == 1  # past the shadow's end
-
-
 @pytest.fixture(scope="module")
 def ls_mae_deg() -> float:
     estimate = estimate_normals(read_capture(MEDALLION), make_estimator("ls"))

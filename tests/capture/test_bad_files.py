@@ -15,6 +15,7 @@ import pytest
 import tifffile
 
 from splinecli.capture import Overrides, find_capture_files, open_capture, read_capture
+from splinecli.capture.formats.header import is_display_encoded, stated_white_level
 from splinecli.errors import InputError
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
@@ -95,6 +96,14 @@ def test_a_file_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None
     with pytest.raises(InputError) as caught:
         read_capture(folder)
     assert str(caught.value) == f"{folder / name}: the file cannot be read (Permission denied)."
+
+
+def test_headers_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None]) -> None:
+    forbid(folder / "1.tif")
+    with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
+        is_display_encoded(folder / "1.tif")
+    with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
+        stated_white_level(folder / "1.tif")
 
 
 def test_an_image_that_vanishes(folder: Path) -> None:

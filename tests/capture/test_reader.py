@@ -11,7 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from splinecli.capture import CaptureWarning, open_capture, read_capture
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
 
 WriteImage = Callable[..., Path]
@@ -99,23 +99,6 @@ def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDAr
     )
     with pytest.raises(InputError, match=r"img9\.png: found neither PNG, TIFF nor JPEG"):
         source.read()
-
-
-@pytest.mark.parametrize(
-    ("indices", "message"),
-    [
-        (
-            [0, 1, 4],
-            "light index 4 is out of range: the capture has 4 lights. Light indices count from 0 to 3.",
-        ),
-        ([0, 1, 1], "light index 1 comes twice. Name each light once."),
-        ([0, 1], "2 lights chosen, expected at least 3."),
-    ],
-)
-def test_wrong_light_indices(capture_folder: Path, indices: list[int], message: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        read_capture(capture_folder, light_indices=indices)
-    assert str(caught.value) == message
 
 
 def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> None:

@@ -46,16 +46,6 @@ def test_positions_that_cannot_be_meant(positions: list[int], message: str) -> N
     assert str(caught.value) == message
 
 
-def test_chosen_lights_in_one_plane() -> None:
-    row = np.array([[-0.6, 0, 0.8], [0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
-    with pytest.raises(InputError) as caught:
-        make(light_directions=row).choose_lights([0, 1, 2])
-    assert str(caught.value) == (
-        "vase: the 3 lights lie in one plane, so least squares (LS) cannot solve for a normal."
-        " Choose lights that surround the viewing direction."
-    )
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

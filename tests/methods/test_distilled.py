@@ -16,7 +16,7 @@ from splinecli.errors import UsageError
 from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.methods.pupil_size import PupilSize
+from splinecli.methods.pupil_size import PupilSize, pupil_sizes
 from splinecli.methods.refiner import Refiner
 from splinecli.networks.refine_net import RefineNet
 from splinecli.normals import angle_between_deg, unit
@@ -168,3 +168,13 @@ def test_too_few_pixels() -> None:
     teacher = Teacher(observations, normals, np.tile(log_median(2), (127, 1)))
     with pytest.raises(UsageError, match="127 pixels are lit, too few to distil the network"):
         distil(teacher, observations, LIGHTS, SIZE)
+
+
+def test_sizes_grow_with_the_capture() -> None:
+    assert pupil_sizes(100_000)[0] == PupilSize(sample=10_000, steps=1000, width=192)
+    assert pupil_sizes(1_600_000)[0].sample == 20_000
+    assert pupil_sizes(8_000)[0].sample == 2000
+    for n_pixels in (1000, 100_000, 24_000_000):
+        usual, larger = pupil_sizes(n_pixels)
+        assert usual.sample < larger.sample < n_pixels
+        assert usual.width < larger.width

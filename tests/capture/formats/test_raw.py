@@ -6,16 +6,19 @@ import struct
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splinecli.calibration.balls import find_ball_files
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.exposure import Exposure, read_exposure
 from splinecli.capture.formats.header import is_display_encoded
+from splinecli.capture.formats.raw import _full_scale
 from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
 from splinecli.capture.layouts.image_lists import list_images
 from splinecli.errors import InputError
@@ -168,6 +171,21 @@ def test_saturated_photosites_are_at_full_scale(tmp_path: Path, white: int, blac
         assert (pixels[:, 30:] < 65535).all()
 
 
+def test_full_scale_is_where_the_camera_says() -> None:
+    def full_scale(stated: list[int] | None) -> int:
+        raw: Any = SimpleNamespace(
+            white_level=16383,
+            camera_white_level_per_channel=stated,
+            black_level_per_channel=[510, 512, 511, 512],
+        )
+        return _full_scale(raw)
+
+    assert full_scale(None) == 16383 - 512 - 1
+    assert full_scale([15300, 15200, 15200, 15300]) == 15200 - 512 - 1
+    for other_unit in (3800, 60000):
+        assert full_scale([other_unit] * 4) == 16383 - 512 - 1
+
+
 @pytest.mark.usefixtures("needs_rawpy")
 @pytest.mark.parametrize("colour", [(0.2, 0.5, 0.3), (0.4,)])
 def test_sensors_without_bayer_filter(tmp_path: Path, colour: tuple[float, ...]) -> None:
@@ -267,6 +285,13 @@ def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:
     ]
 
 
+def test_photographs_of_mirror_balls(tmp_path: Path) -> None:
+    touch(tmp_path, "1.cr3", "1.jpg", "2.cr3", "2.jpg", "ref.cr3", "ref.jpg", "mask.png")
+    files = find_ball_files(tmp_path)
+    assert names_of(files.images) == ["1.cr3", "2.cr3"]
+    assert files.reference == tmp_path / "ref.cr3"
+
+
 @pytest.mark.usefixtures("without_rawpy")
 def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
     stated = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
@@ -284,3 +309,12 @@ def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture
     path.write_bytes(path.read_bytes()[:2000])
     assert read_exposure(path) is None
     assert capfd.readouterr() == ("", "")
+
+
+def test_mixed_exposures_are_refused(tmp_path: Path) -> None:
+    for number, seconds in enumerate((1 / 64, 1 / 64, 1 / 32)):
+        write_dng(tmp_path / f"{number}.nef", mosaic(ramp()), exposure=(seconds, 8.0, 100))
+    (tmp_path / "lights.txt").write_text(LIGHTS)
+    message = r"2\.nef: found an exposure of 1/32 s, f/8, ISO 100, expected 1/64 s, f/8, ISO 100 as in 0\.nef"
+    with pytest.raises(InputError, match=message):
+        open_capture(tmp_path)

@@ -112,14 +112,3 @@ def test_a_wrong_draws_file(tmp_path: Path, text: str, problem: str) -> None:
     with pytest.raises(InputError) as raised:
         read_draws(path)
     assert str(raised.value) == f"{path}{problem}"
-
-
-def test_a_draws_file_against_a_capture(tmp_path: Path) -> None:
-    path = write(tmp_path, "0 1 2\n\n3 8 4\n")
-    with pytest.raises(InputError) as raised:
-        read_draws(path).check_against(LIGHTS[:8])
-    assert str(raised.value) == f"{path}:3: found light index 8, expected 0 to 7: the capture has 8 lights."
-    flat = LIGHTS[:9].copy()
-    flat[[3, 4, 8], 1] = 0
-    with pytest.raises(InputError, match=r"draws\.txt:3: the lights of this draw lie in one plane"):
-        read_draws(path).check_against(unit(flat))

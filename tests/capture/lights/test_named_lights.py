@@ -110,17 +110,6 @@ def test_images_that_no_light_names_are_left_out(write_folder: WriteFolder) -> N
     assert [path.name for path in open_capture(folder).files.images] == NAMES[:4]
 
 
-def test_a_named_light_file_goes_before_the_folder_s(write_folder: WriteFolder, tmp_path: Path) -> None:
-    folder = write_folder("dome")
-    (folder / "lights.txt").write_text("1 2 3\n")
-    other = tmp_path / "other.lp"
-    other.write_text(f"5\n{rows(NAMES)}")
-    source = open_capture(folder, lights=other)
-    np.testing.assert_allclose(
-        source.light_directions, LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
-    )
-
-
 def test_intensities_of_the_json_count_unless_a_file_is_given(
     write_folder: WriteFolder, tmp_path: Path
 ) -> None:
