@@ -14,6 +14,7 @@ from splinecli.capture.window import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.info import InfoOptions, describe_capture
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]
@@ -74,6 +75,15 @@ def test_results_are_a_part_of_those_of_the_whole(
         maps[name] = np.load(folder / "normals.npy"), np.load(folder / "albedo.npy")
     for whole, part in zip(maps["whole"], maps["part"], strict=True):
         np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
+
+
+def test_info_counts_what_is_read() -> None:
+    crop, scale = WINDOWS[2]
+    part = describe_capture(InfoOptions(capture=MEDALLION, reading=InferOptions(crop=crop, scale=scale)))
+    expected = open_capture(MEDALLION, window=parse_window(crop, scale)).read().n_pixels
+    assert part["n_pixels"] == expected
+    assert part["reads"] == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
+    assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
 
 @pytest.mark.parametrize(

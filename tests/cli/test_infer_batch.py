@@ -13,11 +13,12 @@ from urllib.parse import unquote
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.files import UNFINISHED
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.pipeline.batch import infer_batch
+from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
@@ -137,6 +138,27 @@ def test_another_object_of_the_same_name(capture, make_capture, run):
     assert (other.code, "out/sphere: contains results made from other input files" in other.err) == (5, True)
 
 
+def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
+    holder = capture.parent / "Ball"
+    for kind in ("specular", "metallic"):
+        (holder / f"images_{kind}").mkdir(parents=True)
+        for index in range(8):
+            picture = cv2.imread(str(capture / f"image{index + 1}.png"), cv2.IMREAD_UNCHANGED)
+            tifffile.imwrite(holder / f"images_{kind}/{index:05}.tif", np.dstack([picture] * 3))
+    (holder / "light.txt").write_bytes((capture / "light_directions.txt").read_bytes())
+    for name in ("inboundary.png", "onboundary.png"):
+        (holder / name).write_bytes((capture / "mask.png").read_bytes())
+    result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
+    assert result.code == 0
+    assert result.err.endswith("2 captures: 2 done; see out/index.html\n")
+    assert {path.name for path in Path("out").iterdir()} == {"index.html", "Ball_specular", "Ball_metallic"}
+    assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
+    # An object with several kinds is passed over among others, under its own name.
+    result = run("infer", holder, capture, "--method", "ls", "--overwrite")
+    assert result.code == 3
+    assert "Ball: found 2 folders of images (images_metallic, images_specular)" in result.err
+
+
 def test_an_index_of_several_captures(capture, make_capture, run):
     make_capture("a b")
     make_capture("broken")
@@ -254,6 +276,13 @@ def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch
     assert not Path("out/second").exists()
 
 
+def test_the_worst_exit_code():
+    assert worst_exit_code([]) == 0
+    assert worst_exit_code([0, 3, 0]) == 3
+    assert worst_exit_code([5, 3, 2]) == 5
+    assert worst_exit_code([5, 1, 3]) == 1  # a defect
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -347,6 +376,18 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
         ("second: reading", 8),
         ("second: estimating", 448),
     ]
+
+
+def test_as_stored_is_named_and_a_white_level_is_used(capture, run):
+    for path in capture.glob("image*.png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.minimum(picture, 57_000).astype(np.uint16))
+    call = ("infer", capture, "--method", "ls", "--overwrite", "--json", "--white-level", 57_000)
+    restored, stored = (json.loads(run(*call, *extra).out)[0] for extra in ((), ("--as-stored",)))
+    assert (restored["reading"], stored["reading"]) == ("restored", "as stored")
+    assert restored["white_level"] == {"value": 57_000, "origin": "given"}
+    assert restored["angular_error_deg"]["mean"] < 0.1 < stored["angular_error_deg"]["mean"]
+    assert restored["options"]["white_level"] == 57_000
 
 
 def test_shards_give_the_results_of_the_whole(capture, make_capture, run):

@@ -73,6 +73,12 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form):
     assert np.nanmax(here) - np.nanmin(here) > 1
 
 
+def test_an_array_of_something_else(run):
+    np.save("albedo.npy", np.random.default_rng(0).uniform(0, 0.4, (*SHAPE, 3)).astype(np.float32))
+    result = run("integrate", "albedo.npy", "-o", "out")
+    assert (result.code, "these are no normals" in result.err) == (3, True)
+
+
 @pytest.mark.parametrize("where", ["mask", "alpha"])
 def test_a_background_that_is_not_black(run, where):
     normals, heights, inside = sphere()
@@ -91,6 +97,15 @@ def test_a_background_that_is_not_black(run, where):
     depth = np.load("out/depth.npy")
     assert np.array_equal(np.isfinite(depth), inside)
     assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
+
+
+def test_results_of_infer_stay_together(run, capture):
+    assert run("infer", str(capture), "--method", "ls", "-o", "results").code == 0
+    folder = Path("results") / capture.name
+    assert run("integrate", str(folder), "-q").code == 0
+    assert {"normals.npy", "depth.npy", "mesh.ply", "surface.json"} <= {
+        path.name for path in folder.iterdir()
+    }
 
 
 def test_a_part_in_colour_by_perspective(run):

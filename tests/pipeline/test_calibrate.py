@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import FrozenInstanceError
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,13 @@ BALLS = (Path("one"), Path("two"))
 def test_options_that_contradict_each_other(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         CalibrateOptions(balls=BALLS, **options)
+
+
+def test_options_are_frozen() -> None:
+    options = CalibrateOptions(balls=BALLS, gray_card=Path("card"), transfer="gamma:2.2")
+    assert options.gamma == 2.2
+    with pytest.raises(FrozenInstanceError):
+        options.transfer = "linear"  # type: ignore[misc]
 
 
 def test_files_are_checked_before_images_are_read(tmp_path: Path) -> None:
