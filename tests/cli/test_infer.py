@@ -210,12 +210,6 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     )
 
 
-def test_json_is_the_report_and_nothing_else(capture, run):
-    result = run("infer", capture, "--method", "ls", "--json")
-    assert json.loads(result.out) == [read_report(Path("out/sphere"))]
-    assert result.err == ""
-
-
 def test_lights_by_index_and_by_draw(capture, run):
     (chosen,) = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
     assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])

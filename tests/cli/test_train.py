@@ -96,15 +96,6 @@ def test_a_run_and_its_continuation(run):
     assert [row["step"] for row in rows()] == ["3", "5", "6"]
 
 
-def test_the_weights_work(run, make_capture, no_pictures):
-    run("train", "-o", "run", "--steps", 1, "--quiet")
-    (report,) = json.loads(
-        run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
-    )
-    assert report["weights"]["name"] == "weights"
-    assert report["angular_error_deg"]["mean"] < 5
-
-
 def test_a_run_on_pixel_sets(run, make_capture):
     write_set("set")
     write_set("more/set")
@@ -125,23 +116,6 @@ def test_a_run_on_pixel_sets(run, make_capture):
     Path("elsewhere").mkdir()
     os.chdir("elsewhere")
     assert run("train", "-o", "../run", "--resume", "--steps", 6, "--quiet").code == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sources"),
-    [
-        (["set"], {"set": 1.0}),
-        (["set", "--generator-weight", "0.5"], {"set": 1.0, "generator": 0.5}),
-        (["set", "--generator-weight", "0"], {"set": 1.0}),
-        (["--generator-weight", "2"], {"generator": 2.0}),
-    ],
-)
-def test_sources(run, no_pictures, arguments, sources):
-    write_set("set")
-    assert run("train", *arguments, "-o", "run", "--steps", 1, "--quiet").code == 0
-    found = {name if name == "generator" else Path(name).name: w for name, w in settings()["sources"].items()}
-    assert found == sources
-    assert all(name == "generator" or Path(name).is_absolute() for name in settings()["sources"])
 
 
 def test_settings_come_from_preset_file_and_options(run, no_pictures):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -64,21 +64,9 @@ def test_walls_stand_where_the_surface_looks() -> None:
 def matte(pixels: int) -> PrincipledMaterial:
     """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection away."""
     zero = torch.zeros(pixels, 1)
-    return PrincipledMaterial(
-        zero + 1,
-        zero,
-        zero,
-        zero + 0.1,
-        zero,
-        zero,
-        zero,
-        zero + 1e-9,
-        zero + 1,
-        zero + 2,
-        zero,
-        zero + 1,
-        zero,
-    )
+    plain = {field.name: zero for field in fields(PrincipledMaterial)}
+    plain |= {"base": zero + 1, "roughness": zero + 0.1, "interface_loss": zero + 1e-9, "minnaert": zero + 1}
+    return PrincipledMaterial(**plain | {"tail_exponent": zero + 2, "second_roughness": zero + 1})
 
 
 def mirror(pixels: int) -> PrincipledMaterial:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -80,28 +79,7 @@ def test_masked_map_loss_is_over_observed_cells_of_known_truth(norm: Norm, expec
     assert masked_map_loss(dense, truth, known, torch.zeros(2, 1, 4, 4), norm) == 0
 
 
-# An axis along a row, a column or a diagonal sends centres to centres. What is left is rounding of the axis.
-@pytest.mark.parametrize(
-    ("azimuth_deg", "expected"),
-    [
-        (0, lambda maps: maps.flip(2)),
-        (180, lambda maps: maps.flip(2)),
-        (90, lambda maps: maps.flip(3)),
-        (270, lambda maps: maps.flip(3)),
-        (45, lambda maps: maps.transpose(2, 3).flip(2, 3)),
-        (135, lambda maps: maps.transpose(2, 3)),
-    ],
-)
-@pytest.mark.parametrize("zenith_deg", [2, 40, 90])
-def test_mirror_permutes_cells(
-    azimuth_deg: int, zenith_deg: int, expected: Callable[[Tensor], Tensor]
-) -> None:
-    maps = random_maps(1, 2, 16, 16)
-    found = mirror(maps, at(zenith_deg, azimuth_deg))
-    torch.testing.assert_close(found, expected(maps), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("azimuth_deg", [17, 100, 211, 300])
+@pytest.mark.parametrize("azimuth_deg", [17, 90, 211])
 def test_mirror_against_scipy(azimuth_deg: int) -> None:
     size = 16
     maps = random_maps(1, 1, size, size, seed=azimuth_deg)
@@ -132,8 +110,8 @@ def asymmetry(maps: Tensor, normal: Tensor, filled: Tensor) -> float:
 
 
 @pytest.mark.parametrize("kind", ["matte", "glossy"])
-@pytest.mark.parametrize("zenith_deg", [2, 10, 30, 60])
-@pytest.mark.parametrize("azimuth_deg", [0, 45, 17, 123, 290])
+@pytest.mark.parametrize("zenith_deg", [2, 10, 60])
+@pytest.mark.parametrize("azimuth_deg", [45, 17, 290])
 def test_an_isotropic_map_is_symmetric_about_its_normal(kind: str, zenith_deg: int, azimuth_deg: int) -> None:
     normal = at(zenith_deg, azimuth_deg)
     maps, filled = isotropic_map(normal, kind)
@@ -155,8 +133,8 @@ def _at_size(normal: Tensor, kind: str, size: int) -> tuple[Tensor, Tensor, Tens
 
 
 @pytest.mark.parametrize("kind", ["matte", "glossy"])
-@pytest.mark.parametrize("azimuth_deg", [3, 67, 203])  # and no multiple of 45 with what is added
-@pytest.mark.parametrize("off_deg", [-60, -20, -5, 5, 20, 60])
+@pytest.mark.parametrize("azimuth_deg", [67, 203])  # and no multiple of 45 with what is added
+@pytest.mark.parametrize("off_deg", [-60, -5, 20])
 def test_symmetry_pulls_a_normal_towards_the_right_azimuth(kind: str, azimuth_deg: int, off_deg: int) -> None:
     maps, filled = isotropic_map(at(40, azimuth_deg), kind)
 
