@@ -12,7 +12,9 @@ import pytest
 import typer
 
 from splinecli.cli.app import app
-from splinecli.cli.man import EXAMPLES, man_pages
+from splinecli.cli.man import EXAMPLES, FILES, man_pages
+from splinecli.results.files import OWN_FILES
+from splinecli.results.index import INDEX
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -41,6 +43,11 @@ def test_man_pages_are_typeset_without_warnings():
         assert (name, done.returncode, done.stderr) == (name, 0, "")
 
 
+def test_man_page_names_what_infer_writes():
+    named = " ".join(part for row in FILES for part in row)
+    assert [name for name in (*OWN_FILES, INDEX) if name not in named] == []
+
+
 @pytest.mark.parametrize("example", [example for example, _ in EXAMPLES])
 def test_examples_of_the_man_pages_are_valid(example, run, tmp_path, monkeypatch):
     _, command, *args = shlex.split(example)
@@ -49,6 +56,10 @@ def test_examples_of_the_man_pages_are_valid(example, run, tmp_path, monkeypatch
         monkeypatch.chdir(tmp_path)
         # Past all that is checked about the command line, up to files that are not there.
         assert run(command, *args).code in (3, 4)
+
+
+def test_every_command_has_an_example():
+    assert {shlex.split(example)[1] for example, _ in EXAMPLES} == set(COMMANDS)
 
 
 def test_the_page_of_infer_shows_the_help(run, request):

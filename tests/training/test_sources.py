@@ -15,7 +15,7 @@ from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import PixelBatch, join_batches
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.sources import MixedSource, open_sources, split_scenes
+from splinecli.training.sources import open_sources, split_scenes
 
 MakeSet = Callable[..., PixelSet]
 
@@ -41,17 +41,6 @@ class Constant:
         ones = torch.ones(pixels, self.lights)
         scene = SampledPixels(lights[:, 0], ones, lights, ones > 0)
         return PixelBatch(ones, lights, ones > 0, scene, torch.full((pixels, 1), self.number))
-
-
-def test_a_mixture_keeps_its_weights() -> None:
-    parts = [Constant(1.0, 3), Constant(2.0, 5), Constant(3.0, 4)]
-    mixed = MixedSource(parts, (1.0, 6.0, 3.0), seeded())
-    batches = [mixed.draw(3) for _ in range(2000)]
-    numbers = np.array([batch.exposure.unique().item() for batch in batches])  # a batch has one source
-    for number, share in ((1.0, 0.1), (2.0, 0.6), (3.0, 0.3)):
-        # Four standard deviations of the binomial.
-        expected = pytest.approx(2000 * share, abs=4 * np.sqrt(2000 * share * (1 - share)))
-        assert (numbers == number).sum() == expected
 
 
 def test_batches_of_other_numbers_of_lights_are_padded() -> None:
