@@ -50,6 +50,10 @@ def test_the_same_image_twice(mask: NDArray[np.bool_]) -> None:
     assert repeated_images(observations) == [(2, 7)]
 
 
+def test_uniform_images_are_not_repeated() -> None:
+    assert repeated_images(np.ones((50, 4))) == []
+
+
 def test_encoded_images(mask: NDArray[np.bool_]) -> None:
     linear = images(shine=0.05)[mask]
     ratio = decoding_ratio(linear, find_factors(linear), lights())
@@ -57,6 +61,11 @@ def test_encoded_images(mask: NDArray[np.bool_]) -> None:
     encoded = linear ** (1 / 2.2)
     ratio = decoding_ratio(encoded, find_factors(encoded), lights())
     assert ratio is not None and ratio < DISPLAY_RATIO
+
+
+def test_too_few_pixels_are_not_judged() -> None:
+    few = np.ones((5, 10))
+    assert decoding_ratio(few, find_factors(few), lights()) is None
 
 
 def test_the_spread_of_lights() -> None:

@@ -130,6 +130,17 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
         read_capture(capture_folder)
 
 
+def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
+    pixels = np.full((10, 10, 3), 200, np.uint8)
+    pixels[0, :5, 1] = 255
+    for number in range(8, 12):
+        write_image(f"vase/img{number}.png", pixels)
+    assert texts(read_capture(capture_folder).warnings) == (
+        "5.0 % of the observations are saturated; a shorter exposure gives better normals.",
+        "The images have 8 bits; 16-bit linear images give better normals.",
+    )
+
+
 @pytest.mark.parametrize(("n_black", "share"), [(1, None), (2, "2.0"), (100, "100.0")])
 def test_pixels_that_no_light_reaches(
     capture_folder: Path, write_image: WriteImage, n_black: int, share: str | None

@@ -53,6 +53,12 @@ def complete(line: str, shell: str = "bash") -> list[str]:
 
 
 @pytest.mark.parametrize("shell", SHELLS)
+def test_shells_get_their_scripts(shell):
+    script = call(_SPLINECLI_COMPLETE=f"source_{shell}")
+    assert f"_SPLINECLI_COMPLETE=complete_{shell}" in script
+
+
+@pytest.mark.parametrize("shell", SHELLS)
 @pytest.mark.parametrize(
     ("line", "expected"),
     [

@@ -223,6 +223,27 @@ def test_weights_are_named_and_their_lights_warned_about(dataset, run):
     assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
 
 
+def test_all_methods_by_one_word(dataset, run):
+    document = json.loads(
+        run(
+            "evaluate", dataset / "matte", "--method", "all", "--n-lights", "all", "--max-pixels", 9, "--json"
+        ).out
+    )
+    from splinecli.methods import method_names
+
+    assert [result["method"] for result in document["results"]] == method_names()
+
+
+def test_the_white_level_is_used_and_named(overexposed, run):
+    """A level below the image values makes the values above it saturated, so they are restored."""
+    arguments = ["evaluate", overexposed, "--method", "ls", "--n-lights", "all", "--json"]
+    plain = json.loads(run(*arguments).out)
+    lower = json.loads(run(*arguments, "--white-level", 50_000).out)
+    assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
+    assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
+    assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()
+
+
 def test_an_unreadable_file_skips_its_capture(dataset, run, monkeypatch):
     """Permissions do not stop the superuser, so the refusal is simulated."""
     from splinecli.capture import source

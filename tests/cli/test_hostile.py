@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -180,6 +181,15 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     assert Path("out/second/normals.png").exists()
 
 
+def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise EOFError
+
+    monkeypatch.setattr("splinecli.pipeline.info.describe_capture", fail)
+    monkeypatch.setattr("splinecli.cli.info.describe_capture", fail)
+    assert run("info", capture).code == 1
+
+
 @posix
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_while_the_program_starts(capture, number):
@@ -229,6 +239,17 @@ def test_sigterm_always_ends_a_process(code):
     assert process.returncode == 130
     assert err == "splinecli: interrupted.\n"
     assert GRACE_SECONDS < 2
+
+
+@posix
+def test_a_signal_at_the_end_does_not_change_the_exit_code():
+    code = "import atexit; atexit.register(time.sleep, 0.5); print('ready', flush=True); return 3"
+    process = start(code)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 3
 
 
 def test_the_dependencies_have_no_known_holes():

@@ -49,6 +49,24 @@ def test_the_plot_of_the_lights(run, capture, tmp_path):
     assert orange > 8 * 20  # eight markers
 
 
+def test_warnings(run, capture):
+    photographs = sorted(capture.glob("image*.png"))
+    stored = cv2.imread(str(photographs[0]), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(photographs[0]), (stored // 256).astype(np.uint8))
+    cv2.imwrite(str(photographs[1]), np.full_like(stored, 65_535))
+    cv2.imwrite(str(photographs[2]), stored // 30)
+    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
+    assert warnings[:3] == [
+        "The images have 8 bits; 16-bit linear images give better normals.",
+        "Images saturated in more than 1 % of the pixels: 1, most of all image2.png (100.0 %);"
+        " a shorter exposure gives better normals.",
+        "Images that use less than 5 % of the range: 1, such as image3.png; a longer exposure gives less noise.",
+    ]
+    cv2.imwrite(str(photographs[3]), stored[:20])
+    warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
+    assert "The images have 2 different sizes; all images need the same size." in warnings
+
+
 def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
     before = (capture / "image1.png").read_bytes()
     for name in ("image1.png", "sky.png"):

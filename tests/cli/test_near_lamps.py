@@ -191,6 +191,16 @@ def test_evaluate_and_prepare(run, bump: Path) -> None:
     assert "near lamps, and training needs distant lights" in refused.err
 
 
+def test_positions_are_no_angles(run, bump: Path) -> None:
+    np.savetxt(bump / "light_positions.txt", POSITIONS)
+    (bump / "pixel_size.txt").write_text("2\n")
+    result = run("infer", "bump", "--method", "ls", "--lights-format", "azel")
+    assert result.code == 2
+    assert (
+        "--lights-format azel concerns light directions, but bump/light_positions.txt has pos" in result.err
+    )
+
+
 def test_albedo_and_saturation(run, bump: Path) -> None:
     """The bump has one albedo, and pixels that are clipped at 70 % of the brightest are restored."""
     np.savetxt(bump / "light_positions.txt", POSITIONS)
