@@ -142,12 +142,3 @@ def test_optimum_is_scipys(rows: int) -> None:
     assert found.min() >= 0
     assert gradient.min() > -1e-9
     assert np.abs(gradient * found).max() < 1e-9
-
-
-def test_independent_variables_are_clamped() -> None:
-    linear = torch.tensor([[1.0, -2.0, 3.0], [-1.0, -1.0, -1.0]], dtype=torch.float64)
-    hessian = torch.diag(torch.tensor([1.0, 2.0, 6.0], dtype=torch.float64)).expand(2, 3, 3)
-    torch.testing.assert_close(
-        minimise_nonnegative(hessian, linear),
-        torch.tensor([[1.0, 0.0, 0.5], [0.0, 0.0, 0.0]], dtype=torch.float64),
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -71,15 +70,3 @@ def test_lights_that_are_not_valid_do_not_count() -> None:
         atol=1e-5,
         rtol=1e-4,
     )
-
-
-@pytest.mark.parametrize("lit", [0, 1, 2])
-def test_too_few_lit_lights_still_give_a_finite_answer(lit: int) -> None:
-    lights = ring(10, 40)
-    observations = torch.zeros(1, 10)
-    observations[:, :lit] = 1
-    scaled = fit_lambertian(observations, lights)
-    assert torch.isfinite(scaled).all()
-    assert scaled.norm() > 0
-    if lit == 0:
-        assert error_deg(scaled, torch.tensor([[0.0, 0.0, 1.0]])).max() < 1e-3

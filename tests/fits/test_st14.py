@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from scenes import cap_directions, halfway
-from splinecli.fits.st14 import coefficient_count, kept_count, solve
+from splinecli.fits.st14 import solve
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.normals import angle_between_deg
@@ -94,16 +94,6 @@ def test_noise_and_highlights_cost_less_than_in_least_squares(count: int, untouc
     observations = with_highlights(bipolynomial(TRUTH, lights) * noise, untouched)
     error = angle_between_deg(estimate(observations, lights), TRUTH).mean()
     assert error < 0.25 * angle_between_deg(LeastSquares().estimate(observations, lights), TRUTH).mean()
-
-
-def test_share_grows_and_coefficients_shrink_with_few_observations() -> None:
-    lit = torch.tensor([0, 3, 8, 10, 32, 33, 96])
-    kept = kept_count(lit, share=0.25, fewest=8)
-    assert kept.tolist() == [0, 3, 8, 8, 8, 9, 24]
-    assert coefficient_count(kept).tolist() == [1, 1, 2, 2, 2, 2, 9]
-    # Two observations or more for each unknown, the two angles of the normal among them.
-    many = torch.arange(6, 30)
-    assert (2 * (coefficient_count(many) + 2) <= many).all()
 
 
 def test_eight_observations_fit_a_reflectance_that_varies_with_the_half_angle() -> None:

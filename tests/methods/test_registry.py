@@ -32,11 +32,6 @@ def weights(tmp_path: Path) -> str:
     return save_tiny(tmp_path / "tiny.safetensors")
 
 
-def test_unknown_method() -> None:
-    with pytest.raises(UsageError, match="no method named 'l2'; expected one of spline-net, cnn-ps, ls"):
-        make_estimator("l2")
-
-
 def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
     truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
     observations = (truth @ LIGHTS.T * 0.5).astype(np.float32)
@@ -54,17 +49,6 @@ def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
         np.testing.assert_allclose(normals, truth, atol=0.01)
     assert len(fingerprints) == len(method_names())
-
-
-def test_options_reach_the_network(weights: str) -> None:
-    options = MethodOptions(weights=weights, batch_size=7, rotations=4, device="cpu", precision="bfloat16")
-    estimator = make_estimator("spline-net", options)
-    assert estimator.precision == "bfloat16"
-    assert estimator.weights is not None
-    assert estimator.weights["name"] == "tiny"
-    assert len(estimator.weights["sha256"]) == 64
-    assert vars(estimator)["batch_size"] == 7
-    assert len(vars(estimator)["_rotations"]) == 4
 
 
 def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
@@ -88,18 +72,6 @@ def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
         match=r"'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps",
     ):
         make_estimator("spline-net", MethodOptions(weights=alone))
-
-
-@pytest.mark.parametrize(
-    ("options", "error"),
-    [
-        (MethodOptions(weights="/nowhere/at/all.safetensors"), ModelError),
-        (MethodOptions(device="tpu"), UsageError),  # type: ignore[arg-type]
-    ],
-)
-def test_options_that_cannot_be(options: MethodOptions, error: type[Exception]) -> None:
-    with pytest.raises(error):
-        make_estimator("spline-net", options)
 
 
 @pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])

@@ -91,27 +91,6 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeS
     assert all((normals == normal).all(axis=1).any() for normal in batch.truth.normals[few].numpy())
 
 
-def test_lights_lie_within_a_random_angle_and_then_closest_to_it(make_set: MakeSet) -> None:
-    # Beyond the cone, no light that is left out is closer to the axis than one that is used.
-    pixel_set = make_set(entries=[("a", "one", 50, 200)])
-    config = replace(FAULTLESS, min_lights=10, max_lights=10, usual_lights=10)
-    batch = source_of(pixel_set, config).draw(600)
-    largest = batch.light_directions[..., 2].acos().rad2deg().amax(dim=1)
-    # Ten of all 200 lights nearly always reach beyond 50 degrees. Ten lights of a random cone often do not.
-    assert 0.15 < (largest < 50).float().mean() < 0.6
-    zeniths = np.sort(np.degrees(np.arccos(pixel_set.load(pixel_set.entries[0]).light_directions[:, 2])))
-    assert largest.min() >= zeniths[9] - 0.01  # ten lights reach at least as far as the ten innermost
-
-
-def test_pixels_with_fewer_lights_than_others_know_no_more_cells(make_set: MakeSet) -> None:
-    scene = source_of(make_set()).draw(300).truth
-    assert isinstance(scene, SampledPixels)
-    assert set(scene.known.sum(dim=1).tolist()) == {12, 25, 30}
-    dense = scene.dense_truth(32)
-    assert (dense.known.sum((1, 2, 3)) <= scene.known.sum(dim=1)).all()
-    assert (dense.filled >= dense.known).all()
-
-
 def analytic_scene(pixels: int = 6) -> tuple[SampledPixels, torch.Tensor]:
     """Matte pixels under lights at the centres of a third of the cells."""
     directions, inside = cell_directions()

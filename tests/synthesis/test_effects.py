@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from scipy import stats
 
 from distributions import SHARE, N, assert_uniform, generator
 from splinecli.observation_map import cell_directions, dot
@@ -44,21 +41,6 @@ def test_walls_have_the_stated_shapes() -> None:
     along = (wall.towards * wall.azimuth).sum(dim=1)
     assert (wall.towards[present, 2] < wall.tan_height[present, 0] * along[present]).all()
     assert ((wall.facing * wall.towards).sum(dim=1) < 0).all()
-
-
-def test_walls_stand_where_the_surface_looks() -> None:
-    normals = draw_visible_normals(N, generator(1))
-    azimuth = draw_wall(normals, 1.0, generator()).azimuth
-    turned = torch.atan2(azimuth[:, 1], azimuth[:, 0]) - torch.atan2(normals[:, 1], normals[:, 0])
-    degrees = (np.degrees(turned.double().numpy()) + 180) % 360 - 180
-
-    def cdf(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        wrapped = sum(
-            stats.norm.cdf(x, 360 * k, 50) - stats.norm.cdf(-180, 360 * k, 50) for k in range(-3, 4)
-        )
-        return np.asarray(0.6 * wrapped + 0.4 * (x + 180) / 360)
-
-    assert stats.kstest(degrees, cdf).pvalue > 1e-3
 
 
 def matte(pixels: int) -> PrincipledMaterial:

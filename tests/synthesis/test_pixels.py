@@ -15,7 +15,6 @@ from splinecli.synthesis.pixels import (
     PixelBatch,
     PixelGenerator,
     PixelGeneratorConfig,
-    draw_neighbour_normals,
     draw_scene,
     draw_visible_normals,
 )
@@ -175,13 +174,3 @@ def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
     assert stats.kstest(squared, stats.uniform(0, 0.997**2).cdf).pvalue > 1e-3
     azimuth = torch.atan2(normals[:, 1], normals[:, 0]).numpy()
     assert stats.kstest(azimuth, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
-
-
-def test_neighbours_face_the_camera_too() -> None:
-    normals = draw_visible_normals(5000, torch.Generator().manual_seed(0))
-    moved = draw_neighbour_normals(normals, torch.Generator().manual_seed(1))
-    assert moved.norm(dim=1).sub(1).abs().max() < 1e-6
-    assert (moved[:, 2] > 0).all()
-    cosine = (normals * moved).sum(dim=1)
-    # Moved by 0.5 in each of two tangential directions: a median of some 30 degrees.
-    assert 0.8 < cosine.median() < 0.95

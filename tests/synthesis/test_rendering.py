@@ -141,24 +141,6 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
         assert indirect[part].mean() == pytest.approx(expected, rel=0.05)
 
 
-def test_several_materials_share_one_tracing() -> None:
-    tracer = Tracer(ball(0.9, polar=90, inward=True))
-    visible = find_visible_surface(tracer, 12, 2)
-    lights = directions((0, 0, 1), (0.5, 0, 1))
-    patches = np.zeros(len(tracer.mesh.faces), np.int64)
-    together = {"half": Matte(torch.full((1, 1), 0.5)), "full": Matte(torch.full((1, 1), 1.0))}
-
-    def indirect(materials: dict[str, Matte]) -> dict[str, Tensor]:
-        generator = torch.Generator().manual_seed(2)
-        return render_indirect(
-            tracer, visible, lights, materials, patches, directions=32, bounces=1, generator=generator
-        )
-
-    both = indirect(together)
-    torch.testing.assert_close(both["full"], 4 * both["half"], rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(both["full"], indirect({"full": together["full"]})["full"])
-
-
 def test_patches_have_their_own_material() -> None:
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 20, 2)

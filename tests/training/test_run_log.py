@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
-import io
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.errors import OutputError
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.loop import Trainer
@@ -70,14 +67,6 @@ def test_every_damaged_file_is_kept(tmp_path: Path) -> None:
     assert [(tmp_path / name).read_text() for name in kept] == ["damage 0\n", "damage 1\n", "damage 2\n"]
 
 
-@pytest.mark.parametrize("text", ["", "step\n50\n", "step,loss\n50,1.0\n"])
-def test_a_file_of_another_version_is_set_aside(tmp_path: Path, text: str) -> None:
-    (tmp_path / METRICS).write_text(text)
-    RunLog(tmp_path, 50).append(ROWS[0])
-    assert read_metrics(tmp_path / METRICS) == ROWS[:1]
-    assert (tmp_path / "metrics.damaged.csv").read_text() == text
-
-
 def read_png(path: Path) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
@@ -91,19 +80,6 @@ def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     }  # fmt: skip
     assert read_png(tmp_path / CURVES).std() > 5
     assert read_png(tmp_path / MAPS).std() > 20
-
-
-def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = RunLog(tmp_path, 0)
-    log.append(ROWS[0])
-
-    class Full(io.StringIO):
-        def write(self, text: str) -> int:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "open", lambda *args, **kwargs: Full())
-    with pytest.raises(OutputError, match=r"metrics\.csv: cannot be written \(No space left on device\)"):
-        log.append(ROWS[1])
 
 
 def test_tensorboard_s_events(tmp_path: Path) -> None:
