@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import errno
 import json
+import os
 import pickle
 import re
 from pathlib import Path
@@ -54,6 +55,19 @@ def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
     assert documents[0] == read_report(Path("out/sphere"))
     assert documents[1]["capture"] == "broken"
     assert "image3.png" in documents[1]["error"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--n-lights", 2), ("--light-indices", "0,0,1"), ("--device", "cuda"), ("--weights", "spline-net")],
+)
+def test_usage_errors_end_a_batch_at_once(arguments, capture, make_capture, run, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    make_capture("second")
+    method = "spline-net" if "--device" in arguments else "ls"
+    result = run("infer", capture, "second", "--method", method, *arguments)
+    assert (result.code, result.out, result.err.count("\n")) == (2, "", 1)
+    assert not Path("out").exists()
 
 
 def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
@@ -129,6 +143,17 @@ def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason,
     assert run(*call, *extra).code == 0
 
 
+def test_update_keeps_files_of_others(capture, run):
+    Path("out/sphere").mkdir(parents=True)
+    Path("out/sphere/normals.png").write_text("drawn by hand")
+    result = run("infer", capture, "--method", "ls", "--update")
+    assert result.code == 5
+    assert "out/sphere: contains normals.png, but no report.json. Add --overwrite" in result.err
+    assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
+    both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
+    assert (both.code, "contradict each other" in both.err) == (2, True)
+
+
 def test_another_object_of_the_same_name(capture, make_capture, run):
     make_capture("third")
     assert run("infer", capture, "--method", "ls").code == 0
@@ -136,6 +161,15 @@ def test_another_object_of_the_same_name(capture, make_capture, run):
     Path("others/sphere").symlink_to(Path("third").absolute())
     other = run("infer", "others/sphere", "--method", "ls")
     assert (other.code, "out/sphere: contains results made from other input files" in other.err) == (5, True)
+
+
+def test_links_are_called_by_their_own_names(capture, run):
+    for link in ("x/obj", "y/obj", "one", "two"):
+        Path(link).parent.mkdir(exist_ok=True)
+        Path(link).symlink_to(capture.absolute())
+    assert run("infer", "x/obj", "y/obj", "--method", "ls").code == 2
+    assert run("infer", "one", "two", "--method", "ls").code == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "one", "two"]
 
 
 def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
@@ -194,6 +228,12 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     assert run("infer", capture, "fourth", "--method", "ls", "-o", "place", "--overwrite").code == 5
 
 
+def test_names_that_are_no_text(capture, make_capture, run):
+    odd = make_capture("odd").rename(os.fsdecode(b"x\xff"))
+    assert run("infer", capture, odd, "--method", "ls").code == 0
+    assert 'href="x%FF/normals.npy"' in Path("out/index.html").read_text("utf-8")
+
+
 def test_a_defect_is_called_one(capture, run, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("oops")
@@ -244,6 +284,35 @@ def test_a_failure_is_that_of_its_capture(failure, place, capture, make_capture,
     assert f"splinecli: {first['error']}\n" in result.err
 
 
+def test_an_image_without_permission(capture, make_capture, run_without_privileges):
+    make_capture("second")
+    (capture / "image1.png").chmod(0)
+    result = run_without_privileges("infer", capture, "second", "--method", "ls")
+    assert (result.code, "sphere/image1.png" in result.err) == (3, True)
+    assert Path("out/second/report.json").is_file()
+
+
+def test_a_folder_without_permission(capture, make_capture, run_without_privileges):
+    """The parser must not refuse it: it would end the batch before the first capture."""
+    make_capture("second")
+    capture.chmod(0)
+    result = run_without_privileges("infer", capture, "second", "--method", "ls", "--json")
+    capture.chmod(0o755)
+    first, second = json.loads(result.out)
+    assert (result.code, first["capture"], first["exit_code"]) == (3, "sphere", 3)
+    assert first["error"] == "sphere: the folder cannot be read (Permission denied)."
+    assert second == read_report(Path("out/second"))
+
+
+def test_a_light_file_without_permission(capture, run_without_privileges):
+    lights = Path("lights.txt")
+    lights.write_bytes((capture / "light_directions.txt").read_bytes())
+    lights.chmod(0)
+    result = run_without_privileges("infer", capture, "--lights", lights, "--method", "ls", "--json")
+    (document,) = json.loads(result.out)
+    assert (result.code, document["exit_code"], "lights.txt" in document["error"]) == (3, 3, True)
+
+
 def test_a_missing_folder_is_the_failure_of_its_capture(capture, run):
     result = run("infer", "nowhere", capture, "--method", "ls", "--json")
     first, second = json.loads(result.out)
@@ -258,6 +327,15 @@ def test_a_missing_folder_is_the_failure_of_its_capture(capture, run):
     gone = run("infer", "sphere", "moved", "--method", "ls", "--n-lights", 4)
     assert (gone.code, "sphere: the folder does not exist" in gone.err) == (3, True)
     assert Path("out/moved/report.json").is_file()
+
+
+def test_a_folder_that_is_given_twice_counts_once(capture, run):
+    result = run(
+        "infer", capture, capture.absolute(), "others/../sphere", "sphere/", "--method", "ls", "--json"
+    )
+    (document,) = json.loads(result.out)
+    assert (result.code, result.err, document["capture"]) == (0, "", "sphere")
+    assert not Path("out/index.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -281,6 +359,14 @@ def test_the_worst_exit_code():
     assert worst_exit_code([0, 3, 0]) == 3
     assert worst_exit_code([5, 3, 2]) == 5
     assert worst_exit_code([5, 1, 3]) == 1  # a defect
+
+
+def test_a_folder_of_photographs_and_a_stray_file(capture, run):
+    """A pattern such as captures/* may match files too; they do not stop the captures."""
+    Path("notes.txt").write_text("mine")
+    result = run("infer", capture, "notes.txt", "--method", "ls")
+    assert (result.code, "notes.txt: found a file, expected a folder" in result.err) == (3, True)
+    assert Path("out/sphere/report.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -321,6 +407,16 @@ def test_arguments_are_checked_before_the_first_capture(
     documents = json.loads(run("infer", capture, "second", *method, *arguments, "--json").out)
     assert [document["exit_code"] for document in documents] == [code]
     assert message in documents[0]["error"]
+
+
+def test_json_is_a_list_also_where_nothing_could_be_read(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run("infer", "nofolder", "--json")
+    assert result.code == 3
+    assert json.loads(result.out) == [
+        {"capture": "nofolder", "error": "nofolder: the folder does not exist.", "exit_code": 3}
+    ]
+    assert result.err == "splinecli: nofolder: the folder does not exist.\n"
 
 
 def test_options_are_written_and_read_back(capture, run):

@@ -264,3 +264,15 @@ def test_normals_in_an_unfinished_folder_are_refused(run):
         result = run("integrate", given, "-o", "out")
         assert result.code == 3
         assert "new files of an interrupted run, which are not all in their places" in result.err
+
+
+def test_quiet_prints_nothing(run):
+    result = run("integrate", "normals.npy", "-o", "out", "-q")
+    assert (result.code, result.out, result.err) == (0, "", "")
+
+
+def test_home_folder_in_paths(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    result = run("integrate", "~/normals.npy", "--output=~/out", "--format", "npy")
+    assert (result.code, result.out.split(":")[0]) == (0, f"{tmp_path}/out")
+    assert not Path("~").exists()
