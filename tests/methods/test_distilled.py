@@ -99,7 +99,7 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
 def test_it_learns_where_its_teacher_is_unsure() -> None:
     normals = cap_directions(6000, 50)
     dull = np.arange(6000) % 2 == 0
-    observations = shade(normals, LIGHTS).astype(np.float32) ** np.where(dull, 1, 2)[:, None]
+    observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
     errors = np.where(dull[:, None], log_median(1), log_median(12))
     found = distil(Teacher(observations, normals, errors), observations, LIGHTS, SIZE)
     learned = confidence(found.estimate_with_error(observations, LIGHTS)[1])
