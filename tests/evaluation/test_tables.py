@@ -14,7 +14,7 @@ from splinecli.evaluation.document import results_csv, results_document
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.report import html_report
-from splinecli.evaluation.tables import latex, markdown
+from splinecli.evaluation.tables import best_cells, latex, markdown, table_rows
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 TEN = Evaluation(
@@ -68,6 +68,16 @@ def test_markdown_of_two() -> None:
 def test_a_bar_in_a_name_does_not_end_the_cell() -> None:
     odd = replace(TEN, results=(replace(TEN.results[0], capture="a|b"),))
     assert markdown([odd]).startswith("| method | a\\|b | average |\n")
+
+
+def test_rows_for_a_terminal() -> None:
+    rows = table_rows(TEN)
+    assert rows == [
+        ["method", "ball", "cat", "average"],
+        ["ls", "4.50", "9.00", "6.75"],
+        ["spline-net", "3.25", "9.00", "6.13"],
+    ]
+    assert best_cells(rows) == {(2, 1), (1, 2), (2, 2), (2, 3)}
 
 
 def test_csv() -> None:
