@@ -13,8 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from browser import browser, open_page
+from scenes import cap_directions, directions_at, shade, spiral_lights
 
-__all__ = ["browser", "open_page"]
+__all__ = ["browser", "directions_at", "open_page"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -32,25 +33,6 @@ def shared_data() -> Path:
     return folder.resolve()
 
 
-def directions_at(azimuth: NDArray[np.float64], zenith: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """Return the unit directions (count, 3) at these angles in radians."""
-    x, y, z = np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)
-    return np.stack((x, y, np.broadcast_to(z, x.shape)), axis=1)
-
-
-def cap_directions(count: int, limit_deg: float, seed: int = 0) -> NDArray[np.float64]:
-    """Random unit vectors (count, 3) within limit_deg of the view axis."""
-    rng = np.random.default_rng(seed)
-    azimuth, zenith = rng.uniform(0, 2 * np.pi, count), np.radians(rng.uniform(0, limit_deg, count))
-    return directions_at(azimuth, zenith)
-
-
-def spiral_lights(count: int, limit_deg: float = 35) -> NDArray[np.float64]:
-    """Lights (count, 3) on a spiral, 5 to limit_deg degrees from the view axis."""
-    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(5, limit_deg, count))
-    return directions_at(azimuth, zenith)
-
-
 @pytest.fixture
 def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels, no shadow among them."""
@@ -63,8 +45,4 @@ def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np
 def glossy_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe, attached shadows."""
     normals, lights = cap_directions(60, 70), spiral_lights(14, 60)
-    half = lights + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    shading = np.clip(normals @ lights.T, 0, None)
-    lobe = np.clip(normals @ half.T, 0, None) ** 40 * (shading > 0)
-    return normals, lights, 0.6 * shading + 0.5 * lobe
+    return normals, lights, 0.6 * shade(normals, lights, gloss=5 / 6, exponent=40)

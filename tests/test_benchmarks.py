@@ -43,12 +43,6 @@ def numbers(line: str) -> list[float]:
     ]
 
 
-def test_every_benchmark_has_a_test() -> None:
-    text = Path(__file__).read_text("utf-8")
-    for path in (ROOT / "benchmarks").glob("*.py"):
-        assert f'run("{path.stem}"' in text.replace("(\n        ", "("), path.name
-
-
 def test_training_speed(run: Run) -> None:
     """It crashed: CNN-PS has no LI-Net, so its updates cannot alternate."""
     printed = run(

@@ -39,11 +39,6 @@ def test_cuda_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
         choose_device("cuda")
 
 
-def test_a_named_precision_is_taken_as_it_is() -> None:
-    assert choose_precision("bfloat16", torch.device("cpu")) == "bfloat16"
-    assert choose_precision("float32", torch.device("cpu")) == "float32"
-
-
 def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions() -> None:
     listing = Path("/proc/cpuinfo")
     flags = set(listing.read_text().split()) if listing.exists() else set()

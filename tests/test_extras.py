@@ -17,40 +17,20 @@ def test_an_installed_module_is_returned() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "extra", "message"),
+    ("module", "extra", "named"),
     [
-        (
-            "embreex.rtcore_scene",
-            "render",
-            "rendering needs embreex and scikit-image, which are not all installed."
-            " Run pip install 'splinecli[render]'.",
-        ),
-        (
-            "OpenEXR",
-            "exr",
-            "EXR files need the package OpenEXR, which is not installed. Run pip install 'splinecli[exr]'.",
-        ),
-        (
-            "fast_simplification",
-            "mesh",
-            "--decimate needs the package fast-simplification, which is not installed."
-            " Run pip install 'splinecli[mesh]'.",
-        ),
-        (
-            "torch.utils.tensorboard",
-            "tensorboard",
-            "--tensorboard needs the package tensorboard, which is not installed."
-            " Run pip install 'splinecli[tensorboard]'.",
-        ),
+        ("embreex.rtcore_scene", "render", "embreex and scikit-image"),
+        ("OpenEXR", "exr", "OpenEXR"),
+        ("fast_simplification", "mesh", "fast-simplification"),
+        ("torch.utils.tensorboard", "tensorboard", "tensorboard"),
     ],
 )
 def test_the_message_names_the_packages_and_the_command(
-    module: str, extra: str, message: str, monkeypatch: pytest.MonkeyPatch
+    module: str, extra: str, named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises(UsageError, match=rf"{named}.*Run pip install 'splinecli\[{extra}\]'"):
         import_extra(module, extra)
-    assert str(caught.value) == message
 
 
 def test_another_error_with_a_file_and_another_way_out(monkeypatch: pytest.MonkeyPatch) -> None:

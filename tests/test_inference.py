@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.inference import estimate_normals
-from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.least_squares import LeastSquares
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -50,21 +49,6 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
     assert sum(done) == n_pixels
     assert len(done) == -(-n_pixels // tile_pixels)
     assert max(done) <= tile_pixels
-
-
-def test_progress_of_a_network_is_finer_than_a_tile() -> None:
-    """Fails if progress is only called after each tile of 16,384 pixels."""
-    mask = np.ones((50, 60), np.bool_)
-    observations = np.tile(np.float32(0.5) * LIGHTS[:, 2].astype(np.float32), (3000, 1))
-    done: list[int] = []
-    options = MethodOptions(device="cpu", precision="float32")
-    estimate_normals(
-        Capture("flat", observations, LIGHTS, (0, 1, 2, 3), mask),
-        make_estimator("spline-net", options),
-        progress=done.append,
-    )
-    assert sum(done) == 3000
-    assert max(done) <= 1024
 
 
 def test_errors_against_the_ground_truth() -> None:

@@ -60,11 +60,6 @@ def test_black_outside_the_mask_and_zero_when_read_back(convention: Convention) 
     np.testing.assert_allclose(np.linalg.norm(decoded[mask], axis=1), 1)
 
 
-def test_float32_components_just_over_one_do_not_wrap_around() -> None:
-    normals = np.array([[[0, 0, np.nextafter(np.float32(1), np.float32(2))]]], np.float32)
-    assert encode_picture(normals, np.array([[True]]))[0, 0, 2] == 65535
-
-
 @pytest.mark.parametrize("degrees", [0.0, 1e-7, 1e-3, 45.0, 90.0, 179.999, 180 - 1e-7, 180.0])
 def test_angles_from_0_to_180(degrees: float) -> None:
     radians = np.radians(degrees)

@@ -17,7 +17,6 @@ import splinecli
 from splinecli.capture.arrays import capture_from_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
-from splinecli.surface.integration import integrate_normals
 
 MEDALLION = Path(__file__).resolve().parents[1] / "examples/medallion"
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -95,14 +94,6 @@ def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
     np.testing.assert_allclose(estimate.normal_map, normals, atol=1e-2 if dtype is np.uint8 else 1e-4)
 
 
-def test_intensities_divide_each_channel() -> None:
-    images, normals = matte()
-    intensities = np.random.default_rng(0).uniform(0.5, 2, (len(LIGHTS), 3))
-    colour = images[..., None] * intensities[:, None, None]
-    estimate = splinecli.estimate_normals(list(colour), LIGHTS, light_intensities=intensities, method="ls")
-    np.testing.assert_allclose(estimate.normal_map, normals, atol=1e-5)
-
-
 @pytest.mark.filterwarnings("ignore:The images fit the lights much better if")  # clipped ones, as stored
 def test_saturated_values_are_restored_unless_as_stored() -> None:
     lights = np.concatenate((LIGHTS, LIGHTS[1:] * (-1, -1, 1)))
@@ -152,12 +143,6 @@ def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message
     with pytest.raises(error) as caught:
         splinecli.estimate_normals(**(arguments | change))
     assert message in str(caught.value)
-
-
-def test_heights() -> None:
-    _, normals = matte()
-    expected = integrate_normals(normals, None)
-    np.testing.assert_array_equal(splinecli.integrate_normals(normals), expected)
 
 
 def test_importing_the_package_loads_neither_torch_nor_numpy() -> None:

@@ -47,15 +47,6 @@ def test_one_image_is_moved(right: int, down: int) -> None:
     assert find_shifts(sample_of(pictures, step=4)) == [ImageShift(3, 4 * right, 4 * down)]
 
 
-def test_a_hand_held_camera() -> None:
-    """Every image is moved. The amounts are told against the others, so their differences count."""
-    pictures, rng = images(texture=0.1), np.random.default_rng(4)
-    moved = rng.integers(-3, 4, (N_LIGHTS, 2))
-    for place, (right, down) in enumerate(moved):
-        pictures[..., place] = np.roll(pictures[..., place], (down, right), axis=(0, 1))
-    assert len(find_shifts(sample_of(pictures))) >= N_LIGHTS / 2
-
-
 def test_highlights_that_move_are_no_shift() -> None:
     """A polished relief without paint: highlights lie elsewhere under each light."""
     relief = np.random.default_rng(2).normal(size=(SIDE, SIDE, 2))

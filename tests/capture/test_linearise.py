@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from splinecli.errors import InputError
 from splinecli.results.albedo import albedo_map
 
 LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
-WriteImage = Callable[..., Path]
 
 
 @pytest.fixture
@@ -85,12 +84,6 @@ def test_ambient_light_is_taken_off(
     assert ("ambient_subtracted" in codes(capture.warnings)) == found
 
 
-def test_what_is_darker_than_the_ambient_light_is_black(tmp_path: Path, light: NDArray[np.float64]) -> None:
-    folder = store(tmp_path / "capture", light)
-    write(folder / "ambient.png", np.full(light.shape[1:], 0.3))
-    np.testing.assert_allclose(observed(folder), expected((light - 0.3).clip(0)), atol=3e-5)
-
-
 @pytest.mark.parametrize("one", [True, False], ids=["one for all", "one each"])
 def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one: bool) -> None:
     falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
@@ -99,17 +92,6 @@ def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one:
     flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(1 if one else 4))
     mean = falloff.mean(axis=(1, 2, 3), keepdims=True)
     np.testing.assert_allclose(observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4)
-
-
-def test_flat_fields_follow_their_images_in_an_lp_file(tmp_path: Path, light: NDArray[np.float64]) -> None:
-    falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
-    folder = store(tmp_path / "capture", light * falloff)
-    flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(4))
-    before = observed(folder, flat_field=flats)
-    (folder / "lights.txt").unlink()
-    rows = [f"{n}.png {row}" for n, row in enumerate(LIGHTS.splitlines())]
-    (folder / "a.lp").write_text("\n".join(["4", *rows[::-1]]))
-    np.testing.assert_array_equal(observed(folder, flat_field=flats), before[:, ::-1])
 
 
 def test_the_albedo_sees_the_same_light(tmp_path: Path, light: NDArray[np.float64]) -> None:

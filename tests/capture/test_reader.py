@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -13,7 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from splinecli.capture import CaptureWarning, open_capture, read_capture
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
 
 WriteImage = Callable[..., Path]
@@ -70,18 +68,6 @@ def test_channels_are_divided_by_their_own_intensity(
     )
 
 
-def test_gray_images_are_equal_in_all_channels(
-    capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
-) -> None:
-    np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
-    gray = np.repeat(photographs[..., :1], 3, axis=-1)
-    for number, pixels in enumerate(gray, start=8):
-        write_image(f"vase/img{number}.png", pixels[..., 0])
-    np.testing.assert_allclose(
-        read_capture(capture_folder).observations, expected(gray, INTENSITIES), rtol=1e-6
-    )
-
-
 def test_mask_and_ground_truth(
     capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
 ) -> None:
@@ -115,23 +101,6 @@ def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDAr
         source.read()
 
 
-@pytest.mark.parametrize(
-    ("indices", "message"),
-    [
-        (
-            [0, 1, 4],
-            "light index 4 is out of range: the capture has 4 lights. Light indices count from 0 to 3.",
-        ),
-        ([0, 1, 1], "light index 1 comes twice. Name each light once."),
-        ([0, 1], "2 lights chosen, expected at least 3."),
-    ],
-)
-def test_wrong_light_indices(capture_folder: Path, indices: list[int], message: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        read_capture(capture_folder, light_indices=indices)
-    assert str(caught.value) == message
-
-
 def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> None:
     mask = write_image("vase/mask.png", np.full((6, 5), 255, np.uint8))
     with pytest.raises(InputError) as caught:
@@ -142,12 +111,6 @@ def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> Non
     with pytest.raises(InputError) as caught:
         read_capture(capture_folder)
     assert str(caught.value) == f"{image}: found an image of 7 x 5 pixels, expected 6 x 5 as in img8.png."
-
-
-def test_counts_that_differ(capture_folder: Path) -> None:
-    np.savetxt(capture_folder / "light_directions.txt", LIGHTS[[0, 1, 2, 3, 1]])
-    with pytest.raises(InputError, match=r"found 5 light directions, expected 4, one for each image\."):
-        open_capture(capture_folder)
 
 
 def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
@@ -210,10 +173,3 @@ def test_psbox_s_transposed_lights(shared_data: Path) -> None:
     source = open_capture(shared_data / "psbox/Objects", lights=shared_data / "psbox/light_directions.txt")
     assert source.n_lights == 12
     assert source.read([0, 4, 8]).n_pixels == 430 * 550
-
-
-def test_importing_is_light() -> None:
-    heavy = {"cv2", "scipy", "tifffile", "torch", "rich"}
-    code = f"import splinecli.capture, sys; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splinecli.capture import Capture, CaptureWarning
+from splinecli.capture import Capture
 from splinecli.errors import InputError, UsageError
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -23,23 +23,6 @@ def make(**changes: Any) -> Capture:
         "mask": MASK,
     }
     return Capture(**(fields | changes))
-
-
-def test_fields_get_their_dtypes() -> None:
-    capture = make(ground_truth=np.zeros((2, 3, 3)))
-    assert capture.observations.dtype == np.float32
-    assert capture.light_directions.dtype == np.float64
-    assert capture.ground_truth is not None
-    assert capture.ground_truth.dtype == np.float32
-    assert (capture.n_lights, capture.n_pixels) == (4, 4)
-
-
-def test_choose_lights_keeps_the_order_given() -> None:
-    chosen = make(warnings=(CaptureWarning("code", "Read me."),)).choose_lights([3, 0, 2])
-    np.testing.assert_array_equal(chosen.observations, np.arange(16).reshape(4, 4)[:, [3, 0, 2]])
-    np.testing.assert_array_equal(chosen.light_directions, LIGHTS[[3, 0, 2]])
-    assert chosen.light_indices == (7, 0, 2)
-    assert [str(warning) for warning in chosen.warnings] == ["Read me."]
 
 
 @pytest.mark.parametrize(
@@ -61,16 +44,6 @@ def test_positions_that_cannot_be_meant(positions: list[int], message: str) -> N
     with pytest.raises(UsageError) as caught:
         make().choose_lights(positions)
     assert str(caught.value) == message
-
-
-def test_chosen_lights_in_one_plane() -> None:
-    row = np.array([[-0.6, 0, 0.8], [0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
-    with pytest.raises(InputError) as caught:
-        make(light_directions=row).choose_lights([0, 1, 2])
-    assert str(caught.value) == (
-        "vase: the 3 lights lie in one plane, so least squares (LS) cannot solve for a normal."
-        " Choose lights that surround the viewing direction."
-    )
 
 
 @pytest.mark.parametrize(

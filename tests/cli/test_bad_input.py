@@ -127,10 +127,3 @@ def test_same_names(capture, make_capture, run, golden):
     result = run("infer", capture, "others/sphere")
     assert result.code == 2
     golden("bad_input/same_names.txt", result.err)
-
-
-def test_cuda_where_there_is_none(capture, run, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    result = run("infer", capture, "--device", "cuda")
-    assert result.code == 2
-    assert result.err == "splinecli: no CUDA device was found. Use --device cpu or auto.\n"

@@ -8,7 +8,6 @@ import sys
 
 import pytest
 
-from splinecli.cli.options.values import complete_list
 from splinecli.methods import method_names
 from splinecli.networks.weights import shipped_names
 from splinecli.results.files import MAPS, NORMALS
@@ -90,14 +89,3 @@ def test_values_offered_are_all_there_are():
     assert complete("splinecli infer --maps ") == list(MAPS)
     assert complete("splinecli infer --format ") == list(NORMALS)
     assert complete("splinecli integrate --format ") == list(SURFACE_FILES)
-
-
-def test_lists_are_completed_at_their_last_item():
-    complete_maps = complete_list("albedo", "confidence", "preview")
-    assert complete_maps("al") == [
-        "albedo",
-        "confidence",
-        "preview",
-    ]  # Typer leaves out those that begin otherwise
-    assert complete_maps("albedo,") == ["albedo,confidence", "albedo,preview"]
-    assert complete_maps("albedo,preview,c") == ["albedo,preview,confidence"]

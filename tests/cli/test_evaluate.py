@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -92,43 +91,6 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lig
         figures.append(result["mae_deg"])
     restored, as_stored = figures
     assert restored < as_stored / 2
-
-
-def test_a_part_of_the_pixels_has_the_intensities_of_all(overexposed, run):
-    """The scored pixels keep the normals that they have when all pixels are scored."""
-    from splinecli.evaluation.plan import CaptureJob, ProtocolTrials
-    from splinecli.evaluation.protocol import Protocol
-    from splinecli.methods import make_estimator
-
-    seen = []
-    for max_pixels in (None, 20):
-        tasks = [ProtocolTrials.of(Protocol(7, max_pixels=max_pixels))]
-        job = CaptureJob.plan(overexposed, "overexposed", [make_estimator("ls")], tasks)
-        seen.append(job.read(job.draws).see(job.draws[0][0][0]))
-    whole, part = seen
-    assert part.n_pixels == 20
-    np.testing.assert_array_equal(part.estimated_intensities, whole.estimated_intensities)
-    position = np.cumsum(whole.mask.ravel())[np.flatnonzero(part.mask)] - 1
-    np.testing.assert_array_equal(part.observations, whole.observations[position])
-
-
-@pytest.mark.parametrize(("policy", "mae_deg"), [([], 2.03), (["--as-stored"], 9.56)])
-def test_the_medallion_without_its_intensities(run, tmp_path, monkeypatch, policy, mae_deg):
-    folder = Path(__file__).resolve().parents[2] / "examples/medallion"
-    shutil.copytree(folder, tmp_path / "medallion")
-    monkeypatch.chdir(tmp_path)
-    Path("medallion/light_intensities.txt").unlink()
-    arguments = ["medallion", "--method", "iw12", "--n-lights", "all", *policy, "--json"]
-    document = json.loads(run("evaluate", *arguments).out)
-    assert document["results"][0]["mae_deg"] == pytest.approx(mae_deg, abs=0.01)
-
-
-def test_draws_from_a_file(dataset, run):
-    Path("draws.txt").write_text("# without the shadowed light\n1 2 3 4\n4,5,6,7\n")
-    document = json.loads(run("evaluate", dataset, "--method", "ls", "--draws", "draws.txt", "--json").out)
-    assert document["protocol"]["draws"] == "draws.txt"
-    assert [(r["trials"], r["n_lights"]) for r in document["results"]] == [(2, 4), (2, 4)]
-    assert all(result["mae_deg"] < 1e-3 for result in document["results"])
 
 
 def test_several_light_counts_and_all(dataset, run, golden):
@@ -250,16 +212,6 @@ def test_figures(dataset, run):
     assert not list(Path("evaluation/figures").iterdir())
 
 
-def test_images_left_out_are_noted(dataset, run):
-    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--skip-first", "shaded=2")
-    assert result.err == "splinecli: note: shaded: the first 2 images are left out.\n"
-    document = json.loads(Path("evaluation/results.json").read_text())
-    assert document["protocol"]["skip_first"] == {"shaded": 2}
-    assert document["notes"] == ["shaded: the first 2 images are left out."]
-    # Light 1 was the shadowed one.
-    assert all(result["mae_deg"] < 1e-3 for result in document["results"])
-
-
 def test_weights_are_named_and_their_lights_warned_about(dataset, run):
     result = run(
         "evaluate", dataset / "matte", "--method", "cnn-ps", "--n-lights", 5, "--trials", 1, "--max-pixels", 9
@@ -290,34 +242,6 @@ def test_the_white_level_is_used_and_named(overexposed, run):
     assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
     assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
     assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--pixel", "3,4"],
-        ["--skip-first", "cow=3"],
-        ["--draws", "draws.txt"],
-        ["--light-noise-deg", 40],
-        ["--white-level", 0],
-        ["--n-lights", 9],
-        ["--weights", "spline-net"],
-        ["--method", "cnn-ps", "--weights", "spline-net"],
-    ],
-)
-def test_arguments_are_checked_before_any_image_is_read(dataset, run, monkeypatch, arguments):
-    from splinecli.capture import CaptureSource
-
-    def fail(*_, **__):
-        raise AssertionError("an image was read")
-
-    monkeypatch.setattr(CaptureSource, "read_stored", fail)
-    Path("draws.txt").write_text("1 2 two\n")
-    method = [] if "--method" in arguments else ["--method", "ls"]
-    result = run("evaluate", dataset, *method, *arguments)
-    assert result.code in (2, 3, 4)
-    assert "AssertionError" not in result.err
-    assert not Path("evaluation").exists()
 
 
 def test_an_unreadable_file_skips_its_capture(dataset, run, monkeypatch):

@@ -35,19 +35,6 @@ def test_man_pages_are_up_to_date():
     assert found == man_pages()
 
 
-def test_every_command_has_a_man_page():
-    assert man_pages().keys() == {"splinecli.1", *(f"splinecli-{command}.1" for command in COMMANDS)}
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_man_page_names_every_option(command, run):
-    page = man_pages()[f"splinecli-{command}.1"].replace("\\-", "-")
-    options = [word for word in run(command, "--help").out.split() if word.startswith("--")]
-    assert options
-    for option in options:
-        assert option.rstrip(",.;") in page
-
-
 @pytest.mark.skipif(shutil.which("groff") is None, reason="no groff to check the man pages with")
 def test_man_pages_are_typeset_without_warnings():
     for name, page in man_pages().items():

@@ -17,7 +17,6 @@ import pytest
 
 from splinecli.cli.signals import GRACE_SECONDS
 
-COMMAND = [sys.executable, "-m", "splinecli"]
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
 
@@ -95,65 +94,11 @@ def test_a_pipe_in_place_of_the_lock_is_refused(capture, run):
     )
 
 
-@posix
-def test_a_pipe_in_place_of_stored_scores_is_refused(capture, run):
-    Path("evaluation").mkdir()
-    os.mkfifo("evaluation/trials.jsonl")
-    result = run("evaluate", capture, "--method", "ls", "--n-lights", 4, "--trials", 1)
-    message = "splinecli: evaluation/trials.jsonl: is not a file. Remove it, or choose another -o.\n"
-    assert (result.code, result.err) == (5, message)
-
-
 def test_a_zero_byte_in_a_list_of_images(capture, run):
     (capture / "filenames.txt").write_text("image1.png\na\0b.png\n")
     result = run("infer", capture, "--method", "ls")
     assert result.code == 3
     assert result.err.startswith('splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist')
-
-
-@pytest.mark.parametrize("value", ["1" + "0" * 100, "1" + "0" * 400])
-@pytest.mark.parametrize("key", ["direction", "intensity"])
-def test_whole_numbers_of_lights_of_any_length(capture, run, key, value):
-    light = {"direction": "[0, 0, -1]", "intensity": "[1, 1, 1]", key: f"[{value}, 1, -1]"}
-    text = ", ".join(f'"{name}": {numbers}' for name, numbers in light.items())
-    Path("lights.json").write_text(f'{{"lights": [{", ".join(8 * ["{" + text + "}"])}]}}')
-    result = run("infer", capture, "--method", "ls", "--lights", "lights.json")
-    assert "defect" not in result.err
-    assert result.code in (0, 3) if len(value) < 300 else result.code == 3
-
-
-@pytest.mark.parametrize("text", ["[" * 200_000, '{"lights": [' + "9" * 400 + "]}", "9" * 5_000])
-def test_lights_that_no_parser_likes(capture, run, text):
-    Path("lights.json").write_text(text)
-    result = run("infer", capture, "--method", "ls", "--lights", "lights.json")
-    assert result.code == 3
-    assert result.err.startswith("splinecli: lights.json: ")
-    assert len(result.err) < 200
-    Path("many.lp").write_text("1" * 5_000 + "\nimage1.png 0 0 1\n")
-    result = run("infer", capture, "--method", "ls", "--lights", "many.lp")
-    assert (result.code, result.err.count("\n")) == (3, 1)
-    assert "lights, but 1 lines follow" in result.err
-
-
-def test_numbers_of_options_that_no_parser_likes(capture, run):
-    for arguments in (
-        ["infer", capture, "--light-indices", "9" * 5_000],
-        ["evaluate", capture, "--skip-first", "9" * 5_000],
-        ["evaluate", capture, "--n-lights", "9" * 5_000],
-        ["train", "-o", "run", "--param", "seed=" + "9" * 5_000],
-        ["train", "-o", "run", "--param", "seed=" + "[" * 5_000],
-    ):
-        result = run(*arguments)
-        assert result.code in (2, 4), result.err
-        assert "Traceback" not in result.err
-
-
-def test_light_files_of_windows(capture, run):
-    run("infer", capture, "--method", "ls", "-o", "expected")
-    text = (capture / "light_directions.txt").read_text()
-    (capture / "light_directions.txt").write_text(text, encoding="utf-16")
-    assert run("infer", capture, "--method", "ls").code == 0
-    assert np.array_equal(np.load("out/sphere/normals.npy"), np.load("expected/sphere/normals.npy"))
 
 
 def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path):

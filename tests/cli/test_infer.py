@@ -15,13 +15,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from splinecli.capture.layouts.capture_files import NOT_PHOTOGRAPHS
-from splinecli.capture.layouts.image_lists import IMAGE_SUFFIXES
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.normals import angle_between_deg, decode_picture
-from splinecli.results.files import OWN_FILES
-
-PIXELS = 448
 
 
 def read_report(folder: Path) -> dict:
@@ -48,25 +43,6 @@ def test_writes_the_contract(capture, truth, run, golden):
     assert picture.dtype == np.uint16
     assert angle_between_deg(decode_picture(picture)[mask], normals[mask]).max() < 5e-3
     assert cv2.imread(str(out / "error_map.png")).shape[0] >= mask.shape[0]
-
-
-def test_directx_flips_green(capture, run):
-    run("infer", capture, "--method", "ls", "-o", "gl")
-    run("infer", capture, "--method", "ls", "-o", "dx", "--convention", "directx")
-    opengl, directx = (
-        cv2.imread(f"{out}/sphere/normals.png", cv2.IMREAD_UNCHANGED).astype(int) for out in ("gl", "dx")
-    )
-    inside = opengl.any(axis=-1)
-    assert (np.abs(opengl + directx - 65535)[inside][:, 1] <= 1).all()
-    np.testing.assert_array_equal(opengl[..., [0, 2]], directx[..., [0, 2]])
-
-
-def test_no_ground_truth_no_error_map(capture, run):
-    (capture / "normals_gt.npy").unlink()
-    assert run("infer", capture, "--method", "ls", "--json").code == 0
-    report = read_report(Path("out/sphere"))
-    assert report["angular_error_deg"] is None
-    assert report["files"] == ["normals.npy", "normals.png", "report.json"]
 
 
 def test_albedo_and_preview_where_they_are_asked_for(capture, run):
@@ -137,22 +113,6 @@ def test_options_of_the_surface_that_are_refused(capture, run, arguments, messag
     assert (result.code, message in result.err) == (2, True), result.err
 
 
-def test_a_missing_library_is_named_before_the_work(capture, run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    result = run("infer", capture, "--method", "ls", "--surface", "--decimate", 50)
-    assert (result.code, "pip install 'splinecli[mesh]'" in result.err) == (2, True), result.err
-    assert not Path("out").exists()
-
-
-def test_a_page_to_look_at(capture, run):
-    assert run("infer", capture, "--method", "ls", "--html").code == 0
-    page = Path("out/sphere/page.html").read_text("utf-8")
-    assert {"page.html", "albedo.png"} & set(read_report(Path("out/sphere"))["files"]) == {"page.html"}
-    assert page.count("data:image/png;base64,") >= 4  # normals in two halves, albedo, error map
-    assert "http://" not in page.replace("http://www.w3.org", "")
-    assert "sphere" in page
-
-
 def test_how_sure_the_network_is(capture, run):
     assert run("infer", capture, "--maps", "confidence", "--html", "--overwrite").code == 0
     out, mask = Path("out/sphere"), cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
@@ -206,32 +166,6 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
     assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (3, True, True)
 
 
-def test_eight_bits(capture, run):
-    assert run("infer", capture, "--method", "ls", "--format", "png,png8").code == 0
-    small, large = (
-        cv2.imread(f"out/sphere/{name}", cv2.IMREAD_UNCHANGED) for name in ("normals_8bit.png", "normals.png")
-    )
-    assert (small.dtype, large.dtype) == (np.uint8, np.uint16)
-    np.testing.assert_allclose(small / 255, large / 65_535, atol=0.6 / 255)
-
-
-def test_overexposed_photographs(capture, run):
-    """Saturated pixels are not taken for what they say: a matte surface comes out as if they had not been."""
-    before = run("infer", capture, "--method", "ls", "--json").out
-    for path in capture.glob("image*.png"):
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
-        cv2.imwrite(str(path), np.minimum(picture * 65_535 // 57_000, 65_535).astype(np.uint16))
-    (after,) = json.loads(run("infer", capture, "--method", "ls", "--json", "--overwrite").out)
-    assert json.loads(before)[0]["angular_error_deg"]["mean"] < 0.01
-    assert after["angular_error_deg"]["mean"] < 0.1
-    assert any(warning["code"] == "saturated" for warning in after["warnings"])
-
-
-def test_no_picture_of_ours_is_a_photograph():
-    pictures = {Path(name).stem for name in OWN_FILES if Path(name).suffix in IMAGE_SUFFIXES}
-    assert pictures <= NOT_PHOTOGRAPHS
-
-
 def test_a_mended_mask_stays(capture, run):
     """A mask that was found, painted over, and given to the next call, which replaces the other results."""
     (capture / "mask.png").unlink()
@@ -276,16 +210,6 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     )
 
 
-def test_json_is_the_report_and_nothing_else(capture, run):
-    result = run("infer", capture, "--method", "ls", "--json")
-    assert json.loads(result.out) == [read_report(Path("out/sphere"))]
-    assert result.err == ""
-
-
-def test_quiet_says_nothing(capture, run):
-    assert run("infer", capture, "--method", "ls", "--quiet") == type(run("--version"))(0, "", "")
-
-
 def test_lights_by_index_and_by_draw(capture, run):
     (chosen,) = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
     assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])
@@ -297,27 +221,6 @@ def test_lights_by_index_and_by_draw(capture, run):
     ]
     assert [draw["n_lights"] for draw in draws] == [4, 4, 4]
     assert draws[0]["light_indices"] == draws[1]["light_indices"] != draws[2]["light_indices"]
-
-
-def test_files_given_go_before_the_folders(capture, run):
-    lights = np.loadtxt(capture / "light_directions.txt")
-    (capture / "light_directions.txt").unlink()
-    np.savetxt("l.txt", lights)
-    cv2.imwrite("m.png", np.pad(np.full((2, 3), 255, np.uint8), ((4, 18), (5, 16))))
-    (report,) = json.loads(
-        run("infer", capture, "--method", "ls", "--lights", "l.txt", "--mask", "m.png", "--json").out
-    )
-    assert report["n_pixels"] == 6
-    assert report["angular_error_deg"]["mean"] < 1e-3
-
-
-def test_network_on_a_matte_sphere(capture, run):
-    """All that is shipped, from the command line: a matte sphere without shadows is easy."""
-    (report,) = json.loads(run("infer", capture, "--precision", "float32", "--json").out)
-    assert report["method"] == "spline-net"
-    assert report["weights"]["name"] == "spline-net"
-    assert len(report["weights"]["sha256"]) == 64
-    assert report["angular_error_deg"]["mean"] < 2.5
 
 
 def test_distilled(capture, run):
@@ -348,21 +251,6 @@ def test_three_lights_are_warned_about(capture, run):
     assert "trained with 4" in warning["text"]
 
 
-def test_rotations_change_little_and_batches_nothing(capture, run):
-    run("infer", capture, "-o", "one", "--precision", "float32")
-    run("infer", capture, "-o", "five", "--precision", "float32", "--rotations", 5)
-    run("infer", capture, "-o", "small", "--precision", "float32", "--batch-size", 7)
-    one, five, small = (np.load(f"{out}/sphere/normals.npy") for out in ("one", "five", "small"))
-    inside = one.any(axis=-1)
-    difference = angle_between_deg(one[inside], five[inside])
-    assert 0 < difference.mean() < 3
-    # Rounding may move a light into the next cell of a pixel's map: on this symmetric sphere, lights lie on borders.
-    # The refinement net passes a part of such a change on to the neighbours.
-    rounding = angle_between_deg(one[inside], small[inside])
-    assert np.quantile(rounding, 0.9) < 2e-3
-    assert rounding.max() < 0.5
-
-
 def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
     run("infer", capture, "--method", "ls")
     Path("out/sphere/notes.txt").write_text("mine")
@@ -386,15 +274,6 @@ def test_interrupted_while_estimating(capture, run, monkeypatch):
     monkeypatch.setattr(LeastSquares, "estimate", interrupt)
     result = run("infer", capture, "--method", "ls")
     assert (result.code, result.out, result.err) == (130, "", "splinecli: interrupted.\n")
-    assert not Path("out").exists()
-
-
-def test_interrupted_while_writing(capture, run, monkeypatch):
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("splinecli.results.files.encode_png", interrupt)
-    assert run("infer", capture, "--method", "ls").code == 130
     assert not Path("out").exists()
 
 

@@ -67,12 +67,6 @@ def test_warnings(run, capture):
     assert "The images have 2 different sizes; all images need the same size." in warnings
 
 
-def test_no_capture(run, tmp_path):
-    result = run("info", tmp_path / "nowhere")
-    assert (result.code, result.out) == (3, "")
-    assert "the folder does not exist" in result.err
-
-
 def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
     before = (capture / "image1.png").read_bytes()
     for name in ("image1.png", "sky.png"):
@@ -117,27 +111,3 @@ def test_the_white_level_of_12_bit_data(run, capture):
     assert report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
     assert report["exposure"]["saturated"] > 0.1
     assert report["exposure"]["bright"][1] == pytest.approx(1)
-
-
-def test_a_white_level_given_by_the_user(run, capture):
-    clip_at_12_bits(capture, times=0.5)
-    result = run("info", capture, "--white-level", 2000)
-    assert "white level  2000, given by --white-level\n" in result.out
-    given = json.loads(run("info", capture, "--white-level", 1000, "--json").out)
-    assert (
-        given["exposure"]["saturated"]
-        > json.loads(run("info", capture, "--json").out)["exposure"]["saturated"]
-    )
-    assert run("info", capture, "--white-level", -1).code == 2
-
-
-@pytest.mark.parametrize("option", ["--plot", "--lights", "--mask"])
-def test_home_folder_in_paths(run, capture, tmp_path, monkeypatch, option):
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    (tmp_path / "home").mkdir()
-    for name in ("light_directions.txt", "mask.png"):
-        (tmp_path / "home" / name).write_bytes((capture / name).read_bytes())
-    name = {"--plot": "sky.png", "--lights": "light_directions.txt", "--mask": "mask.png"}[option]
-    assert run("info", capture, f"{option}=~/{name}").code == 0
-    assert (tmp_path / "home" / name).exists()
-    assert not Path("~").exists()

@@ -191,16 +191,6 @@ def test_evaluate_and_prepare(run, bump: Path) -> None:
     assert "near lamps, and training needs distant lights" in refused.err
 
 
-def test_figures_have_no_observation_maps(run, bump: Path) -> None:
-    """Each pixel has light directions of its own, so one set of directions would place observations wrongly."""
-    np.savetxt(bump / "light_positions.txt", POSITIONS)
-    (bump / "pixel_size.txt").write_text("2\n")
-    arguments = ["--method", "spline-net-pixelwise", "--n-lights", "5", "--trials", "1", "--figures"]
-    result = run("evaluate", "bump", *arguments, "--pixel", "10,10")
-    assert result.code == 0, result.err
-    assert [path.name for path in Path("evaluation/figures").iterdir()] == ["bump.png"]
-
-
 def test_positions_are_no_angles(run, bump: Path) -> None:
     np.savetxt(bump / "light_positions.txt", POSITIONS)
     (bump / "pixel_size.txt").write_text("2\n")

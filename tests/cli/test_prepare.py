@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import cv2
@@ -75,16 +74,6 @@ def test_a_cycles_tree_reads_to_the_values_put_in(run, cycles_tree):
     assert manifest["complete"] is True
 
 
-def test_the_sheet_shows_normals_and_images(run, cycles_tree):
-    run("prepare", cycles_tree, "-o", "set", "--quiet")
-    sheet = cv2.imread("set/contact_sheet.png")
-    # A framed strip of 7 tiles: the normals, and three entries under two lights each.
-    assert sheet.shape == (164, 7 * 160 + 8, 3)
-    middle = sheet[82, 82].astype(int)
-    assert middle[0] > 240  # blue is z
-    assert abs(middle[1] - 128) < 3  # green is y, and y is 0 here
-
-
 def test_the_same_command_continues(run, make_capture):
     one, two = make_capture("one"), make_capture("two")
     shutil.move(two / "image3.png", "hidden.png")
@@ -113,13 +102,6 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     assert run("prepare", "b", capture, "-o", "set", "--quiet").code == 0
     assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
     assert [Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")] == before
-
-
-def test_another_capture_of_a_name_joins_later_under_another(run, make_capture):
-    capture = make_capture("a")
-    shutil.copytree(capture, "b/a")
-    run("prepare", capture, "-o", "set", "--quiet")
-    assert run("prepare", "b/a", "-o", "set").err == "a-2: 448 pixels, 8 lights, b/a\n"
 
 
 def change_ambient(capture: Path) -> None:
@@ -190,30 +172,6 @@ def test_a_white_level_is_used_and_named(run, capture):
     assert "was made with white_level = 3500.0, not None" in refused.err
 
 
-def test_a_missing_extra_is_named_before_captures_are_read(run, capture, monkeypatch):
-    monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    result = run("prepare", capture, "--scenes", 1, "-o", "set")
-    assert (result.code, result.out) == (2, "")
-    assert "splinecli[render]" in result.err
-    assert not Path("set").exists()
-
-
-def test_the_help_gives_the_defaults_of_rendered_scenes(run):
-    from splinecli.synthesis.scenes import SceneConfig
-
-    text = " ".join(run("prepare", "--help").out.split())
-    assert f"rendered images. [default: {SceneConfig().size}]" in text
-    assert f"lights of a rendered scene. [default: {SceneConfig().lights}]" in text
-
-
-def test_json_when_no_capture_can_be_read(run, capture):
-    (capture / "normals_gt.npy").unlink()
-    result = run("prepare", capture, "-o", "set", "--json")
-    summary = json.loads(result.out)
-    assert (result.code, summary["entries"], summary["contact_sheet"]) == (3, 0, None)
-    assert "no ground truth" in summary["skipped"][0]["reason"]
-
-
 @pytest.fixture
 def cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cube's mesh, its top turned to the camera."""
@@ -275,21 +233,6 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
     assert result.err.startswith(
         "splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z"
     )
-
-
-def test_a_scene_does_not_depend_on_those_before_it(run, cube):
-    common = ("prepare", "--size", 16, "--n-lights", 20, "--quiet")
-    run(*common, "--scenes", 2, "-o", "set")
-    shutil.move("set", "first")
-    # After an interruption, the second scene is rendered without the first.
-    manifest = json.loads(Path("first/manifest.json").read_text())
-    shutil.copytree("first", "set")
-    manifest["entries"] = manifest["entries"][:3]
-    Path("set/manifest.json").write_text(json.dumps(manifest))
-    run(*common, "--scenes", 2, "-o", "set")
-    for name in ("observations", "normals", "light_directions", "mask"):
-        path = f"scene0001-metallic/{name}.npy"
-        assert (Path("set") / path).read_bytes() == (Path("first") / path).read_bytes()
 
 
 def test_refusals(run, make_capture, cycles_tree, golden):

@@ -8,12 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bump_capture import POSITIONS, SIZE, write_bump
-from splinecli.capture import read_capture
-from splinecli.capture.restore.light_refinement import refine_capture
-from splinecli.evaluation.plan import CaptureJob, ProtocolTrials
-from splinecli.evaluation.protocol import Protocol
-from splinecli.methods import make_estimator
+from bump_capture import POSITIONS, write_bump
 
 
 @pytest.fixture
@@ -56,24 +51,6 @@ def test_evaluate(run, rough: np.ndarray) -> None:
     assert document["protocol"]["light_error_deg"] == 3
     assert errors[1] < 0.9 * errors[0]
     assert errors[2] not in errors[:2]
-
-
-def test_evaluate_refines_from_all_pixels(rough: np.ndarray) -> None:
-    """The lights do not depend on the pixels that are scored, or on whether the method sees all of them."""
-    job = CaptureJob.plan(
-        Path("bump"),
-        "bump",
-        [make_estimator("ls")],
-        [ProtocolTrials.of(Protocol(light_error_deg=5.0, max_pixels=150))],
-    )
-    assert job is not None
-    source, trial = job.read(job.draws), job.draws[0][0][0]
-    scored, whole = source.see(trial), source.see(trial, whole=True)
-    assert (scored.n_pixels, whole.n_pixels) == (150, SIZE * SIZE)
-    refined = refine_capture(read_capture("bump"), error_deg=5.0)
-    assert np.abs(refined.light_directions - rough).max() > 0.02
-    for seen in (scored, whole):
-        np.testing.assert_array_equal(seen.light_directions, refined.light_directions)
 
 
 def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> None:

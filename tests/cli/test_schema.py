@@ -20,10 +20,6 @@ def check(document: Any, name: str) -> None:
     validator.validate(document)
 
 
-def test_the_schema_is_one():
-    jsonschema.Draft202012Validator.check_schema(SCHEMA)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -96,15 +96,6 @@ def test_a_run_and_its_continuation(run):
     assert [row["step"] for row in rows()] == ["3", "5", "6"]
 
 
-def test_the_weights_work(run, make_capture, no_pictures):
-    run("train", "-o", "run", "--steps", 1, "--quiet")
-    (report,) = json.loads(
-        run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
-    )
-    assert report["weights"]["name"] == "weights"
-    assert report["angular_error_deg"]["mean"] < 5
-
-
 def test_a_run_on_pixel_sets(run, make_capture):
     write_set("set")
     write_set("more/set")
@@ -127,23 +118,6 @@ def test_a_run_on_pixel_sets(run, make_capture):
     assert run("train", "-o", "../run", "--resume", "--steps", 6, "--quiet").code == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sources"),
-    [
-        (["set"], {"set": 1.0}),
-        (["set", "--generator-weight", "0.5"], {"set": 1.0, "generator": 0.5}),
-        (["set", "--generator-weight", "0"], {"set": 1.0}),
-        (["--generator-weight", "2"], {"generator": 2.0}),
-    ],
-)
-def test_sources(run, no_pictures, arguments, sources):
-    write_set("set")
-    assert run("train", *arguments, "-o", "run", "--steps", 1, "--quiet").code == 0
-    found = {name if name == "generator" else Path(name).name: w for name, w in settings()["sources"].items()}
-    assert found == sources
-    assert all(name == "generator" or Path(name).is_absolute() for name in settings()["sources"])
-
-
 def test_settings_come_from_preset_file_and_options(run, no_pictures):
     Path("a.toml").write_text("seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n")
     options = ["--param", "batch_size=4", "--param", "pixels.ambient_share=0", "--n-lights", 12, "--steps", 1]
@@ -155,15 +129,6 @@ def test_settings_come_from_preset_file_and_options(run, no_pictures):
     # The configuration of one run starts another.
     assert run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
     assert json.loads(Path("other/config.json").read_text()) == values | {"seed": 9}
-
-
-def test_alternating_updates_with_every_term(run, no_pictures):
-    terms = ["updates=alternating", "symmetric_weight=0.02", "asymmetric_weight=2e-5", "li_net_norm=sum"]
-    options = [word for term in terms for word in ("--param", term)]
-    assert run("train", "-o", "run", "--steps", 6, *options, "--quiet").code == 0
-    (row,) = rows()
-    assert float(row["symmetric"]) > 0
-    assert float(row["asymmetric"]) > 0
 
 
 def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
@@ -275,12 +240,3 @@ def test_refusals(run, golden, no_pictures):
     golden("train_refusals.txt", "".join(messages))
     assert not Path("other").exists()
     assert [row["step"] for row in rows()] == ["1"]
-
-
-def test_another_preset_is_refused_by_its_network(run, no_pictures):
-    # The compact network of these tests is smaller, but the message gives the name of its size.
-    run("train", "-o", "run", "--steps", 1)
-    result = run("train", "-o", "run", "--resume", "--steps", 2, "--preset", "paper")
-    assert (result.code, result.out) == (4, "")
-    message = "run/checkpoint.safetensors: the run was started with network.size = 'compact', not 'paper'"
-    assert message in result.err

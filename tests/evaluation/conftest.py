@@ -5,23 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import shade, spiral_lights, write_capture
 from splinecli.normals import unit
 
 SIZE = 12  # pixels a side; the outermost ring is outside the mask
-
-
-def ring_of_lights(n_lights: int) -> NDArray[np.float64]:
-    """Directions 15 to 40 degrees from the view axis."""
-    azimuth = np.arange(n_lights) * np.radians(137.5)
-    zenith = np.radians(np.linspace(15, 40, n_lights))
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1
-    )
 
 
 def dome_normals() -> NDArray[np.float64]:
@@ -37,19 +28,11 @@ def write_dome(tmp_path: Path) -> Callable[..., Path]:
     def write(
         name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0
     ) -> Path:
-        folder = tmp_path / name
-        folder.mkdir(parents=True)
-        lights, normals = ring_of_lights(n_lights), dome_normals()
-        for number, light in enumerate(lights):
-            photograph = np.rint(0.9 * 65535 * (normals @ light)).astype(np.uint16)
-            assert cv2.imwrite(str(folder / f"{number:03}.png"), photograph)
-        mask = np.zeros((SIZE, SIZE), np.uint8)
-        mask[1:-1, 1:-1] = 255
-        assert cv2.imwrite(str(folder / "mask.png"), mask)
-        np.savetxt(folder / "light_directions.txt", lights)
-        if ground_truth:
-            normals[1, 1 : 1 + without_truth] = 0
-            np.save(folder / "normal_gt.npy", normals)
-        return folder
+        lights, normals = spiral_lights(n_lights, 40, 15), dome_normals()
+        photographs = np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)).astype(np.uint16)
+        mask = np.pad(np.ones((SIZE - 2, SIZE - 2), bool), 1)
+        normals[1, 1 : 1 + without_truth] = 0
+        truth = normals if ground_truth else None
+        return write_capture(tmp_path / name, photographs, lights, mask=mask, normals=truth)
 
     return write

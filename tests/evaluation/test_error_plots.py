@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import cv2
 import numpy as np
 import pytest
@@ -82,21 +80,8 @@ def test_captures_that_not_all_have_are_left_out() -> None:
     assert lights_curves([both, fewer]) == lights_curves([evaluation_of(["ball"], 10), fewer])
 
 
-@pytest.mark.parametrize("draw", [lights_curves, light_noise_curves])
-def test_lights_and_noise_may_both_differ(draw: Callable[[Sequence[Evaluation]], bytes]) -> None:
-    evaluations = [evaluation_of(["ball"], k, noise) for k in (5, 10, None) for noise in (0, 2.5)]
-    ink = (decode(draw(evaluations)) < 255).sum()
-    assert ink > (decode(draw(evaluations[::2])) < 255).sum()
-
-
 def test_odd_names_one_point_and_one_trial_are_drawn() -> None:
     odd = Evaluation(Protocol(10), (Result("_m$x$", "a$b_{c$ 猫", 10, (3.0,), 1.0),))
     # matplotlib takes what stands between dollars for a formula, and raises for this one.
     for draw in (lights_curves, light_noise_curves):
         assert (decode(draw([odd])) < 128).any()
-
-
-def test_a_capture_with_as_many_lights_as_all_has_one_point_there() -> None:
-    # A logarithmic axis without a width would raise.
-    twice = decode(lights_curves([evaluation_of(["ball"], 96), evaluation_of(["ball"], None)]))
-    assert (twice < 128).any()

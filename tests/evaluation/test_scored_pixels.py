@@ -52,10 +52,6 @@ def test_a_part_of_the_pixels(capture: Capture) -> None:
     assert (parts[0] != parts[2]).any()
 
 
-def test_more_than_there_are_is_all(capture: Capture) -> None:
-    np.testing.assert_array_equal(scored_rows(capture, max_pixels=1000), scored_rows(capture))
-
-
 def test_without_ground_truth(capture: Capture) -> None:
     with pytest.raises(InputError, match="c: the capture has no ground truth"):
         scored_rows(replace(capture, ground_truth=None))

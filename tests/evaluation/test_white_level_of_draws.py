@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from conftest import spiral_lights
+from scenes import shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.white_level import WhiteLevel
@@ -25,25 +24,17 @@ LS = make_estimator("ls")
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A matte sphere under nine lights. The camera clips three images at 6000; the others are too dark for that."""
-    folder = tmp_path / "half"
-    folder.mkdir()
-    axis = np.linspace(-0.65, 0.65, SIDE)
-    x, y = np.meshgrid(axis, -axis)
-    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
-    lights = spiral_lights(N_LIGHTS, 50)
+    normals, lights = sphere_cap(SIDE), spiral_lights(N_LIGHTS, 50)
     rng = np.random.default_rng(3)
-    albedo = rng.uniform(0.6, 1, (SIDE, SIDE))
+    albedo = rng.uniform(0.6, 1, (SIDE, SIDE, 1))
     intensities = np.where(np.arange(N_LIGHTS) < CLIPPED, 1.6, 0.5)
-    for number, (light, intensity) in enumerate(zip(lights, intensities, strict=True)):
-        values = intensity * LEVEL * albedo * np.maximum(normals @ light, 0)
-        values *= rng.normal(1, 0.01, values.shape)
-        image = np.minimum(np.rint(values), LEVEL).astype(np.uint16)
-        assert (image == LEVEL).any() == (number < CLIPPED)
-        assert cv2.imwrite(str(folder / f"{number}.png"), image)
-    np.savetxt(folder / "light_directions.txt", lights)
-    np.savetxt(folder / "light_intensities.txt", np.repeat(intensities[:, None], 3, axis=1))
-    np.save(folder / "normal_gt.npy", normals)
-    return folder
+    values = (
+        intensities * LEVEL * albedo * shade(normals, lights) * rng.normal(1, 0.01, (SIDE, SIDE, N_LIGHTS))
+    )
+    images = np.moveaxis(np.minimum(np.rint(values), LEVEL).astype(np.uint16), 2, 0)
+    assert ((images == LEVEL).any(axis=(1, 2)) == (np.arange(N_LIGHTS) < CLIPPED)).all()
+    colours = np.repeat(intensities[:, None], 3, axis=1)
+    return write_capture(tmp_path / "half", images, lights, normals=normals, intensities=colours)
 
 
 def mae_deg(folder: Path, lights: tuple[int, ...], **settings: bool) -> float:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from splinecli.fits import iw12, least_absolute, trimmed_least_squares
-from splinecli.fits.shadows import lit_observations
 from splinecli.fits.weighted_least_squares import RIDGE, weighted_least_squares
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.normals import angle_between_deg
@@ -61,18 +60,6 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
             gamma = (pixel - lights @ solution) ** 2 + np.einsum("fi,ij,fj->f", lights, posterior, lights)
             gamma = gamma.clip(iw12.SMALLEST_VARIANCE)
         np.testing.assert_allclose(b, solution, rtol=1e-5)
-
-
-def test_shadows_go_and_what_is_needed_stays() -> None:
-    # The 0.6 quantiles are 0.46, 0.04 and 0.16: a highlight over a dim pixel darkens nothing.
-    observations = torch.tensor([[1.0, 0.5, 0.3, 0.04], [1.0, 0.04, 0.04, 0.03], [1.0, 0.2, 0.001, 0.0]])
-    expected = [[True, True, True, False], [True] * 4, [True, True, True, False]]
-    assert lit_observations(observations, 0.1).tolist() == expected
-    assert lit_observations(observations, 0.0).all()
-    # Observations that are not there count for nothing: not for the quantile, and not among the largest.
-    more = torch.cat((torch.full((3, 5), 9.0), observations), dim=1)
-    valid = torch.arange(9) >= 5
-    assert lit_observations(more, 0.1, valid.expand(3, 9)).tolist() == [[False] * 5 + row for row in expected]
 
 
 def test_l1_is_the_linear_programme_s_optimum() -> None:

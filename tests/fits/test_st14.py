@@ -7,7 +7,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from splinecli.fits.st14 import coefficient_count, kept_count, solve
+from scenes import cap_directions, halfway
+from splinecli.fits.st14 import solve
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.normals import angle_between_deg
@@ -15,19 +16,9 @@ from splinecli.normals import angle_between_deg
 Array = NDArray[np.float64]
 
 
-def directions(count: int, limit_deg: float, seed: int) -> Array:
-    rng = np.random.default_rng(seed)
-    azimuth = rng.uniform(0, 2 * np.pi, count)
-    zenith = np.radians(limit_deg) * np.sqrt(rng.uniform(0, 1, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
-
-
 def half_cosines(normals: Array, lights: Array) -> tuple[Array, Array]:
     """n.h (P, F) and l.h (F,)."""
-    bisectors = lights + np.array((0, 0, 1))
-    bisectors /= np.linalg.norm(bisectors, axis=1, keepdims=True)
+    bisectors = halfway(lights)
     return normals @ bisectors.T, (lights * bisectors).sum(axis=1)
 
 
@@ -58,8 +49,8 @@ def solved(observations: Array, lights: Array) -> Array:
 
 
 # All lights are within 38 degrees of the camera, all normals within 50: nothing is shadowed.
-TRUTH = directions(300, 50, 0)
-LIGHTS = directions(96, 38, 1)
+TRUTH = cap_directions(300, 50, 0, even=True)
+LIGHTS = cap_directions(96, 38, 1, even=True)
 OBSERVATIONS = bipolynomial(TRUTH, LIGHTS)
 
 
@@ -86,7 +77,7 @@ def test_highlights_in_the_brightest_observations_change_nothing() -> None:
 
 @pytest.mark.parametrize(("count", "cast"), [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
 def test_exact_on_lambertian_scenes_with_shadows(count: int, cast: float) -> None:
-    lights, truth = directions(count, 70, 3), directions(300, 60, 4)
+    lights, truth = cap_directions(count, 70, 3, even=True), cap_directions(300, 60, 4, even=True)
     observations = np.maximum(truth @ lights.T, 0)
     assert (observations == 0).any()
     # Fewer than four may be three in one plane.
@@ -98,35 +89,15 @@ def test_exact_on_lambertian_scenes_with_shadows(count: int, cast: float) -> Non
 
 @pytest.mark.parametrize(("count", "untouched"), [(10, 8), (96, 60)])
 def test_noise_and_highlights_cost_less_than_in_least_squares(count: int, untouched: int) -> None:
-    lights = directions(count, 38, 3)
+    lights = cap_directions(count, 38, 3, even=True)
     noise = np.random.default_rng(6).normal(1, 0.01, (len(TRUTH), count))
     observations = with_highlights(bipolynomial(TRUTH, lights) * noise, untouched)
     error = angle_between_deg(estimate(observations, lights), TRUTH).mean()
     assert error < 0.25 * angle_between_deg(LeastSquares().estimate(observations, lights), TRUTH).mean()
 
 
-@pytest.mark.parametrize("count", [1, 3, 10])
-def test_too_few_observations_give_a_finite_normal(count: int) -> None:
-    observations = np.zeros((count + 1, count))
-    for lit in range(1, count + 1):
-        observations[lit, :lit] = np.linspace(0.5, 1, lit)
-    found = estimate(observations, LIGHTS[:count])
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
-    np.testing.assert_array_equal(found[0], (0, 0, 1))
-
-
-def test_share_grows_and_coefficients_shrink_with_few_observations() -> None:
-    lit = torch.tensor([0, 3, 8, 10, 32, 33, 96])
-    kept = kept_count(lit, share=0.25, fewest=8)
-    assert kept.tolist() == [0, 3, 8, 8, 8, 9, 24]
-    assert coefficient_count(kept).tolist() == [1, 1, 2, 2, 2, 2, 9]
-    # Two observations or more for each unknown, the two angles of the normal among them.
-    many = torch.arange(6, 30)
-    assert (2 * (coefficient_count(many) + 2) <= many).all()
-
-
 def test_eight_observations_fit_a_reflectance_that_varies_with_the_half_angle() -> None:
-    lights = directions(8, 38, 3)
+    lights = cap_directions(8, 38, 3, even=True)
     half, _ = half_cosines(TRUTH, lights)
     observations = (1 - 0.3 * (1 - half)) * (TRUTH @ lights.T)
     # Pixels with none dark enough to count as a shadow.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from conftest import directions_at, spiral_lights
+from scenes import directions_at, spiral_lights
 from splinecli.fits.two_halves import alternating_signs, compare_halves
 
 LIGHTS = torch.tensor(spiral_lights(10, 55))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from conftest import cap_directions, spiral_lights
+from scenes import cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
@@ -25,13 +25,6 @@ Floats = NDArray[np.floating]
 LIGHTS = spiral_lights(8, 50)
 SIZE = PupilSize(sample=1600, steps=160, width=64)
 SMALL = PupilSize(sample=800, steps=80, width=32)
-
-
-def shade(normals: Floats, gloss: float) -> NDArray[np.float32]:
-    """Return observations (P, 8): Lambert's cosine and a Phong lobe."""
-    half = unit(LIGHTS + np.array((0.0, 0.0, 1.0)))
-    lobe = np.clip(normals @ half.T, 0, None) ** 30
-    return (np.clip(normals @ LIGHTS.T, 0, None) + gloss * lobe).astype(np.float32)
 
 
 @dataclass
@@ -83,7 +76,7 @@ def noisy(normals: Floats, degrees: float, seed: int = 5) -> Floats:
 
 def glossy(count: int = 8000) -> tuple[Floats, NDArray[np.float32]]:
     normals = cap_directions(count, 50)
-    return normals, shade(normals, 0.8)
+    return normals, shade(normals, LIGHTS, gloss=0.8).astype(np.float32)
 
 
 def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
@@ -106,7 +99,7 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
 def test_it_learns_where_its_teacher_is_unsure() -> None:
     normals = cap_directions(6000, 50)
     dull = np.arange(6000) % 2 == 0
-    observations = np.where(dull[:, None], shade(normals, 0), shade(normals, 0) ** 2)
+    observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
     errors = np.where(dull[:, None], log_median(1), log_median(12))
     found = distil(Teacher(observations, normals, errors), observations, LIGHTS, SIZE)
     learned = confidence(found.estimate_with_error(observations, LIGHTS)[1])
@@ -129,23 +122,6 @@ def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
     assert found.report()["unlike_pixels"] == found.n_unlike
 
 
-def test_pixels_unlike_all_others_are_left_to_the_teacher() -> None:
-    normals, observations = glossy()
-    stranger = np.zeros((1, 8), np.float32)
-    stranger[0, 2] = 0.4
-    teacher = Teacher(
-        np.concatenate((observations, stranger)),
-        np.concatenate((normals, [(0.0, -0.6, 0.8)])),
-        np.tile(log_median(2), (8001, 1)),
-    )
-    found = distil(teacher, observations, LIGHTS, SIZE)
-    asked = teacher.asked
-    estimate, errors = found.estimate_with_error(stranger, LIGHTS)
-    assert teacher.asked == asked + 1
-    np.testing.assert_allclose(estimate, [(0.0, -0.6, 0.8)], atol=1e-6)
-    np.testing.assert_allclose(errors, [log_median(2)], atol=1e-6)
-
-
 def test_dark_pixels_have_no_normal() -> None:
     normals, observations = glossy(3000)
     observations[::100] = 0
@@ -153,14 +129,6 @@ def test_dark_pixels_have_no_normal() -> None:
     estimate, errors = distil(teacher, observations, LIGHTS, SIZE).estimate_with_error(observations, LIGHTS)
     np.testing.assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
     np.testing.assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
-
-
-def test_the_scale_of_a_pixel_does_not_matter() -> None:
-    normals, observations = glossy(3000)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
-    found = distil(teacher, observations, LIGHTS, SMALL)
-    common = observations[~np.isin(np.arange(3000), np.flatnonzero(found._apply(observations)[2]))]
-    np.testing.assert_allclose(found._apply(common)[0], found._apply(common * 64)[0], atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
@@ -177,25 +145,6 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
     assert torch.equal(torch.rand(3), expected)
-
-
-def test_a_teacher_without_sense_is_noticed() -> None:
-    """Held-out pixels show it: learning random normals by heart is no success."""
-    _, observations = glossy(3000)
-    random = cap_directions(3000, 80, seed=8)
-    teacher = Teacher(observations, random, np.tile(log_median(3), (3000, 1)))
-    assert not distil(teacher, observations, LIGHTS, SMALL).distillation.is_good
-
-
-def test_progress_counts_the_sample_twice_and_each_pixel_once() -> None:
-    normals, observations = glossy(3000)
-    teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
-    learning: list[int] = []
-    found = distil(teacher, observations, LIGHTS, SMALL, progress=learning.append)
-    assert sum(learning) == pytest.approx(2 * found.distillation.sample, abs=2)
-    estimating: list[int] = []
-    found.estimate(observations, LIGHTS, progress=estimating.append)
-    assert sum(estimating) == 3000
 
 
 def test_its_map_is_refined_by_the_net_of_its_teacher_with_turns_where_it_is_small(

@@ -42,19 +42,6 @@ def estimator(loaded: LoadedNetwork, **options: Any) -> NetworkEstimator:
     return NetworkEstimator("spline-net", loaded, **options)
 
 
-@pytest.mark.parametrize("config", [COMPACT, PAPER])
-def test_batches_do_not_change_the_result(config: NetworkConfig) -> None:
-    observations, lights = pixels(20)
-    whole = estimator(random_network(config), precision="float32").estimate(observations, lights)
-    assert whole.dtype == np.float32
-    for batch_size in (1, 7):
-        parts = NetworkEstimator(
-            "spline-net", random_network(config), precision="float32", batch_size=batch_size
-        )
-        np.testing.assert_allclose(parts.estimate(observations, lights), whole, atol=3e-6)
-    assert whole.std(axis=0).max() > 1e-3  # the pixels are not all alike
-
-
 def test_bfloat16_costs_little() -> None:
     observations, lights = pixels(50)
     exact = estimator(random_network(COMPACT), precision="float32").estimate(observations, lights)
@@ -62,28 +49,6 @@ def test_bfloat16_costs_little() -> None:
     error = angle_between_deg(coarse, exact)
     # 8 bits of mantissa on the correction alone, not on the fit.
     assert 0 < error.max() < 1
-
-
-def test_dark_pixels_face_the_camera_and_darken_no_others() -> None:
-    observations, lights = pixels(6)
-    network = estimator(random_network(COMPACT), precision="float32", rotations=3)
-    expected = network.estimate(observations, lights)
-    observations[2] = 0
-    estimate = network.estimate(observations, lights)
-    np.testing.assert_array_equal(estimate[2], (0, 0, 1))
-    others = [0, 1, 3, 4, 5]
-    np.testing.assert_allclose(estimate[others], expected[others], atol=1e-5)
-
-
-def test_no_pixels() -> None:
-    _, lights = pixels(1)
-    network = estimator(random_network(COMPACT), precision="float32")
-    assert network.estimate(np.empty((0, 10), np.float32), lights).shape == (0, 3)
-
-
-def test_rotations_of_a_network_without_canonical_azimuth_divide_the_circle() -> None:
-    assert rotations_of(1, canonical=False) == [(0, False)]
-    assert rotations_of(4, canonical=False) == [(0, False), (90, False), (180, False), (270, False)]
 
 
 def test_rotations_of_a_canonical_network() -> None:

@@ -46,11 +46,6 @@ def test_rare_groups_and_strangers_are_unlike() -> None:
     assert none_rare.unlike(torch.tensor([[0.0, 0.0, -30.0]])).all()
 
 
-def test_half_of_the_pixels_at_most() -> None:
-    sample = draw_sample(clusters()[:100], 1200, torch.Generator().manual_seed(0))
-    assert len(sample.rows) == 50
-
-
 def test_equal_pixels_are_one_group() -> None:
     sample = draw_sample(torch.ones(500, 4), 100, torch.Generator().manual_seed(0))
     assert len(sample.rows) == 100

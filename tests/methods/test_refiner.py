@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from conftest import spiral_lights
+from scenes import spiral_lights
 from splinecli.capture import Capture, read_capture
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate

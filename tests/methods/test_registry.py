@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.devices import count_available_cores
 from splinecli.errors import ModelError, UsageError
-from splinecli.methods import DEFAULT_METHOD, MethodOptions, make_estimator, method_names
+from splinecli.methods import MethodOptions, make_estimator, method_names
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import save_weights
@@ -31,15 +30,6 @@ def save_tiny(path: Path, **settings: Any) -> str:
 @pytest.fixture
 def weights(tmp_path: Path) -> str:
     return save_tiny(tmp_path / "tiny.safetensors")
-
-
-def test_unknown_method() -> None:
-    with pytest.raises(UsageError, match="no method named 'l2'; expected one of spline-net, cnn-ps, ls"):
-        make_estimator("l2")
-
-
-def test_the_default_is_one_of_them() -> None:
-    assert DEFAULT_METHOD in method_names()
 
 
 def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
@@ -61,17 +51,6 @@ def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path
     assert len(fingerprints) == len(method_names())
 
 
-def test_options_reach_the_network(weights: str) -> None:
-    options = MethodOptions(weights=weights, batch_size=7, rotations=4, device="cpu", precision="bfloat16")
-    estimator = make_estimator("spline-net", options)
-    assert estimator.precision == "bfloat16"
-    assert estimator.weights is not None
-    assert estimator.weights["name"] == "tiny"
-    assert len(estimator.weights["sha256"]) == 64
-    assert vars(estimator)["batch_size"] == 7
-    assert len(vars(estimator)["_rotations"]) == 4
-
-
 def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
     options = MethodOptions(weights=weights, device="cpu", precision="float32")
     others = (replace(options, rotations=3), replace(options, precision="bfloat16"))
@@ -79,13 +58,6 @@ def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
     assert len(fingerprints) == 3
     same = make_estimator("spline-net", replace(options, batch_size=3))
     assert same.fingerprint in fingerprints
-
-
-def test_cnn_ps_averages_ten_rotations(tmp_path: Path) -> None:
-    alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
-    assert make_estimator("cnn-ps", MethodOptions(weights=alone)).fingerprint.endswith("10 views")
-    one = make_estimator("cnn-ps", MethodOptions(weights=alone, rotations=1))
-    assert one.fingerprint.endswith("1 views")
 
 
 def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
@@ -102,30 +74,7 @@ def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
         make_estimator("spline-net", MethodOptions(weights=alone))
 
 
-@pytest.mark.parametrize(
-    ("options", "error"),
-    [
-        (MethodOptions(weights="/nowhere/at/all.safetensors"), ModelError),
-        (MethodOptions(device="tpu"), UsageError),  # type: ignore[arg-type]
-    ],
-)
-def test_options_that_cannot_be(options: MethodOptions, error: type[Exception]) -> None:
-    with pytest.raises(error):
-        make_estimator("spline-net", options)
-
-
 @pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
 def test_counts_from_one(options: MethodOptions, weights: str) -> None:
     with pytest.raises(UsageError, match="whole numbers from 1"):
         make_estimator("spline-net", replace(options, weights=weights))
-
-
-@pytest.mark.parametrize("name", ["spline-net", "iw12"])
-def test_torch_methods_use_no_more_threads_than_the_process_has_cores(
-    name: str, weights: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen: list[int] = []
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 64)
-    monkeypatch.setattr(torch, "set_num_threads", chosen.append)
-    make_estimator(name, MethodOptions(weights=weights, device="cpu"))
-    assert chosen == [count_available_cores()]

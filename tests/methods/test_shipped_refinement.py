@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from conftest import directions_at
+from scenes import directions_at
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import MethodOptions, make_estimator
@@ -106,16 +106,14 @@ def depth(estimate: NormalEstimate, slope: NDArray[np.floating]) -> float:
     return float(((found - found.mean()) / slope).mean())
 
 
-@pytest.mark.parametrize("gloss", [0.0, 0.5])
-@pytest.mark.parametrize("width", [1, 2, 4])
+@pytest.mark.parametrize(("width", "gloss"), [(1, 0.0), (1, 0.5), (4, 0.5)])
 def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
     normals, slope = grooves(width)
     refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
     assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.1)
 
 
-@pytest.mark.parametrize("noise", [0.002, 0.02])
-@pytest.mark.parametrize("width", [1, 2])
+@pytest.mark.parametrize(("width", "noise"), [(1, 0.02), (2, 0.002)])
 def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -> None:
     """They turn normals by 17 degrees, which says nothing about detail. The net alone takes most of it for noise."""
     normals, slope = grooves(width)

@@ -27,28 +27,18 @@ def test_round_trip() -> None:
         ({"grid": "cnn-ps"}, "network grid is 'cnn-ps'; it needs the size 'paper'"),
         ({"size": "huge"}, "network size is 'huge'; expected 'paper' or 'compact'"),
         ({"fits": ["cow"]}, r"'fits' is \['cow'\]; expected a list of ls, iw12, iw12-all, ia14"),
-        ({"fits": "ls"}, "'fits' is 'ls'"),
         ({"size": "paper", "fits": ["ls"]}, "'fits' needs the size 'compact'"),
         ({"interpolates": "no"}, "interpolates is 'no'; expected True or False"),
         ({"width": 0}, "network setting 'width' is 0; expected a whole number from 1 to 4096"),
-        ({"width": 1}, "network setting 'width' is 1; expected at least 2"),
-        ({"width": 64.0}, "'width' is 64.0"),
         ({"ne_blocks": True}, "'ne_blocks' is True"),
-        ({"head_width": "256"}, "'head_width' is '256'"),
         ({"li_blocks": 5000}, "'li_blocks' is 5000"),
         ({"set_width": 20}, "'set_width' is 20; expected a multiple of 16"),
-        ({"set_width": -16}, "'set_width' is -16; expected a whole number from 0"),
         ({"size": "paper", "set_width": 16}, "'set_width' needs the size 'compact'"),
         ({"map_size": 30}, "'map_size' is 30; expected 8 to 128 in fours"),
-        ({"map_size": 4}, "'map_size' is 4"),
+        ({"size": "paper", "error_head": True}, "'error_head' needs the size 'compact'"),
         ({"map_size": 4096}, "'map_size' is 4096"),
     ],
 )
 def test_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         NetworkConfig.from_dict(values)
-
-
-def test_only_the_compact_size_is_canonical() -> None:
-    assert NetworkConfig(size="compact").is_canonical
-    assert not NetworkConfig(size="paper").is_canonical

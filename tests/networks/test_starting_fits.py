@@ -54,14 +54,6 @@ def test_pixels_that_no_fit_can_tell_anything_of() -> None:
     assert not found[0].any()
 
 
-def test_an_untrained_network_gives_the_robust_lambertian_normal() -> None:
-    observations, directions = pixels(30, 10)
-    networks = [SplineNet(config) for config in (TINY, replace_fits(TINY))]
-    with torch.no_grad():
-        plain, weighing = (network(observations, directions).normals for network in networks)
-    torch.testing.assert_close(plain, weighing)
-
-
 def test_the_network_can_take_any_fit() -> None:
     network = SplineNet(replace_fits(TINY))
     observations, directions = pixels(30, 10)

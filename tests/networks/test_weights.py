@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -62,13 +61,6 @@ def test_round_trip(random_network: Make, tmp_path: Path, settings: dict[str, ob
             atol=5e-3,
             rtol=0,
         )
-
-
-def test_saving_loaded_weights_loses_nothing_more(saved: Path, tmp_path: Path) -> None:
-    loaded = load_weights(saved).network
-    save_weights(loaded, tmp_path / "again.safetensors")
-    again = load_weights(tmp_path / "again.safetensors").network
-    assert tensors_sha256(again.state_dict()) == tensors_sha256(loaded.state_dict())
 
 
 def test_every_tensor_and_no_other(random_network: Make, tmp_path: Path) -> None:
@@ -133,20 +125,6 @@ class TensorsMade(TorchFunctionMode):
         return result
 
 
-@pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
-def test_a_pipe_is_no_weight_file(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.safetensors")
-    with pytest.raises(ModelError, match="is not a file"):
-        load_weights(tmp_path / "pipe.safetensors")
-
-
-def test_a_weight_file_of_gigabytes(saved: Path) -> None:
-    with saved.open("ab") as file:
-        file.truncate(3 << 30)
-    with pytest.raises(ModelError, match="found 3221 MB, expected at most 500"):
-        load_weights(saved)
-
-
 def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
     whole = saved.read_bytes()
     for position in range(0, len(whole), 61):
@@ -157,17 +135,13 @@ def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
     load_weights(saved)
 
 
-def test_a_changed_weight_is_told_by_the_checksum(saved: Path) -> None:
+@pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64])
+def test_files_of_other_kinds(saved: Path, content: bytes) -> None:
     whole = saved.read_bytes()
-    saved.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    with pytest.raises(ModelError, match="damaged: the tensors do not match the checksum in the file"):
-        load_weights(saved)
-
-
-def test_a_file_cut_short(saved: Path) -> None:
-    saved.write_bytes(saved.read_bytes()[:-100])
-    with pytest.raises(ModelError, match="not a safetensors file, or cut short"):
-        load_weights(saved)
+    for other in (content, whole[:-100]):
+        saved.write_bytes(other)
+        with pytest.raises(ModelError, match="not a safetensors file"):
+            load_weights(saved)
 
 
 def test_somebody_else_s_safetensors(tmp_path: Path) -> None:
@@ -193,14 +167,6 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64])
-def test_files_of_other_kinds(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "weights.safetensors"
-    path.write_bytes(content)
-    with pytest.raises(ModelError, match="not a safetensors file"):
-        load_weights(path)
-
-
 def test_files_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no such file"):
         resolve_weights(str(tmp_path / "weights.safetensors"))
@@ -222,11 +188,6 @@ def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -
         resolve_weights("bad")
     with pytest.raises(ModelError, match=r"expected one of bad, good, or a \.safetensors file"):
         resolve_weights("better")
-
-
-def test_what_the_package_ships_is_whole() -> None:
-    for name in weights.shipped_names():
-        assert resolve_weights(name).name == name
 
 
 def test_weights_that_are_not_finite(tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
-"""Curves of plain points: every method is drawn, and axes accept what evaluations give them."""
+"""Plots: every method is drawn, curves leave out what was not computed, and anything may be a title."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from splinecli.pictures.curves import Panel, Point, error_curves
+from splinecli.pictures.light_sky import sky_plot
 from splinecli.pictures.plotting import method_styles
+from splinecli.pictures.training_curves import training_figure
 
 POINTS = (Point(4, 6.0, 0.5), Point(10, 4.0, 0.2), Point(96, 3.0, 0.0))
 TICKS = {4: "4", 10: "10", 96: "96\n(all)"}
@@ -27,10 +31,49 @@ def test_every_method_has_its_colour(logarithmic: bool) -> None:
         assert (np.abs(picture - rgb).max(axis=2) <= 2).mean() > 0.001
 
 
-def test_the_order_of_the_ticks_does_not_matter() -> None:
-    backwards = dict(reversed(TICKS.items()))
-    pictures = [
-        error_curves([Panel("ball", ticks, {("ls", ""): POINTS})], label="lights")
-        for ticks in (TICKS, backwards)
-    ]
-    assert pictures[0] == pictures[1]
+COLUMNS: dict[str, list[float | None]] = {
+    "step": [50, 100, 125],
+    "loss": [2.0, 1.0, 0.5],
+    "symmetric": [None, 0.5, None],
+    "asymmetric": [None, None, None],
+    "angle_deg": [20.0, 10.0, 8.0],
+    "validation_deg": [None, 12.5, 9.0],
+    "map_error": [0.2, 0.1, 0.08],
+    "masked_map_error": [0.1, 0.05, 0.04],
+}
+
+
+def lines(axes: Any) -> dict[str, list[list[float]]]:
+    return {line.get_label(): [list(map(float, values)) for values in line.get_data()] for line in axes.lines}
+
+
+def test_each_curve_leaves_out_what_was_not_computed() -> None:
+    loss, angle, maps = training_figure(COLUMNS).axes
+    steps = [50, 100, 125]
+    assert lines(loss) == {"weighted sum": [steps, [2.0, 1.0, 0.5]], "Ls, unweighted": [[100], [0.5]]}
+    assert lines(angle) == {"training": [steps, [20, 10, 8]], "validation": [[100, 125], [12.5, 9]]}
+    assert lines(maps) == {
+        "all cells": [steps, [0.2, 0.1, 0.08]],
+        "cells with a light": [steps, [0.1, 0.05, 0.04]],
+    }
+    assert {axes.get_xlabel() for axes in (loss, angle, maps)} == {"step"}
+    assert loss.get_title() == "loss"
+    assert loss.get_yscale() == "linear"
+
+
+def test_wide_curves_are_logarithmic_unless_a_value_is_zero() -> None:
+    assert training_figure(COLUMNS | {"loss": [50.0, 1.0, 0.5]}).axes[0].get_yscale() == "log"
+    assert training_figure(COLUMNS | {"loss": [50.0, 0.0, 0.5]}).axes[0].get_yscale() == "linear"
+
+
+def test_without_a_li_net_the_map_errors_are_hidden() -> None:
+    columns = COLUMNS | {"map_error": [None] * 3, "masked_map_error": [None] * 3}
+    assert [axes.get_visible() for axes in training_figure(columns).axes] == [True, True, False]
+
+
+LIGHTS = np.array([(0, 0, 1), (0.6, 0, 0.8)])
+
+
+@pytest.mark.parametrize("name", ["b\udcff", "a\nb\x1b[2J", r"$\frac$"])
+def test_a_name_that_is_not_printable_or_a_formula(name: str) -> None:
+    assert sky_plot(LIGHTS, name) != sky_plot(LIGHTS, "")

@@ -1,4 +1,4 @@
-"""Known values of maps have known colours, and PNG files keep every value."""
+"""Known values and errors have known colours; maps of every size are legible; PNG files keep every value."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.errors import OutputError
-from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture, preview_picture
+from splinecli.errors import OutputError, UsageError
+from splinecli.pictures.error_map import colour_errors, error_map_picture
+from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, preview_picture
 from splinecli.pictures.png import encode_png
 
 
@@ -21,14 +22,6 @@ def test_white_is_the_brightest_hundredth_of_the_mask():
     assert picture.dtype == np.uint8
     assert picture[10, 10].tolist() == [255, 188, 0]  # sRGB of 1, 1/2 and 0 (IEC 61966-2-1)
     assert (picture[1, 0] == 255).all()
-
-
-def test_a_black_albedo_is_black():
-    assert not albedo_picture(np.zeros((3, 3, 3), np.float32), np.ones((3, 3), bool)).any()
-
-
-def test_confidence_is_gray():
-    assert confidence_picture(np.array([[0, 0.6, 1]], np.float32)).tolist() == [[0, 153, 255]]
 
 
 def test_the_preview_is_brightest_where_the_surface_faces_the_light():
@@ -52,3 +45,60 @@ def test_a_picture_that_cannot_be_encoded(monkeypatch):
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.empty(0, np.uint8)))
     with pytest.raises(OutputError, match="cannot be encoded as PNG"):
         encode_png(np.zeros((2, 2), np.uint8))
+
+
+# The ends and the middle of viridis as its authors publish it (bids.github.io/colormap), times 255.
+VIOLET, TEAL, YELLOW = (68, 1, 84), (33, 145, 140), (253, 231, 37)
+WHITE = (255, 255, 255)
+
+
+def test_known_errors_have_known_colours() -> None:
+    errors = np.array([[0, 15, 30, 180, np.nan]], np.float32)
+    colours = colour_errors(errors, 30).astype(int)
+    wanted = np.array([[VIOLET, TEAL, YELLOW, YELLOW, WHITE]])
+    assert np.abs(colours - wanted).max() <= 2  # OpenCV's table is rounded in its own way
+    assert (colours[0, 4] == 255).all()
+
+
+def test_a_small_map_is_enlarged_pixel_by_pixel() -> None:
+    errors = np.full((60, 50), np.nan, np.float32)
+    errors[10:20, 30:40] = 30
+    picture = error_map_picture(errors)
+    assert picture.dtype == np.uint8
+    assert picture.shape[0] == 300
+    square = np.zeros((300, 250), bool)
+    square[50:100, 150:200] = True
+    np.testing.assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
+
+
+def test_a_large_map_keeps_its_pixels() -> None:
+    errors = np.random.default_rng(0).uniform(0, 60, (400, 300)).astype(np.float32)
+    picture = error_map_picture(errors, top_deg=45)
+    assert picture.shape[0] == 400
+    np.testing.assert_array_equal(picture[:, :300], colour_errors(errors, 45))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (10, 2000), (2000, 10), (256, 256)])
+@pytest.mark.parametrize("top_deg", [0.05, 7, 30, 180])
+def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int], top_deg: float) -> None:
+    picture = error_map_picture(np.full(shape, np.nan, np.float32), top_deg=top_deg)
+    assert picture.shape[0] == max(shape[0], 256)
+    coloured = np.ptp(picture.astype(int), axis=2) > 0  # the map is white and the text is gray
+    rows, columns = np.flatnonzero(coloured.any(axis=1)), np.flatnonzero(coloured.any(axis=0))
+    bar = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    assert len(bar) > 200
+    assert bar.shape[1] >= 18
+    np.testing.assert_array_equal(
+        bar[:, 0], colour_errors(np.linspace(top_deg, 0, len(bar))[:, None], top_deg)[:, 0]
+    )
+    # Text: black ink right of the bar, and none cut at the picture's edges.
+    right = picture[:, columns[-1] + 1 :]
+    assert (right < 64).all(axis=2).sum() > 200
+    assert (picture[[0, -1]] == 255).all()
+    assert (picture[:, -1] == 255).all()
+
+
+@pytest.mark.parametrize("top_deg", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_scale_needs_an_end(top_deg: float) -> None:
+    with pytest.raises(UsageError, match="expected more than 0"):
+        error_map_picture(np.zeros((3, 3), np.float32), top_deg=top_deg)

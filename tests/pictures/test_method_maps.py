@@ -81,14 +81,6 @@ def test_the_frame_is_not_turned() -> None:
     assert left[0][1] + left[0][3] == right[0][1]
 
 
-@pytest.mark.parametrize(("height", "width", "n_methods"), [(200, 3000, 9), (1600, 1600, 1), (6, 900, 30)])
-def test_large_maps_are_averaged_down(height: int, width: int, n_methods: int) -> None:
-    picture = draw(height, width, [str(i) for i in range(n_methods)])
-    # Below 4000, but for more methods than have room at the smallest legible size.
-    assert picture.shape[1] < 4000 or n_methods > 24
-    assert picture.shape[0] < 3000
-
-
 def test_nothing_is_cut_at_the_edges() -> None:
     long = "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2 degrees $x$"
     for methods in (["ls"], ["a method with a long name", "b"]):

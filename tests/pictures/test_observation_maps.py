@@ -65,9 +65,3 @@ def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dens
     assert boxes(unnamed, YELLOW)[0][1] < boxes(whole, YELLOW)[0][1]  # no title above
     assert without.shape[1] < unnamed.shape[1]
     assert not [box for box in boxes(without, VIOLET) if box[2] > 100]
-
-
-def test_the_circle_follows_the_grid() -> None:
-    even, authors = draw(1), draw(1, grid="cnn-ps")
-    assert even.shape == authors.shape
-    assert (even != authors).any()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from conftest import cap_directions, spiral_lights
+from scenes import cap_directions, spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.errors import UsageError
@@ -80,11 +80,6 @@ def test_large_captures_are_distilled_where_that_is_faster(
     found, warnings = distil_for(capture(AUTOMATIC_FROM), Teacher(seconds=0.02), None)
     assert (found is not None) == faster
     assert warnings == []
-
-
-def test_learning_takes_time() -> None:
-    small = distilled.seconds_of_learning(LIGHTS, PupilSize(100, 20, 8), "cpu")
-    assert 0 < small < distilled.seconds_of_learning(LIGHTS, PupilSize(100, 2_000_000, 8), "cpu")
 
 
 def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:

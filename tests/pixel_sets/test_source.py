@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from splinecli.observation_map import cell_directions
-from splinecli.pixel_sets import source
 from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
 from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
 from splinecli.pixel_sets.store import PixelSet
-from splinecli.synthesis.batches import CaptureConfig, PixelBatch
+from splinecli.synthesis.batches import CaptureConfig
 
 FAULTLESS = CaptureConfig(
     min_lights=5, max_lights=10, usual_lights=8, light_direction_error_share=0.0,
@@ -29,12 +28,6 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 def source_of(pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0) -> PixelSetSource:
     return PixelSetSource(pixel_set, pixel_set.entries, config, seeded(seed))
-
-
-def assert_same(one: PixelBatch, other: PixelBatch) -> None:
-    for name in ("observations", "light_directions", "valid", "exposure"):
-        assert torch.equal(getattr(one, name), getattr(other, name))
-    assert torch.equal(one.truth.normals, other.truth.normals)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
@@ -96,27 +89,6 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeS
     few = batch.valid.sum(dim=1) == 6
     normals = pixel_set.load(pixel_set.entries[0]).normals
     assert all((normals == normal).all(axis=1).any() for normal in batch.truth.normals[few].numpy())
-
-
-def test_lights_lie_within_a_random_angle_and_then_closest_to_it(make_set: MakeSet) -> None:
-    # Beyond the cone, no light that is left out is closer to the axis than one that is used.
-    pixel_set = make_set(entries=[("a", "one", 50, 200)])
-    config = replace(FAULTLESS, min_lights=10, max_lights=10, usual_lights=10)
-    batch = source_of(pixel_set, config).draw(600)
-    largest = batch.light_directions[..., 2].acos().rad2deg().amax(dim=1)
-    # Ten of all 200 lights nearly always reach beyond 50 degrees. Ten lights of a random cone often do not.
-    assert 0.15 < (largest < 50).float().mean() < 0.6
-    zeniths = np.sort(np.degrees(np.arccos(pixel_set.load(pixel_set.entries[0]).light_directions[:, 2])))
-    assert largest.min() >= zeniths[9] - 0.01  # ten lights reach at least as far as the ten innermost
-
-
-def test_pixels_with_fewer_lights_than_others_know_no_more_cells(make_set: MakeSet) -> None:
-    scene = source_of(make_set()).draw(300).truth
-    assert isinstance(scene, SampledPixels)
-    assert set(scene.known.sum(dim=1).tolist()) == {12, 25, 30}
-    dense = scene.dense_truth(32)
-    assert (dense.known.sum((1, 2, 3)) <= scene.known.sum(dim=1)).all()
-    assert (dense.filled >= dense.known).all()
 
 
 def analytic_scene(pixels: int = 6) -> tuple[SampledPixels, torch.Tensor]:
@@ -189,17 +161,6 @@ def test_linear_maps_are_filled_about_right_and_known_cells_stay() -> None:
     assert error.sum() / disc.sum() < 0.3 * 0.3 / 16
 
 
-def test_a_single_gap_of_a_linear_map_is_filled_exactly() -> None:
-    rows, columns = torch.meshgrid(torch.arange(32.0), torch.arange(32.0), indexing="ij")
-    linear = (0.01 * rows + 0.02 * columns)[None, None]
-    known = torch.ones(1, 1, 32, 32)
-    known[0, 0, 10, 20] = 0
-    # The value of a cell that is not known plays no part.
-    given = torch.where(known > 0, linear, torch.tensor(77.0))
-    dense = fill_gaps(given, known, torch.ones(32, 32))
-    assert dense.values[0, 0, 10, 20].item() == pytest.approx(0.1 + 0.4, rel=1e-5)
-
-
 def test_gaps_are_filled_between_lights_and_not_beside_them() -> None:
     _, inside = cell_directions()
     known, values = torch.zeros(1, 1, 32, 32), torch.zeros(1, 1, 32, 32)
@@ -222,28 +183,3 @@ def test_nothing_is_filled_outside_the_disc_or_far_from_a_light() -> None:
     middle = slice(8 + FILL_ROUNDS, 24 - FILL_ROUNDS)
     assert not dense.filled[0, 0, middle, middle].any()
     np.testing.assert_allclose(dense.values[dense.filled > 0], 0.5, rtol=1e-6)
-
-
-def test_no_light_and_no_map() -> None:
-    dense = fill_gaps(torch.zeros(2, 1, 16, 16), torch.zeros(2, 1, 16, 16), cell_directions(16)[1])
-    assert not dense.values.any()
-    assert not dense.filled.any()
-
-
-def test_arrays_are_let_go_without_changing_what_is_drawn(
-    make_set: MakeSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pixel_set = make_set()
-    kept = source_of(pixel_set)
-    expected = [kept.draw(50) for _ in range(6)]
-    assert set(kept._observations) == {0, 1, 2}
-    assert kept._bytes_read > 300 * 65_536
-    # The limit is reached after 60 pixels, each with the read-ahead around its row.
-    monkeypatch.setattr(source, "_MAPPED_BYTES", 60 * 65_536)
-    freed = source_of(pixel_set)
-    open_after = []
-    for wanted in expected:
-        assert_same(freed.draw(50), wanted)
-        open_after.append(len(freed._observations))
-    assert open_after == [3, 0, 3, 0, 3, 0]
-    assert freed._bytes_read == 0

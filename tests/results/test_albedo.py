@@ -11,8 +11,7 @@ import pytest
 
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.gray import measure_light_intensities
-from splinecli.capture import Capture, open_capture
-from splinecli.errors import InputError
+from splinecli.capture import open_capture
 from splinecli.results.albedo import albedo_map
 
 SIZE = 40
@@ -83,46 +82,6 @@ def test_restored_pixels_do_not_spoil_it(scene):
     assert np.quantile(found, 0.99) < 1.5
 
 
-def test_the_capture_names_its_restored_observations(scene):
-    """Their colours have next to no weight, even if they differ from the restored values by 0.5 % only."""
-    folder, normals, albedo = scene
-    source = open_capture(folder)
-    capture = source.read()
-    first = folder / "0.png"
-    picture = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(first), np.rint(picture * 0.995).astype(np.uint16))
-    restored = np.zeros(capture.observations.shape, bool)
-    restored[:, 0] = True
-    inside = normals.any(axis=2)
-
-    def error(capture: Capture) -> float:
-        found = albedo_map(source, capture, normals)
-        return float(np.median(np.abs(found / np.where(albedo > 0, albedo, 1) - 1)[inside]))
-
-    assert error(replace(capture, restored=restored)) < 1e-4
-    assert error(capture) > 5e-4
-
-
-def test_the_record_says_what_is_restored(scene):
-    """Colours of restored observations do not count, however close the observations are to them."""
-    folder, normals, albedo = scene
-    picture = cv2.imread(str(folder / "0.png"), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(folder / "0.png"), (picture * 0.8).astype(np.uint16))
-    source = open_capture(folder)
-    capture = source.read(as_stored=True)
-    restored = np.zeros(capture.observations.shape, bool)
-    restored[:, 0] = True
-    inside = normals.any(axis=2)
-    ratio = {
-        flags is not None: np.median(
-            albedo_map(source, replace(capture, restored=flags), normals)[inside] / albedo[inside]
-        )
-        for flags in (None, restored)
-    }
-    assert ratio[True] == pytest.approx(1, abs=0.01)
-    assert ratio[False] < 0.98
-
-
 def test_colours_are_divided_by_estimated_intensities(scene):
     folder, normals, _ = scene
     source = open_capture(folder)
@@ -154,26 +113,9 @@ def test_albedo_in_colour(scene):
     assert np.quantile(np.abs(plain / albedo[inside].mean(axis=1) - 1), 0.9) > 0.2
 
 
-def test_some_of_the_lights(scene):
-    folder, normals, albedo = scene
-    source = open_capture(folder)
-    found = albedo_map(source, source.read([5, 0, 2]), normals)
-    inside = normals[..., 2] > 0.8
-    assert np.median(np.abs(found - albedo)[inside] / albedo[inside]) < 1e-3
-
-
 def test_pixels_that_no_light_reaches_are_black(scene):
     folder, normals, _ = scene
     turned = normals * (1, 1, -1)
     source = open_capture(folder)
     found = albedo_map(source, source.read(), turned.astype(np.float32))
     assert not found[normals[..., 2] > 0.95].any()
-
-
-def test_an_image_that_went_away(scene):
-    folder, normals, _ = scene
-    source = open_capture(folder)
-    capture = source.read()
-    (folder / "3.png").unlink()
-    with pytest.raises(InputError, match=r"3\.png: the file does not exist"):
-        albedo_map(source, capture, normals)

@@ -249,31 +249,6 @@ def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -
         assert np.sign(SIDE / 2 - rows.mean()) == np.sign(y)
 
 
-def test_an_enlarged_view_interpolates_normals(open_page: OpenPage) -> None:
-    """The view interpolates normals, not the two bytes that store them, which would be off by up to 25 levels."""
-    html = result_page(REPORT, *sphere(SIDE // 4))
-    [seen] = views(open_page, html, ["light=-0.7,0.5&specular=0"])
-    normals, _ = sphere()
-    expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
-    # Away from the outline and the terminator, whose bends four pixels cannot follow.
-    smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
-    assert np.abs(seen - expected[..., None])[smooth].max() <= 3
-
-
-def test_the_script_decodes_what_the_page_encodes(
-    open_page: OpenPage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The number of stored bits is written once, in page.py: other numbers work as well."""
-    normals, mask = sphere()
-    expected = encode_srgb(np.maximum(normals @ light_at(-0.7, 0.5), 0)).astype(int)
-    for webgl in (True, False):
-        monkeypatch.setattr(page_module, "LOW_BITS", 3)
-        html = result_page(REPORT, normals, mask)
-        [seen] = views(open_page, html, ["light=-0.7,0.5&specular=0"], webgl=webgl)
-        bright = expected > 100  # 11 bits are too few for the steep part of sRGB's curve
-        assert np.abs(seen - expected[..., None])[bright].max() <= 2
-
-
 def test_a_glossy_sphere_of_two_colours(open_page: OpenPage) -> None:
     """The view shows Blinn and Phong's normalised lobe, and the albedo as its picture stores it."""
     normals, mask = sphere()
@@ -341,16 +316,6 @@ def test_zoom_shows_a_part_of_the_same_picture(open_page: OpenPage, webgl: bool)
     smooth = (normals[..., 2] > 0.5) & (normals @ light_at(-0.7, 0.5) > 0.05)
     # Without WebGL, the nearest pixel of the map is shown: at most 1/4 of a pixel away, where shading has this slope.
     assert np.abs(seen - expected[..., None])[smooth].max() <= (3 if webgl else 6)
-
-
-def test_a_reduced_view_is_a_reduced_picture(open_page: OpenPage) -> None:
-    """Where the map is larger than the view, its shaded pixels are averaged, not its normals."""
-    random = np.random.default_rng(0)
-    normals = unit(random.normal(size=(4 * SIDE, 4 * SIDE, 3)) * (1, 1, 0.2) + (0, 0, 1)).astype(np.float32)
-    html = result_page(REPORT, normals, np.ones(normals.shape[:2], bool))
-    [seen] = views(open_page, html, ["light=0.5,0.5&specular=0"])
-    shaded = np.maximum(normals @ light_at(0.5, 0.5), 0).reshape(SIDE, 4, SIDE, 4).mean((1, 3))
-    assert np.abs(seen - encode_srgb(shaded)[..., None]).max() <= 2
 
 
 def wait_until(page: Any, condition: str) -> None:

@@ -11,7 +11,7 @@ from splinecli.capture import Capture
 from splinecli.capture.capture_warnings import EIGHT_BIT, CaptureWarning
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
-from splinecli.results.report import SCHEMA, peak_memory_mib, report_of
+from splinecli.results.report import SCHEMA, report_of
 
 
 @pytest.mark.parametrize(("as_stored", "reading"), [(True, "as stored"), (False, "restored")])
@@ -31,8 +31,3 @@ def test_a_report(matte_pixels, as_stored, reading):
     assert report["seconds"]["read"] == 0.123
     assert report["light_file"] == str(Path.cwd() / "lights.txt")
     assert report["angular_error_deg"] is None
-
-
-def test_the_memory_is_measured_in_mib():
-    peak = peak_memory_mib()
-    assert peak is None or 20 < peak < 200_000

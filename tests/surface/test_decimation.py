@@ -9,10 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from glb_file import read_glb
-from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
 from splinecli.surface import decimation
-from splinecli.surface.camera import pixel_rays
 from splinecli.surface.decimation import decimate, mesh_to_decimate
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 from splinecli.surface.mesh_files import encode_glb
@@ -141,32 +139,3 @@ def test_blocks_of_a_large_map_have_its_shape(
         middle = (SIDE - 1 + odd) / 2
         np.testing.assert_allclose(mesh.vertices[:, 0], columns - 44.5, atol=1e-3)
         np.testing.assert_allclose(mesh.vertices[:, 1], middle - rows, atol=1e-3)
-
-
-def test_a_mesh_that_is_small_enough_stays(camera: NDArray[np.float64] | None) -> None:
-    mesh, normal_map = dome(camera)
-    assert decimate(mesh, len(mesh.triangles), normal_map, camera) is mesh
-
-
-def test_rays_of_a_row_lie_in_the_plane_of_its_tangents() -> None:
-    """The tangents of a plane that faces a perspective camera point along its rows."""
-    mask = np.ones((20, 20), bool)
-    normal_map = np.zeros((20, 20, 3))
-    normal_map[..., 2] = 1
-    depth = np.full((20, 20), 2.0)
-    flat = decimate(surface_mesh(depth, mask, CAMERA, normal_map=normal_map), 100, normal_map, CAMERA)
-    assert flat.tangents is not None
-    np.testing.assert_allclose(flat.tangents, np.tile((1, 0, 0), (len(flat.vertices), 1)), atol=1e-6)
-    assert flat.normal_texture is not None
-    assert (flat.normal_texture == (128, 128, 255)).all()
-    assert np.abs(pixel_rays(mask, CAMERA)[:, 2] + 1).max() == 0
-
-
-def test_nothing_left() -> None:
-    mask = np.ones((3, 3), bool)
-    normal_map = np.tile((0.0, 0.0, 1.0), (3, 3, 1))
-    mesh = surface_mesh(np.zeros((3, 3)), mask, normal_map=normal_map)
-    try:
-        assert 0 < len(decimate(mesh, 1, normal_map).triangles) < 8
-    except InputError as error:
-        assert "no mesh of 1 triangles is left" in str(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -83,22 +84,12 @@ def test_sphere(reach: float, limit: float, stiffness: float) -> None:
     assert found[mask].mean() == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("slope", [0.3, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("slope", [0.3, 10.0])
 def test_tent(slope: float) -> None:
     x, _ = grid(60, 90)
     found = integrate_normals(normals_of_slopes(-slope * np.sign(x), 0 * x), np.ones(x.shape, bool))
     # The ridge lies between two pixels, whose equations are off by the same in both directions.
     assert error_share(found, -slope * np.abs(x), np.ones(x.shape, bool)) < 1e-6
-
-
-@pytest.mark.usefixtures("any_scale")
-def test_tent_of_unequal_sides() -> None:
-    # The pixels at the ridge disagree on the gap between them, truly (0.8 - 0.3) / 2: one gap of 90.
-    x, _ = grid(60, 90)
-    slope = np.where(x < 0, 0.3, -0.8)
-    mask = np.ones(x.shape, bool)
-    found = integrate_normals(normals_of_slopes(slope, 0 * x), mask)
-    assert error_share(found, slope * x, mask) < 1e-3
 
 
 def levels(rows: int, columns: int, height: float, slope: float, joined: int) -> tuple[Floats, Floats, Mask]:
@@ -131,8 +122,8 @@ def test_levels_apart(joined: int) -> None:
     assert np.isfinite(torn).all()
 
 
-@pytest.mark.parametrize("slopes", [(0.5, -0.25), (-3.0, 1.0), (0.0, 0.0), (12.0, 8.0)])
-@pytest.mark.parametrize("shape", [(30, 50), (50, 30), (1, 40), (40, 1), (2, 2)])
+@pytest.mark.parametrize("slopes", [(-3.0, 1.0), (12.0, 8.0)])
+@pytest.mark.parametrize("shape", [(30, 50), (1, 40), (2, 2)])
 def test_plane_is_exact(shape: tuple[int, int], slopes: tuple[float, float]) -> None:
     x, y = grid(*shape)
     mask = np.ones(shape, bool)
@@ -268,18 +259,6 @@ def test_coarse_to_fine_tears_at_the_same_places_with_fewer_solves(
     assert solves[1] < solves[0] / 3
 
 
-def test_parts_are_independent() -> None:
-    normals, mask = bumps(20, 31, 2), np.ones((20, 31), bool)
-    mask[:, 15] = False
-    left, right = mask.copy(), mask.copy()
-    left[:, 16:], right[:, :15] = False, False
-    together = integrate_normals(normals, mask, **TIGHT)
-    apart = integrate_normals(normals, left, **TIGHT), integrate_normals(normals, right, **TIGHT)
-    np.testing.assert_allclose(together[left], apart[0][left], atol=5e-3)
-    np.testing.assert_allclose(together[right], apart[1][right], atol=5e-3)
-    assert together[left].mean() == pytest.approx(0, abs=1e-9)
-
-
 @pytest.mark.usefixtures("any_scale")
 @pytest.mark.parametrize("camera", [None, CAMERA])
 def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) -> None:
@@ -309,7 +288,7 @@ def turned(array: Any, quarters: int) -> Any:
     return np.ascontiguousarray(np.rot90(array, quarters))
 
 
-@pytest.mark.parametrize("quarters", [1, 2, 3])
+@pytest.mark.parametrize("quarters", [1, 2])
 def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
     normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
     x, y, z = np.moveaxis(normals, -1, 0)
@@ -319,13 +298,6 @@ def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
     found = integrate_normals(normals, mask, **TIGHT)
     again = integrate_normals(turned(turn, quarters), turned(mask, quarters), **TIGHT)
     np.testing.assert_allclose(again, turned(found, quarters), atol=5e-3)
-
-
-def test_mirror() -> None:
-    normals, mask = bumps(18, 25, 6), holes(18, 25, 7)
-    found = integrate_normals(normals, mask, **TIGHT)
-    mirrored = integrate_normals(normals[:, ::-1] * (-1, 1, 1), mask[:, ::-1], **TIGHT)
-    np.testing.assert_allclose(mirrored, found[:, ::-1], atol=5e-3)
 
 
 def test_inputs_do_not_change_and_progress_is_reported() -> None:
@@ -344,34 +316,6 @@ def test_without_a_mask_all_normals_count(background: float) -> None:
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize(
-    ("normals", "error", "message"),
-    [
-        (np.zeros((3, 4, 3)), InputError, "the normal map has no normal"),
-        (np.zeros((3, 4)), UsageError, r"the normal map has shape \(3, 4\), expected \(H, W, 3\)"),
-    ],
-)
-def test_without_a_mask_and_without_normals(
-    normals: Floats, error: type[SplinecliError], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        integrate_normals(normals)
-
-
-def test_the_camera_matrix_may_be_the_third_argument() -> None:
-    normals, mask, _ = sphere(40, 50, 30, 0.9)
-    np.testing.assert_array_equal(
-        integrate_normals(normals, mask, CAMERA), integrate_normals(normals, mask, camera_matrix=CAMERA)
-    )
-
-
-def test_normals_of_nearly_unit_length_are_accepted() -> None:
-    normals, mask, _ = sphere(40, 50, 30, 0.9)
-    np.testing.assert_allclose(
-        integrate_normals(normals * 1.009, mask), integrate_normals(normals, mask), atol=1e-9
-    )
-
-
 NORMALS = np.tile((0.0, 0.0, 1.0), (3, 4, 1))
 MASK = np.ones((3, 4), bool)
 ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, None] == 2))
@@ -380,84 +324,31 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "message"),
     [
-        (
-            (NORMALS[..., :2], MASK),
-            {},
-            UsageError,
-            "the normal map has shape (3, 4, 2), expected (3, 4, 3) for this mask.",
-        ),
-        (
-            (NORMALS, MASK.T),
-            {},
-            UsageError,
-            "the normal map has shape (3, 4, 3), expected (4, 3, 3) for this mask.",
-        ),
-        ((NORMALS, MASK.astype(np.uint8)), {}, UsageError, "the mask is uint8 (3, 4), expected bool (H, W)."),
-        ((NORMALS, ~MASK), {}, InputError, "the mask is empty. Mark the pixels of the object in it."),
+        ((NORMALS[..., 0],), {}, UsageError, "(3, 4), expected (H, W, 3)"),
+        ((NORMALS * 0,), {}, InputError, "the normal map has no normal"),
+        ((NORMALS[..., :2], MASK), {}, UsageError, "(3, 4, 2), expected (3, 4, 3) for this mask"),
+        ((NORMALS, MASK.T), {}, UsageError, "(3, 4, 3), expected (4, 3, 3) for this mask"),
+        ((NORMALS, MASK.astype(np.uint8)), {}, UsageError, "the mask is uint8 (3, 4), expected bool (H, W)"),
+        ((NORMALS, ~MASK), {}, InputError, "the mask is empty"),
         (
             (ZERO_AT_1_2, MASK),
             {},
             InputError,
-            "1 of 12 normals in the mask are not unit vectors, the first in row 1, column 2. Leave pixels without a "
-            "normal out of the mask.",
+            "1 of 12 normals in the mask are not unit vectors, the first in row 1",
         ),
-        (
-            (NORMALS * np.nan, MASK),
-            {},
-            InputError,
-            "12 of 12 normals in the mask are not unit vectors, the first in row 0, column 0. Leave pixels without a "
-            "normal out of the mask.",
-        ),
-        (
-            (NORMALS, MASK),
-            {"camera_matrix": np.eye(4)},
-            UsageError,
-            "the camera matrix has shape (4, 4), expected (3, 3).",
-        ),
-        (
-            (NORMALS, MASK),
-            {"camera_matrix": np.diag([9.0, 0, 1])},
-            InputError,
-            "[[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]] is not a camera matrix [[fx, s, cx], [0, fy, cy], "
-            "[0, 0, 1]] with positive fx and fy, and numbers of at most a million. Give it in pixels, with columns to "
-            "the right and rows down.",
-        ),
-        (
-            (NORMALS, MASK),
-            {"camera_matrix": np.array([[500, 1e308, 9], [0, 500, 8], [0, 0, 1]])},
-            InputError,
-            "[[500.0, 1e+308, 9.0], [0.0, 500.0, 8.0], [0.0, 0.0, 1.0]] is not a camera matrix [[fx, s, cx], [0, fy, "
-            "cy], [0, 0, 1]] with positive fx and fy, and numbers of at most a million. Give it in pixels, with "
-            "columns to the right and rows down.",
-        ),
-        (
-            (NORMALS, MASK),
-            {"stiffness": -1},
-            UsageError,
-            "the stiffness is -1, expected a number of at least 0.",
-        ),
-        ((NORMALS, MASK), {"max_iterations": 0}, UsageError, "max_iterations is 0, expected at least 1."),
-        (
-            (NORMALS, MASK),
-            {"tolerance": np.nan},
-            UsageError,
-            "the tolerance is nan, expected a number of at least 0.",
-        ),
+        ((NORMALS * np.nan, MASK), {}, InputError, "12 of 12 normals in the mask are not unit vectors"),
+        ((NORMALS, MASK, np.eye(4)), {}, UsageError, "the camera matrix has shape (4, 4), expected (3, 3)"),
+        ((NORMALS, MASK, np.diag([9.0, 0, 1])), {}, InputError, "is not a camera matrix"),
+        ((NORMALS, MASK, CAMERA + 1e308), {}, InputError, "is not a camera matrix"),
+        ((NORMALS, MASK, CAMERA * (1, -1, 1)), {}, InputError, "is not a camera matrix"),
+        ((NORMALS, MASK, CAMERA.T), {}, InputError, "is not a camera matrix"),
+        ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected"),
+        ((NORMALS, MASK), {"max_iterations": 0}, UsageError, "max_iterations is 0, expected"),
+        ((NORMALS, MASK), {"tolerance": np.nan}, UsageError, "the tolerance is nan, expected"),
     ],
 )
 def test_bad_input(
-    arguments: tuple[Any, Any], options: dict[str, Any], error: type[SplinecliError], message: str
+    arguments: tuple[Any, ...], options: dict[str, Any], error: type[SplinecliError], message: str
 ) -> None:
-    with pytest.raises(error) as caught:
+    with pytest.raises(error, match=re.escape(message)):
         integrate_normals(*arguments, **options)
-    assert str(caught.value) == message
-
-
-@pytest.mark.parametrize(
-    "matrix",
-    [CAMERA * np.nan, CAMERA * (1, -1, 1), CAMERA.T, CAMERA * 2, np.ones((3, 3))],
-    ids=["nan", "upwards", "transposed", "doubled", "ones"],
-)
-def test_no_camera_matrix(matrix: Floats) -> None:
-    with pytest.raises(InputError, match="is not a camera matrix"):
-        integrate_normals(NORMALS, MASK, camera_matrix=matrix)

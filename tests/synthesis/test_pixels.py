@@ -10,12 +10,11 @@ import pytest
 import torch
 from scipy import stats
 
-from splinecli.observation_map import cell_directions, sparse_map
+from splinecli.observation_map import cell_directions
 from splinecli.synthesis.pixels import (
     PixelBatch,
     PixelGenerator,
     PixelGeneratorConfig,
-    draw_neighbour_normals,
     draw_scene,
     draw_visible_normals,
 )
@@ -59,12 +58,6 @@ def test_a_seed_says_everything() -> None:
     assert not torch.equal(one.truth.normals, third.truth.normals)
 
 
-def test_the_global_generator_is_left_alone() -> None:
-    state = torch.get_rng_state()
-    draw(50)
-    assert torch.equal(torch.get_rng_state(), state)
-
-
 def test_matte_pixels_obey_lambert_s_law() -> None:
     batch = draw(500, NOTHING)
     scene = replace(
@@ -93,14 +86,10 @@ def test_matte_pixels_obey_lambert_s_law() -> None:
 
 
 @pytest.mark.parametrize("config", [PixelGeneratorConfig(), replace(PixelGeneratorConfig(), mixed_share=1.0)])
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_scene_turned_by_90_degrees_turns_its_map(config: PixelGeneratorConfig, quarters: int) -> None:
+def test_a_scene_turned_by_90_degrees_turns_its_map(config: PixelGeneratorConfig) -> None:
     scene = draw_scene(300, config, torch.Generator().manual_seed(0))
-    cosine, sine = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters]
-    turned = scene.rotate(torch.full((300,), cosine), torch.full((300,), sine))
-    torch.testing.assert_close(
-        turned.dense_map(), scene.dense_map().rot90(quarters, (2, 3)), rtol=2e-3, atol=1e-4
-    )
+    turned = scene.rotate(torch.zeros(300), torch.ones(300))
+    torch.testing.assert_close(turned.dense_map(), scene.dense_map().rot90(1, (2, 3)), rtol=2e-3, atol=1e-4)
 
 
 def test_each_pixel_is_turned_by_its_own_angle() -> None:
@@ -114,14 +103,6 @@ def test_each_pixel_is_turned_by_its_own_angle() -> None:
     x, y, z = lights.unbind(-1)
     turned_lights = torch.stack((c * x - s * y, s * x + c * y, z), dim=-1)
     torch.testing.assert_close(turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4)
-
-
-def test_shared_and_own_lights_give_the_same_radiance() -> None:
-    scene = draw_scene(60, PixelGeneratorConfig(), torch.Generator().manual_seed(0))
-    lights = cell_directions()[0][cell_directions()[1]]
-    torch.testing.assert_close(
-        scene.radiance(lights), scene.radiance(lights.expand(60, -1, 3)), rtol=1e-3, atol=1e-5
-    )
 
 
 def test_dense_map_has_no_holes_in_the_disc_and_nothing_outside() -> None:
@@ -145,17 +126,6 @@ def test_without_a_camera_s_faults_observations_are_exposed_radiance() -> None:
     torch.testing.assert_close(batch.observations, expected, rtol=5e-3, atol=1e-5)
 
 
-def test_sparse_and_dense_map_agree_where_a_light_is_in_its_cell_s_centre() -> None:
-    batch = draw(100, PLAIN)
-    directions, inside = cell_directions()
-    lights = directions[inside][5::23]
-    observed = batch.truth.radiance(lights) * batch.exposure
-    sparse = sparse_map(observed, lights)
-    dense = batch.truth.dense_map() * batch.exposure[..., None, None]
-    assert sparse.occupied[0].sum() == len(lights)
-    torch.testing.assert_close(sparse.values, dense * sparse.occupied, rtol=1e-3, atol=1e-6)
-
-
 @pytest.mark.parametrize("share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"])
 def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> None:
     def dense(config: PixelGeneratorConfig) -> torch.Tensor:
@@ -171,11 +141,6 @@ def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> N
         assert not off.ambient.any()
     else:
         assert len(off.walls) == 1
-
-
-def test_no_walls_without_shadows_and_interreflections() -> None:
-    config = replace(PixelGeneratorConfig(), cast_shadows=False, interreflections=False)
-    assert draw_scene(50, config, torch.Generator().manual_seed(0)).walls == ()
 
 
 def test_mixed_pixels_lie_between_their_surfaces() -> None:
@@ -209,13 +174,3 @@ def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
     assert stats.kstest(squared, stats.uniform(0, 0.997**2).cdf).pvalue > 1e-3
     azimuth = torch.atan2(normals[:, 1], normals[:, 0]).numpy()
     assert stats.kstest(azimuth, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
-
-
-def test_neighbours_face_the_camera_too() -> None:
-    normals = draw_visible_normals(5000, torch.Generator().manual_seed(0))
-    moved = draw_neighbour_normals(normals, torch.Generator().manual_seed(1))
-    assert moved.norm(dim=1).sub(1).abs().max() < 1e-6
-    assert (moved[:, 2] > 0).all()
-    cosine = (normals * moved).sum(dim=1)
-    # Moved by 0.5 in each of two tangential directions: a median of some 30 degrees.
-    assert 0.8 < cosine.median() < 0.95

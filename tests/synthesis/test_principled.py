@@ -109,20 +109,14 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
     [
         material(roughness=0.0),
         material(roughness=1.0, base=0.9),
-        material(specular=0.5, roughness=0.3),
         material(specular=4.0, roughness=0.15),
-        material(metallic=1.0, base=0.8, roughness=0.4),
         material(metallic=0.3, specular=1.0, roughness=0.7),
-        material(interface_loss=0.4, roughness=0.9),
         material(interface_loss=1.0, specular=0.5),
-        material(minnaert=0.8, specular=0.2),
         material(minnaert=1.4, sheen=0.3),
-        material(specular=1.0, roughness=0.4, tail_exponent=1.1),
         material(metallic=1.0, roughness=0.3, tail_exponent=1.6, clearcoat=4.0, clearcoat_gloss=0.5),
         material(metallic=1.0, roughness=0.6, second_share=0.3, second_roughness=0.2),
         material(specular=2.0, tail_exponent=1.5, second_share=0.7, second_roughness=0.8),
         material(retro=0.5),
-        material(sheen=1.0),
         material(clearcoat=1.0, clearcoat_gloss=0.0),
         material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
     ],
@@ -133,40 +127,6 @@ def test_agrees_with_the_published_equations(surface: PrincipledMaterial) -> Non
         expected = burley(surface, normal, lights)
         assert expected.any()
         np.testing.assert_allclose(radiance(surface, normal, lights), expected, rtol=1e-5, atol=1e-12)
-
-
-def test_a_matte_surface_that_faces_light_and_camera_shows_its_base() -> None:
-    up = np.array([0.0, 0.0, 1.0])
-    # Specular 0 leaves no reflection at normal incidence.
-    for base, roughness in ((0.2, 0.3), (1.0, 1.0)):
-        assert radiance(material(base=base, roughness=roughness), up, up[None])[0] == pytest.approx(base)
-
-
-def test_the_interface_takes_grazing_light_of_a_matte_surface() -> None:
-    # A light and a view at 60 degrees to the normal: cos = 1/2 each, and Schlick's weight is 2^-5.
-    normal = np.array([np.sqrt(0.75), 0.0, 0.5])
-    light = 0.5 * normal + np.array([0.0, np.sqrt(0.75), 0.0])
-    seen = radiance(material(base=0.8, interface_loss=1.0), normal, light[None])
-    # The lobe of no reflectance at normal incidence adds a ten-thousandth here.
-    assert seen[0] == pytest.approx(0.8 * (1 - 2.0**-5) ** 2 * 0.5, rel=2e-4)
-
-
-def test_attached_shadow_is_black() -> None:
-    lights, normal = hemisphere(500), np.array([0.8, 0.0, 0.6])
-    shiny = material(specular=1.0, clearcoat=1.0, sheen=1.0, metallic=0.5)
-    shaded = lights @ normal <= 0
-    assert shaded.any()
-    seen = radiance(shiny, normal, lights)
-    assert not seen[shaded].any()
-    assert (seen[~shaded] > 0).all()
-
-
-def test_mirror_images_in_the_plane_of_normal_and_view_look_the_same() -> None:
-    lights, normal = hemisphere(200), np.array([0.6, 0.0, 0.8])
-    surface = material(specular=1.0, metallic=0.4, clearcoat=0.5, roughness=0.2)
-    np.testing.assert_allclose(
-        radiance(surface, normal, lights), radiance(surface, normal, lights * (1, -1, 1)), rtol=1e-9
-    )
 
 
 def hemispherical_reflectance(
@@ -252,22 +212,6 @@ def test_drawn_materials_have_the_stated_classes() -> None:
         0.5 * np.log10(0.05 / 10**-1.7) / 1.7, abs=0.01
     )
     assert values["base"][metal].min() >= 0.05
-    ranges = {
-        "base": (0.02, 1),
-        "specular": (0, 4),
-        "sheen": (0, 1),
-        "clearcoat": (0, 4),
-        "clearcoat_gloss": (0, 1),
-        "interface_loss": (0, 1),
-        "minnaert": (0.85, 1.5),
-        "tail_exponent": (1.1, 2),
-        "second_share": (0, 0.7),
-        "second_roughness": (0.1, 0.8),
-        "retro": (0, 1),
-    }
-    for name, (low, high) in ranges.items():
-        assert low - 1e-3 <= values[name].min() <= low + 0.01, name
-        assert high - 0.01 <= values[name].max() <= high, name
     rough = values["roughness"]
     assert 0.1 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9
     assert rough[~(metal | blend)].min() == pytest.approx(0.05, abs=0.01)
@@ -279,10 +223,3 @@ def test_light_from_behind_what_is_seen_is_finite() -> None:
     view = torch.full((50, 1), 0.5)
     for l_dot_v in (-1.0, -1.0000001):
         assert torch.isfinite(surface.shade(-view, view, torch.full((50, 1), l_dot_v))).all()
-
-
-def test_take_keeps_parameters_together() -> None:
-    drawn = draw_material(10, torch.Generator().manual_seed(0))
-    some = drawn.take(torch.tensor([7, 2]))
-    assert torch.equal(some.base, drawn.base[[7, 2]])
-    assert torch.equal(some.clearcoat_gloss, drawn.clearcoat_gloss[[7, 2]])

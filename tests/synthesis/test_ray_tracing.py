@@ -70,8 +70,3 @@ def test_a_convex_body_shades_what_faces_away_and_nothing_else() -> None:
     np.testing.assert_array_equal(lit[clear], (cosines > 0)[clear])
     # Where it is not asked, the answer is no.
     assert not tracer.lit(hits.lifted(), ~everything, lights).any()
-
-
-def test_no_rays_are_no_hits() -> None:
-    rays, hits = Tracer(ball()).first_hits(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
-    assert len(rays) == len(hits.position) == 0

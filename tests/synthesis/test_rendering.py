@@ -13,9 +13,8 @@ pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import Tracer
-from splinecli.synthesis.rendering import SOFTEST, render_direct, render_indirect, soften
+from splinecli.synthesis.rendering import render_direct, render_indirect
 
 
 @dataclass(frozen=True)
@@ -142,37 +141,6 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
         assert indirect[part].mean() == pytest.approx(expected, rel=0.05)
 
 
-def test_slanting_light_in_a_bowl_is_conserved() -> None:
-    # The flux through the mouth is pi R^2 cos(angle) whatever part of the wall it meets.
-    radius, rho = 0.9, 0.6
-    tracer = Tracer(ball(radius, polar=90, inward=True))
-    visible = find_visible_surface(tracer, 24, 3)
-    lights = directions((0.6, 0, 0.8))
-    parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
-    indirect = render_indirect(*parts, directions=256, bounces=1, generator=torch.Generator().manual_seed(1))[
-        "matte"
-    ].numpy()
-    assert indirect.mean() == pytest.approx(rho * rho / 4 * 0.8, rel=0.02)
-
-
-def test_several_materials_share_one_tracing() -> None:
-    tracer = Tracer(ball(0.9, polar=90, inward=True))
-    visible = find_visible_surface(tracer, 12, 2)
-    lights = directions((0, 0, 1), (0.5, 0, 1))
-    patches = np.zeros(len(tracer.mesh.faces), np.int64)
-    together = {"half": Matte(torch.full((1, 1), 0.5)), "full": Matte(torch.full((1, 1), 1.0))}
-
-    def indirect(materials: dict[str, Matte]) -> dict[str, Tensor]:
-        generator = torch.Generator().manual_seed(2)
-        return render_indirect(
-            tracer, visible, lights, materials, patches, directions=32, bounces=1, generator=generator
-        )
-
-    both = indirect(together)
-    torch.testing.assert_close(both["full"], 4 * both["half"], rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(both["full"], indirect({"full": together["full"]})["full"])
-
-
 def test_patches_have_their_own_material() -> None:
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 20, 2)
@@ -193,11 +161,3 @@ def test_pixels_on_the_outline_are_left_out() -> None:
     mask = find_visible_surface(Tracer(square), 10, 2).mask
     assert mask.sum() == 16
     assert mask[3:7, 3:7].all()
-
-
-def test_soft_materials_keep_what_does_not_shine() -> None:
-    values = {name: torch.full((2, 1), 0.05) for name in PrincipledMaterial.__dataclass_fields__}
-    softened = soften(PrincipledMaterial(**values))
-    assert isinstance(softened, PrincipledMaterial)
-    assert (softened.roughness == SOFTEST).all()
-    assert torch.equal(softened.base, values["base"])

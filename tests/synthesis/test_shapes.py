@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splinecli.synthesis import fields, shapes
+from splinecli.synthesis import fields
 from splinecli.synthesis.meshes import REACH, Floats, Mesh
-from splinecli.synthesis.shapes import KINDS, draw_rotation, draw_shape, draw_shape_of_kind
+from splinecli.synthesis.shapes import KINDS, draw_shape, draw_shape_of_kind
 
 pytest.importorskip("skimage", reason="needs the extra 'render'")
 
@@ -93,12 +93,6 @@ def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pyte
     np.testing.assert_allclose(volume(sparse), volume(dense), rtol=1e-5)
 
 
-def test_rotations_are_rotations() -> None:
-    rotation = draw_rotation(np.random.default_rng(0)).astype(np.float64)
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-    assert np.linalg.det(rotation) == pytest.approx(1, abs=1e-6)
-
-
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # A coarser field, for speed.
@@ -131,14 +125,3 @@ def test_the_same_generator_draws_the_same_shape(monkeypatch: pytest.MonkeyPatch
     assert kind == same
     np.testing.assert_array_equal(one.vertices, other.vertices)
     np.testing.assert_array_equal(one.faces, other.faces)
-
-
-def test_evenly_spread_places_give_each_kind_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shapes, "draw_shape_of_kind", lambda name, rng: name)
-    drawn = [draw_shape(np.random.default_rng(0), (place + 0.5) / 100)[0] for place in range(100)]
-    assert {kind: drawn.count(kind) for kind in KINDS} == {
-        "carved": 40,
-        "rough": 20,
-        "relief": 15,
-        "vessel": 25,
-    }

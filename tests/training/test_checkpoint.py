@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -74,22 +73,3 @@ def test_settings_of_a_later_splinecli(trainer: Trainer, tmp_path: Path) -> None
     path.write_bytes(whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0'))
     with pytest.raises(ModelError, match="the entry 'config' in the file is not JSON"):
         read_checkpoint_config(path)
-
-
-def test_a_file_of_an_earlier_format_is_refused_by_name(trainer: Trainer, tmp_path: Path) -> None:
-    path = tmp_path / CHECKPOINT
-    path.write_bytes(path.read_bytes().replace(b"splinecli-checkpoint-2", b"splinecli-checkpoint-1"))
-    with pytest.raises(ModelError, match="found splinecli-checkpoint-1, expected splinecli-checkpoint-2"):
-        read_checkpoint_config(path)
-
-
-def test_the_state_of_either_network_alone_is_kept(tiny: TrainingConfig, tmp_path: Path) -> None:
-    # With alternating updates, LI-Net has no moments of AdamW yet after the first steps.
-    config = replace(tiny, updates="alternating")
-    begun = Trainer(config, tmp_path, CPU)
-    begun.step()
-    begun.save()
-    again = Trainer(config, tmp_path, CPU, resume=True)
-    states = again.optimizer.state_dict()["state"]
-    assert states.keys() == begun.optimizer.state_dict()["state"].keys()
-    assert 0 < len(states) < len(list(begun.network.parameters()))

@@ -13,9 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splinecli.errors import UsageError
 from splinecli.networks.weights import load_weights
-from splinecli.training import distributed
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import METRICS
 from splinecli.training.distributed import Workers, is_launched, join_workers, restarts_are_allowed
@@ -39,21 +37,6 @@ def free_port() -> str:
         return str(probe.getsockname()[1])
 
 
-@pytest.mark.parametrize(
-    ("count", "total", "shards"), [(1, 4, [[0, 1, 2, 3]]), (2, 4, [[0, 2], [1, 3]]), (3, 3, [[0], [1], [2]])]
-)
-def test_every_shard_is_somebody_s(count: int, total: int, shards: list[list[int]]) -> None:
-    assert [list(Workers(rank, count).shards(total)) for rank in range(count)] == shards
-    assert [Workers(rank, count).leads for rank in range(count)] == [True] + [False] * (count - 1)
-
-
-def test_shards_that_cannot_be_shared_out(tiny: TrainingConfig, tmp_path: Path) -> None:
-    message = r"3 processes cannot share the 4 shards of a batch evenly\. Add --param shards=3, or start"
-    with pytest.raises(UsageError, match=message):
-        Trainer(tiny, tmp_path / "run", CPU, workers=Workers(0, 3))
-    assert not (tmp_path / "run").exists()
-
-
 def test_alone_nothing_is_exchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("WORLD_SIZE", "TORCHELASTIC_RUN_ID", "TORCHELASTIC_MAX_RESTARTS"):
         monkeypatch.delenv(name, raising=False)
@@ -63,35 +46,6 @@ def test_alone_nothing_is_exchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = torch.ones(6)
     assert Workers().average([], numbers) is numbers
     assert Workers().agree(1 / 3, CPU) == 1 / 3
-
-
-def test_torchrun_s_signs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WORLD_SIZE", "1")
-    assert not is_launched()
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    assert is_launched()
-    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
-    assert not restarts_are_allowed()
-    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "1")
-    assert restarts_are_allowed()
-
-
-def test_a_restart_never_meets_the_addresses_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    # torchrun's store outlives the processes; who finds an old address in it waits for nobody.
-    kept, stores = torch.distributed.HashStore(), []
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    monkeypatch.setattr(distributed, "rendezvous", lambda url: iter([(kept, 1, 2)]))
-    monkeypatch.setattr(
-        torch.distributed, "init_process_group", lambda backend, *, store, **_: stores.append(store)
-    )
-    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    for attempt in (1, 2):
-        monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", str(attempt))
-        assert join_workers(CPU) == (Workers(1, 2), CPU)
-        assert not stores[-1].check(["address"])
-        stores[-1].set("address", "here")
 
 
 WORKER = """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -40,11 +39,6 @@ def random_maps(*shape: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("degrees", [0.0, 0.01, 10.0, 90.0, 179.0, 180.0])
 def test_angle(degrees: float) -> None:
     assert math.degrees(angular_loss(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
-
-
-def test_angle_is_the_mean_over_pixels() -> None:
-    normals = torch.cat((at(10), at(-30), at(80)))
-    assert math.degrees(angular_loss(normals, at(0).expand(3, 3)).item()) == pytest.approx(40, abs=6e-5)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 10.0, 180.0])
@@ -85,33 +79,7 @@ def test_masked_map_loss_is_over_observed_cells_of_known_truth(norm: Norm, expec
     assert masked_map_loss(dense, truth, known, torch.zeros(2, 1, 4, 4), norm) == 0
 
 
-# An axis along a row, a column or a diagonal sends centres to centres. What is left is rounding of the axis.
-@pytest.mark.parametrize(
-    ("azimuth_deg", "expected"),
-    [
-        (0, lambda maps: maps.flip(2)),
-        (180, lambda maps: maps.flip(2)),
-        (90, lambda maps: maps.flip(3)),
-        (270, lambda maps: maps.flip(3)),
-        (45, lambda maps: maps.transpose(2, 3).flip(2, 3)),
-        (135, lambda maps: maps.transpose(2, 3)),
-    ],
-)
-@pytest.mark.parametrize("zenith_deg", [2, 40, 90])
-def test_mirror_permutes_cells(
-    azimuth_deg: int, zenith_deg: int, expected: Callable[[Tensor], Tensor]
-) -> None:
-    maps = random_maps(1, 2, 16, 16)
-    found = mirror(maps, at(zenith_deg, azimuth_deg))
-    torch.testing.assert_close(found, expected(maps), rtol=0, atol=1e-12)
-
-
-def test_mirror_of_a_normal_towards_the_camera_is_half_a_turn() -> None:
-    maps = random_maps(1, 1, 16, 16)
-    torch.testing.assert_close(mirror(maps, at(0)), maps.flip(2, 3), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("azimuth_deg", [17, 100, 211, 300])
+@pytest.mark.parametrize("azimuth_deg", [17, 90, 211])
 def test_mirror_against_scipy(azimuth_deg: int) -> None:
     size = 16
     maps = random_maps(1, 1, size, size, seed=azimuth_deg)
@@ -123,12 +91,6 @@ def test_mirror_against_scipy(azimuth_deg: int) -> None:
     row = (1 - np.hypot(x, y) * np.sin(angle)) * size / 2 - 0.5
     expected = map_coordinates(maps[0, 0].numpy(), (row, column), order=1, mode="grid-constant")
     np.testing.assert_allclose(mirror(maps, at(30, azimuth_deg))[0, 0].numpy(), expected, rtol=0, atol=1e-12)
-
-
-def test_mirror_treats_every_pixel_by_its_own_normal() -> None:
-    maps, normals = random_maps(3, 1, 8, 8), torch.cat((at(20, 10), at(50, 130), at(0)))
-    alone = [mirror(maps[i : i + 1], normals[i : i + 1]) for i in range(3)]
-    torch.testing.assert_close(mirror(maps, normals), torch.cat(alone), rtol=0, atol=1e-12)
 
 
 def isotropic_map(normal: Tensor, kind: str, size: int = 32) -> tuple[Tensor, Tensor]:
@@ -148,8 +110,8 @@ def asymmetry(maps: Tensor, normal: Tensor, filled: Tensor) -> float:
 
 
 @pytest.mark.parametrize("kind", ["matte", "glossy"])
-@pytest.mark.parametrize("zenith_deg", [2, 10, 30, 60])
-@pytest.mark.parametrize("azimuth_deg", [0, 45, 17, 123, 290])
+@pytest.mark.parametrize("zenith_deg", [2, 10, 60])
+@pytest.mark.parametrize("azimuth_deg", [45, 17, 290])
 def test_an_isotropic_map_is_symmetric_about_its_normal(kind: str, zenith_deg: int, azimuth_deg: int) -> None:
     normal = at(zenith_deg, azimuth_deg)
     maps, filled = isotropic_map(normal, kind)
@@ -171,8 +133,8 @@ def _at_size(normal: Tensor, kind: str, size: int) -> tuple[Tensor, Tensor, Tens
 
 
 @pytest.mark.parametrize("kind", ["matte", "glossy"])
-@pytest.mark.parametrize("azimuth_deg", [3, 67, 203])  # and no multiple of 45 with what is added
-@pytest.mark.parametrize("off_deg", [-60, -20, -5, 5, 20, 60])
+@pytest.mark.parametrize("azimuth_deg", [67, 203])  # and no multiple of 45 with what is added
+@pytest.mark.parametrize("off_deg", [-60, -5, 20])
 def test_symmetry_pulls_a_normal_towards_the_right_azimuth(kind: str, azimuth_deg: int, off_deg: int) -> None:
     maps, filled = isotropic_map(at(40, azimuth_deg), kind)
 
@@ -256,20 +218,6 @@ def test_asymmetric_loss_by_hand(eta: float, lambda_c: float, expected: float) -
     assert loss.item() == pytest.approx(expected)
 
 
-def test_special_losses_are_means_over_pixels() -> None:
-    fine, coarse = torch.tensor([1.0, 3.0]), torch.tensor([0.0, 4.0])
-    assert symmetric_loss(fine) == 2
-    assert asymmetric_loss(fine, coarse, eta=1.0, lambda_c=10.0) == ((0 + 10 * 1) + (2 + 10 * 3)) / 2
-
-
-def test_cells_that_are_not_filled_and_their_images_do_not_count() -> None:
-    maps, filled = four_cells(r0c0=0.9, r0c1=0.8), torch.ones(1, 1, 4, 4, dtype=torch.float64)
-    filled[0, 0, 3, 0] = 0  # the image of r0c0
-    maps[0, 0, 3, 0] = 1e3
-    fine, coarse = asymmetries(maps, at(30, 0), filled)
-    assert (fine.item(), coarse.item()) == (pytest.approx(0.6), pytest.approx(0.15))
-
-
 @pytest.mark.parametrize("azimuth_deg", [0, 17, 123])
 def test_gaps_and_the_rim_have_no_gradient(azimuth_deg: int) -> None:
     maps, filled = random_maps(1, 1, 32, 32), cell_directions(32)[1].double()[None, None]
@@ -290,27 +238,3 @@ def test_gaps_and_the_rim_have_no_gradient(azimuth_deg: int) -> None:
     # At 0 the gap of 12 has an image of 12; elsewhere it grows by the reach of the interpolation.
     lost = int((filled * (image_filled <= 0.999)).sum())
     assert lost == 12 if azimuth_deg == 0 else 12 < lost < 200
-
-
-def test_halves_of_a_batch_have_its_loss_as_their_mean() -> None:
-    maps, truth = random_maps(8, 1, 16, 16, seed=1), random_maps(8, 1, 16, 16, seed=2)
-    known = (random_maps(8, 1, 16, 16, seed=3) < 0.7).double()
-    known[:4] *= known[4:].flip(0)  # fewer cells in one half than in the other
-    occupied = (random_maps(8, 1, 16, 16, seed=4) < 0.2).double()
-    normals = torch.nn.functional.normalize(random_maps(8, 3, seed=5), dim=1)
-    others = torch.nn.functional.normalize(random_maps(8, 3, seed=6), dim=1)
-
-    def losses(part: slice) -> Tensor:
-        fine, coarse = asymmetries(maps[part], normals[part], known[part])
-        found = [
-            angular_loss(normals[part], others[part]),
-            symmetric_loss(fine),
-            asymmetric_loss(fine, coarse, eta=1.0, lambda_c=50.0),
-        ]
-        norms: tuple[Norm, ...] = ("mean", "sum")
-        for norm in norms:
-            found.append(map_loss(maps[part], truth[part], known[part], norm))
-            found.append(masked_map_loss(maps[part], truth[part], known[part], occupied[part], norm))
-        return torch.stack(found)
-
-    torch.testing.assert_close((losses(slice(4)) + losses(slice(4, 8))) / 2, losses(slice(8)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.networks.config import NetworkConfig
-from splinecli.networks.spline_net import Rotation, SplineNet, to_pixel_frame
+from splinecli.networks.spline_net import SplineNet, to_pixel_frame
 from splinecli.observation_map import cell_directions, sparse_map
-from splinecli.synthesis.batches import PixelBatch, join_batches
+from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
-from splinecli.training import objective
 from splinecli.training.config import TrainingConfig, preset
 from splinecli.training.loop import Trainer
 from splinecli.training.losses import asymmetric_loss, asymmetries, symmetric_loss
@@ -74,25 +72,6 @@ def test_only_the_part_gets_gradients(
     assert all(p.requires_grad for p in network.parameters())
 
 
-def test_what_was_frozen_before_stays_frozen_also_after_a_failure(
-    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frozen = next(network.ne_net.parameters()).requires_grad_(False)
-    states = [p.requires_grad for p in network.parameters()]
-    compute_losses(network, batch, tiny, part="li_net")
-    assert [p.requires_grad for p in network.parameters()] == states
-
-    def fail(*_: object) -> Tensor:
-        assert not any(p.requires_grad for p in network.ne_net.parameters())
-        raise RuntimeError("in the middle")
-
-    monkeypatch.setattr(network, "estimate", fail)
-    with pytest.raises(RuntimeError, match="in the middle"):
-        compute_losses(network, batch, tiny, part="li_net")
-    assert [p.requires_grad for p in network.parameters()] == states
-    assert not frozen.requires_grad
-
-
 def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny: TrainingConfig, tmp_path: Path) -> None:
     config = replace(
         tiny, updates="alternating", ne_net_updates=2, weight_decay=0.1, learning_rate=1e-2,
@@ -110,16 +89,6 @@ def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny: TrainingCon
         trainer.step()
         assert all(torch.equal(a, b) for a, b in zip(before, state(fixed), strict=True))
         assert not all(torch.equal(a, b) for a, b in zip(old, state(updated), strict=True))
-
-
-@pytest.mark.parametrize("weight", ["symmetric_weight", "asymmetric_weight"])
-def test_the_special_terms_reach_ne_net_through_its_normals(
-    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, weight: str
-) -> None:
-    config = replace(tiny, **SILENT, **{weight: 1.0})
-    compute_losses(network, batch, config, part="ne_net").total.backward()
-    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.ne_net.parameters())
-    assert moved(network.ne_net)
 
 
 def test_the_angle_reaches_li_net_through_the_fixed_ne_net(
@@ -178,31 +147,6 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     assert found.total.item() == pytest.approx(total.item(), rel=1e-5)
 
 
-def test_special_terms_without_weight_are_not_computed(
-    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[Callable[..., object]] = []
-    monkeypatch.setattr(objective, "asymmetries", lambda *args: calls.append(args) or asymmetries(*args))
-    losses = compute_losses(network, batch, tiny)
-    assert not calls
-    assert losses.symmetric.isnan()
-    assert losses.asymmetric.isnan()
-    assert losses.total.isfinite()
-    compute_losses(network, batch, replace(tiny, symmetric_weight=1.0))
-    assert len(calls) == 2
-
-
-def test_halves_of_a_batch_have_its_losses_as_their_mean(tiny: TrainingConfig, network: SplineNet) -> None:
-    # What training by several processes rests on.
-    generator = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0))
-    halves = [generator.draw(6), generator.draw(6)]
-    config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-3)
-    with torch.no_grad():
-        parts = [torch.stack(compute_losses(network, half, config)) for half in halves]
-        whole = torch.stack(compute_losses(network, join_batches(halves), config))
-    torch.testing.assert_close((parts[0] + parts[1]) / 2, whole)
-
-
 @pytest.mark.parametrize("mirror", [False, True])
 def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: bool) -> None:
     # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map there.
@@ -238,30 +182,6 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     assert torch.equal(dense.filled, dense.known)
 
 
-def test_truth_and_views_share_any_turn(tiny: TrainingConfig) -> None:
-    # At any turn: a matte scene's dense map is that of its turned normal.
-    network = SplineNet(replace(tiny.network, map_size=16))
-    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(5)
-    turn_deg = torch.tensor([0.0, 10.0, -35.0, 90.0, 200.0])
-    views = network.build_maps(
-        batch.observations, batch.light_directions, batch.valid, rotation=Rotation(turn_deg)
-    )
-    dense = dense_truth_in_frame(batch, views, size=16)
-    normals = to_pixel_frame(batch.truth.normals, views)
-    azimuth = torch.atan2(batch.truth.normals[:, 1], batch.truth.normals[:, 0])
-    turned = azimuth + torch.atan2(views.sine, views.cosine)
-    torch.testing.assert_close(torch.cos(torch.atan2(normals[:, 1], normals[:, 0]) - turned), torch.ones(5))
-    torch.testing.assert_close(normals[:, 2], batch.truth.normals[:, 2])
-    assert dense.values.shape == (5, 1, 16, 16)
-
-
-def test_all_terms_of_the_paper_s_preset_are_finite(tiny: TrainingConfig) -> None:
-    network = SplineNet(NetworkConfig(size="paper"))
-    few = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(2)
-    losses = compute_losses(network, few, preset("paper"), part="li_net")
-    assert all(torch.isfinite(loss) for loss in losses)
-
-
 def test_without_li_net_the_angle_is_all(tiny: TrainingConfig, batch: PixelBatch) -> None:
     # CNN-PS: no dense map is drawn or judged, and NE-Net learns from the angle alone.
     torch.manual_seed(0)
@@ -271,11 +191,3 @@ def test_without_li_net_the_angle_is_all(tiny: TrainingConfig, batch: PixelBatch
     assert all(torch.isnan(term) for term in losses[2:])
     losses.total.backward()
     assert all(parameter.grad is not None and parameter.grad.any() for parameter in network.parameters())
-
-
-def test_without_li_net_the_special_losses_act_on_ne_net(batch: PixelBatch) -> None:
-    torch.manual_seed(0)
-    network = SplineNet(NetworkConfig(size="paper", interpolates=False)).eval()
-    losses = compute_losses(network, batch, preset("cnn-ps", symmetric_weight=0.01))
-    assert torch.isnan(losses.on_map)
-    torch.testing.assert_close(losses.total, losses.angle + 0.01 * losses.symmetric)

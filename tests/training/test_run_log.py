@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
-import io
-import math
-import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -15,25 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.errors import OutputError, UsageError
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.loop import Trainer
-from splinecli.training.run_log import Metrics, RunLog, none_for_nan, read_metrics
-from splinecli.training.validation import SampleMaps
+from splinecli.training.run_log import Metrics, RunLog, read_metrics
 
 ROWS = [
     Metrics(50, 800, 0.1, 1e-3, 2.0, 20.0, 0.2, 0.1),
     Metrics(100, 1600, 0.2, 9e-4, 1.0, 10.0, 0.1, 0.05, 0.5, 7.25, 12.5),
     Metrics(125, 2000, 0.25, 8e-4, 0.5, 8.0, 0.08, 0.04, None, None, 9.0),
 ]
-
-
-def sample(count: int = 3) -> SampleMaps:
-    random = np.random.default_rng(0)
-    maps = [random.uniform(0, 1, (count, 8, 8)).astype(np.float32) for _ in range(3)]
-    maps[0][:, ::2] = np.nan
-    return SampleMaps(*maps, np.array([1.25, 20.0, 3.0][:count], np.float32))
 
 
 def test_metrics_round_trip(tmp_path: Path) -> None:
@@ -49,9 +36,7 @@ def test_metrics_round_trip(tmp_path: Path) -> None:
         assert len(list(csv.reader(file))) == 4
 
 
-@pytest.mark.parametrize(
-    ("step", "kept"), [(0, 0), (49, 0), (50, 1), (99, 1), (100, 2), (124, 2), (10**6, 3)]
-)
+@pytest.mark.parametrize(("step", "kept"), [(49, 0), (50, 1), (10**6, 3)])
 def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int) -> None:
     log = RunLog(tmp_path, 0)
     for row in ROWS:
@@ -62,17 +47,7 @@ def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int)
     assert read_metrics(tmp_path / METRICS) == [*ROWS[:kept], replace(ROWS[2], step=10**6 + 1)]
 
 
-def test_a_line_cut_short_is_dropped(tmp_path: Path) -> None:
-    log = RunLog(tmp_path, 0)
-    for row in ROWS[:2]:
-        log.append(row)
-    with (tmp_path / METRICS).open("a") as file:
-        file.write("12")
-    RunLog(tmp_path, 100).append(ROWS[2])
-    assert read_metrics(tmp_path / METRICS) == ROWS
-
-
-@pytest.mark.parametrize("step", ["9" * 5000, "²", "-", "1e3"])
+@pytest.mark.parametrize("step", ["9" * 5000, "²"])
 def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) -> None:
     log = RunLog(tmp_path, 0)
     for row in ROWS[:2]:
@@ -92,34 +67,10 @@ def test_every_damaged_file_is_kept(tmp_path: Path) -> None:
     assert [(tmp_path / name).read_text() for name in kept] == ["damage 0\n", "damage 1\n", "damage 2\n"]
 
 
-@pytest.mark.parametrize("text", ["", "step\n50\n", "step,loss\n50,1.0\n"])
-def test_a_file_of_another_version_is_set_aside(tmp_path: Path, text: str) -> None:
-    (tmp_path / METRICS).write_text(text)
-    RunLog(tmp_path, 50).append(ROWS[0])
-    assert read_metrics(tmp_path / METRICS) == ROWS[:1]
-    assert (tmp_path / "metrics.damaged.csv").read_text() == text
-
-
 def read_png(path: Path) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     return picture
-
-
-def test_pictures_are_written_and_renewed(tmp_path: Path) -> None:
-    log = RunLog(tmp_path, 0)
-    for row in ROWS[:2]:
-        log.append(row)
-    log.draw(sample(1))
-    curves, maps = read_png(tmp_path / CURVES), read_png(tmp_path / MAPS)
-    assert len(np.unique(curves.reshape(-1, 3), axis=0)) > 10
-    # Three maps of 8 x 8 random cells.
-    assert len(np.unique(maps.reshape(-1, 3), axis=0)) > 100
-    log.append(ROWS[2])
-    log.draw(sample(2))
-    assert (read_png(tmp_path / CURVES) != curves).any()
-    assert read_png(tmp_path / MAPS).shape[0] > maps.shape[0]  # a row for each pixel
-    assert sorted(path.name for path in tmp_path.iterdir()) == [CURVES, MAPS, METRICS]
 
 
 def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
@@ -129,19 +80,6 @@ def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     }  # fmt: skip
     assert read_png(tmp_path / CURVES).std() > 5
     assert read_png(tmp_path / MAPS).std() > 20
-
-
-def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = RunLog(tmp_path, 0)
-    log.append(ROWS[0])
-
-    class Full(io.StringIO):
-        def write(self, text: str) -> int:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "open", lambda *args, **kwargs: Full())
-    with pytest.raises(OutputError, match=r"metrics\.csv: cannot be written \(No space left on device\)"):
-        log.append(ROWS[1])
 
 
 def test_tensorboard_s_events(tmp_path: Path) -> None:
@@ -157,17 +95,3 @@ def test_tensorboard_s_events(tmp_path: Path) -> None:
         (50, 2.0), (100, 1.0), (125, 0.5),
     ]  # fmt: skip
     assert [event.step for event in events.Scalars("validation_deg")] == [100, 125]
-
-
-def test_without_tensorboard_it_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "tensorboard", None)
-    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
-    with pytest.raises(UsageError, match=r"Run pip install 'splinecli\[tensorboard\]'"):
-        RunLog(tmp_path, 0, tensorboard=True)
-    assert not (tmp_path / EVENTS).exists()
-    RunLog(tmp_path, 0).append(ROWS[0])
-
-
-def test_what_was_not_computed_is_left_empty() -> None:
-    assert none_for_nan(math.nan) is None
-    assert none_for_nan(0.0) == 0

@@ -24,18 +24,6 @@ def test_all_come_in_their_order(stderr_is_apart: bool, count: int) -> None:
     assert list(read_ahead(lambda item: 10 * item, range(count))) == [10 * item for item in range(count)]
 
 
-def test_an_error_comes_when_it_is_the_turn_of_its_item(stderr_is_apart: bool) -> None:
-    def read(item: int) -> int:
-        if item == 1:
-            raise ValueError(item)
-        return item
-
-    images = read_ahead(read, [0, 1, 2])
-    assert next(images) == 0
-    with pytest.raises(ValueError, match="1"):
-        next(images)
-
-
 def test_the_next_item_is_read_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "stderr_is_apart", lambda: True)
     begun = [threading.Event() for _ in range(4)]

@@ -12,9 +12,8 @@ import tifffile
 
 from splinecli.capture import capture_name, find_captures, open_capture, read_capture
 from splinecli.errors import InputError
-from splinecli.evaluation.draws_elsewhere import DrawScorer
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate, evaluate_all
+from splinecli.evaluation.run import evaluate
 from splinecli.methods import make_estimator
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
@@ -111,14 +110,6 @@ def test_an_object_with_two_kinds(tmp_path: Path) -> None:
     assert capture_name(folder) == "Bunny"
 
 
-def test_an_object_without_images(tmp_path: Path) -> None:
-    write_object(tmp_path / "Bunny")
-    assert message(lambda: open_capture(tmp_path / "Bunny")) == (
-        f"{tmp_path / 'Bunny'}: found no folder of images,"
-        " expected images_specular, images_metallic or images_diffuse."
-    )
-
-
 def test_find_captures(tree: Path) -> None:
     objects = [tree / "PRPS/Bunny9", tree / "PRPS/Bunny10"]
     of_prps = [folder / f"images_{kind}" for folder in objects for kind in ("metallic", "specular")]
@@ -143,18 +134,6 @@ def test_evaluation_calls_the_captures_by_their_names(tree: Path) -> None:
     ]
 
 
-def test_another_process_reads_the_kind_that_it_scores(tree: Path) -> None:
-    folders = find_captures(tree / "PRPS/Bunny9")
-    estimators, protocols = [make_estimator("ls")], [Protocol(4)]
-    scorer = DrawScorer(estimators, protocols)
-    (here,), (there,) = (
-        evaluate_all(folders, estimators, protocols, elsewhere=elsewhere)
-        for elsewhere in (None, lambda draws: ((draw, scorer.score(draw)) for draw in draws))
-    )
-    assert there.skipped == ()
-    assert [result.maes_deg for result in there.results] == [result.maes_deg for result in here.results]
-
-
 def test_a_missing_image(tmp_path: Path) -> None:
     folder = tmp_path / "Bunny/images_specular"
     write_object(tmp_path / "Bunny", "specular")
@@ -163,22 +142,6 @@ def test_a_missing_image(tmp_path: Path) -> None:
         f"{folder / '00003.tif'}: the image does not exist,"
         " expected 5 (00000.tif to 00004.tif), one for each light in light.txt."
     )
-
-
-def test_more_images_than_lights(tmp_path: Path) -> None:
-    folder = tmp_path / "Bunny/images_specular"
-    write_object(tmp_path / "Bunny", "specular")
-    np.savetxt(tmp_path / "Bunny/light.txt", LIGHTS[:4])
-    assert message(lambda: open_capture(folder)) == (
-        f"{folder}: found 5 images, expected 4 (00000.tif to 00003.tif), one for each light in light.txt."
-    )
-
-
-def test_other_files_beside_the_images_do_not_matter(tmp_path: Path) -> None:
-    write_object(tmp_path / "Bunny", "specular")
-    for name in ("preview.tif", "._00000.tif", "Thumbs.db"):
-        (tmp_path / "Bunny/images_specular" / name).touch()
-    assert read_capture(tmp_path / "Bunny").n_lights == 5
 
 
 def test_missing_files_of_the_object(tmp_path: Path) -> None:
@@ -215,58 +178,3 @@ def test_masks_that_do_not_fit(tmp_path: Path) -> None:
     assert message(lambda: read_capture(folder)) == (
         f"{folder / 'onboundary.png'}: found a mask of 7 x 11 pixels, expected 11 x 7 as in 00000.tif."
     )
-
-
-def test_images_and_normals_of_another_size(tmp_path: Path) -> None:
-    folder = tmp_path / "Bunny"
-    write_object(folder, "specular")
-    tifffile.imwrite(folder / "gt_normal.tif", np.ones((WIDTH, HEIGHT, 3), np.uint16), photometric="rgb")
-    assert "found a ground truth of 7 x 11 pixels, expected 11 x 7 as in the images" in message(
-        lambda: read_capture(folder)
-    )
-    (folder / "gt_normal.tif").unlink()
-    odd = folder / "images_specular/00002.tif"
-    tifffile.imwrite(odd, np.ones((WIDTH, HEIGHT, 3), np.uint16), photometric="rgb")
-    assert message(lambda: read_capture(folder)).startswith(f"{odd}: found an image of 7 x 11 pixels")
-
-
-def test_a_light_below_the_horizon(tmp_path: Path) -> None:
-    write_object(tmp_path / "Bunny", "specular")
-    (tmp_path / "Bunny/light.txt").write_text("0 0 1\n1 0 1\n0 1 1\n1 1 0\n1 1 1\n")
-    text = message(lambda: open_capture(tmp_path / "Bunny"))
-    assert text.startswith(f"{tmp_path / 'Bunny/light.txt'}:4: found a light below the horizon")
-
-
-def test_images_as_blender_packs_them(tmp_path: Path) -> None:
-    """Deflated with differences of neighbours, and with alpha."""
-    written = write_object(tmp_path / "Bunny", "specular")["specular"]
-    expected = read_capture(tmp_path / "Bunny").observations
-    for index, image in enumerate(written):
-        opaque = np.full((HEIGHT, WIDTH, 1), 65535, np.uint16)
-        tifffile.imwrite(
-            tmp_path / f"Bunny/images_specular/{index:05}.tif",
-            np.concatenate((image, opaque), axis=2),
-            photometric="rgb",
-            extrasamples=["unassalpha"],
-            compression="zlib",
-            predictor=True,
-        )
-    np.testing.assert_array_equal(read_capture(tmp_path / "Bunny").observations, expected)
-
-
-def test_what_is_no_object_of_cyclesps(tmp_path: Path) -> None:
-    # Photographs beside light.txt and a folder images_raw: --lights light.txt makes a plain folder of it.
-    plain = tmp_path / "vase"
-    write_object(plain)
-    for name in ("inboundary.png", "onboundary.png", "gt_normal.tif"):
-        (plain / name).unlink()
-    for index in range(5):
-        cv2.imwrite(str(plain / f"{index}.png"), np.ones((2, 3), np.uint16))
-    (plain / "images_raw").mkdir()
-    assert open_capture(plain, lights=plain / "light.txt").files.name == "vase"
-    # A light file of its own makes a folder of images plain.
-    write_object(tmp_path / "Bunny", "specular")
-    (tmp_path / "Bunny/light.txt").rename(tmp_path / "Bunny/images_specular/lights.txt")
-    own = open_capture(tmp_path / "Bunny/images_specular").files
-    assert (own.name, own.mask, own.boundaries) == ("images_specular", None, ())
-    assert find_captures(tmp_path / "Bunny/images_specular") == [tmp_path / "Bunny/images_specular"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.capture import Overrides, capture_name, find_capture_files, find_captures
+from splinecli.capture import Overrides, find_capture_files, find_captures
 from splinecli.errors import InputError
 
 
@@ -54,11 +54,6 @@ def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
     assert files.light_intensities == folder / "light_intensities.txt"
     assert files.mask == folder / "Mask.png"
     assert files.ground_truth == folder / "normals_gt.npy"
-
-
-def test_plain_folder_with_nothing_but_images_and_lights(tmp_path: Path) -> None:
-    files = find_capture_files(fill(tmp_path, "a.png", "b.png", "light_directions.txt"))
-    assert (files.light_intensities, files.mask, files.ground_truth) == (None, None, None)
 
 
 def test_plain_folder_in_the_order_of_filenames_txt(tmp_path: Path) -> None:
@@ -112,18 +107,6 @@ def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
     assert files.light_intensities == other / "brightness.txt"
     assert files.mask == folder / "outline.png"
     assert files.ground_truth == folder / "gt.tif"
-
-
-@pytest.mark.parametrize("way", ["vase", "vase/", "vase/.", "vase/../vase", "vase/inner/.."])
-def test_the_name_is_the_folder_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    fill(tmp_path / "vase", "a.png", "lights.txt", "inner/x")
-    monkeypatch.chdir(tmp_path)
-    assert find_capture_files(way).name == "vase"
-
-
-def test_the_name_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(fill(tmp_path / "vase", "a.png", "lights.txt"))
-    assert find_capture_files(".").name == "vase"
 
 
 def test_folders_that_are_no_capture(tmp_path: Path) -> None:
@@ -216,23 +199,6 @@ def test_psbox(tmp_path: Path) -> None:
     assert (files.mask, files.ground_truth) == (None, None)
 
 
-def test_psbox_without_images(tmp_path: Path) -> None:
-    folder = fill(tmp_path / "demo", "Objects/notes.txt", "light_directions.txt")
-    with pytest.raises(InputError) as caught:
-        find_capture_files(folder)
-    assert str(caught.value) == (
-        f"{folder / 'Objects'}: the folder contains no images. PNG, TIFF, JPEG and RAW files count as images."
-    )
-
-
-def test_find_captures_sees_psbox(tmp_path: Path) -> None:
-    fill(
-        tmp_path, "a/Objects/1.png", "a/light_directions.txt", "b/Objects/notes.txt", "b/light_directions.txt"
-    )
-    assert find_captures(tmp_path) == [tmp_path / "a"]
-    assert find_captures(tmp_path / "a") == [tmp_path / "a"]
-
-
 def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
     folder = fill(tmp_path / "vase", "a.png", "lights.txt")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
@@ -252,25 +218,3 @@ def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
     loop.symlink_to(loop)
     with pytest.raises(InputError, match=r"loop\.png: cannot be read"):
         find_capture_files(folder)
-
-
-@pytest.mark.parametrize(
-    "error", [RuntimeError("Symlink loop"), OSError(40, "Too many levels of symbolic links")]
-)
-def test_a_name_through_a_loop(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
-    def refuse(path: Path) -> None:  # what Path.resolve raises depends on Python's version
-        raise error
-
-    monkeypatch.setattr(Path, "resolve", refuse)
-    with pytest.raises(InputError, match=r"cannot be read \(Too many levels of symbolic links\)\."):
-        capture_name(Path("loop/x/.."))
-
-
-def test_a_folder_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path, **_: object) -> None:  # root may read everything
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(Path, "stat", refuse)
-    with pytest.raises(InputError) as caught:
-        find_captures(tmp_path / "closed/vase")
-    assert str(caught.value) == f"{tmp_path / 'closed/vase'}: cannot be read (Permission denied)."

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import scenes
+from scenes import ring_lights, spiral_lights
 from splinecli.capture import read_capture
-from splinecli.capture.lights.frame_evidence import rough_normals
 from splinecli.capture.lights.light_check import LightCheck, check_lights
-from splinecli.capture.lights.light_fit import find_factors, random_misfits, shifted_orders, swapped_orders
+from splinecli.capture.lights.light_fit import find_factors, random_misfits
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame, parse_light_frame
 from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.errors import UsageError
@@ -21,20 +22,13 @@ MEDALLION = Path(__file__).resolve().parents[3] / "examples/medallion"
 SIZE = 64
 
 
-def ring(count: int, axis_deg: float = 40) -> Array:
-    azimuth, zenith = 0.3 + np.arange(count) * 2 * np.pi / count, np.radians(axis_deg)
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.full(count, np.cos(zenith))),
-        axis=1,
-    )
+def ring(count: int) -> Array:
+    return ring_lights(count, 40, 0.3)
 
 
 def scattered(count: int = 14) -> Array:
     """Lights on a spiral, so that no shift or exchange takes them to each other."""
-    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(12, 55, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+    return spiral_lights(count, 55, 12)
 
 
 def vase() -> tuple[Array, NDArray[np.bool_]]:
@@ -53,12 +47,7 @@ def vase() -> tuple[Array, NDArray[np.bool_]]:
 
 def shade(normals: Array, lights: Array) -> Array:
     """Lambert's cosine with a Blinn-Phong highlight and attached shadows, and one part in a hundred of noise."""
-    half = lights + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    cosine = np.clip(normals @ lights.T, 0, None)
-    highlight = 0.3 * np.clip(normals @ half.T, 0, None) ** 30 * (cosine > 0)
-    noise = np.random.default_rng(5).normal(0, 0.01, cosine.shape)
-    return np.clip(cosine + highlight + noise, 0, None)
+    return scenes.shade(normals, lights, gloss=0.3, noise=0.01)
 
 
 def check_vase(lights: Array, read_as: Array) -> LightCheck:
@@ -116,15 +105,6 @@ def test_a_ring_that_fits_in_every_shift_is_told_by_its_normals(order: NDArray[n
     assert check.best.name == words
 
 
-def test_a_choice_of_lights_is_checked_in_the_order_of_the_file() -> None:
-    lights, chosen = scattered(20)[np.random.default_rng(2).permutation(20)], [1, 4, 6, 7, 11, 13, 16, 19]
-    normals, mask = vase()
-    observations = shade(normals, lights[chosen])
-    assert check_lights(observations, mask, lights, chosen).order is None
-    check = check_lights(observations, mask, np.roll(lights, 1, axis=0), chosen)
-    assert check.order == "if image 1 belongs to light 2, image 2 to the next, and so on"
-
-
 def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
     y, x = np.mgrid[0 : 3 : SIZE * 1j, 0 : 3 : SIZE * 1j]
     z_x, z_y = 0.4 * np.cos(2 * x) * np.sin(3 * y), 0.6 * np.sin(2 * x) * np.cos(3 * y)
@@ -142,10 +122,8 @@ def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
 
 def metal(normals: Array, lights: Array) -> Array:
     """A highlight, whose brightness varies from image to image, and hardly any matte reflection."""
-    half = lights + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
     lit = np.clip(normals @ lights.T, 0, None)
-    return 0.02 * lit + np.clip(normals @ half.T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
+    return 0.02 * lit + np.clip(normals @ scenes.halfway(lights).T, 0, None) ** 40 * (lit > 0) / lights[:, 2]
 
 
 @pytest.mark.parametrize(
@@ -179,12 +157,6 @@ def test_on_a_flat_relief_only_known_intensities_tell_the_order() -> None:
         assert (check.given_misfit is None) == (not known)
 
 
-def test_few_lights_abstain_about_the_order() -> None:
-    lights = scattered(5)
-    check = check_vase(lights, lights[::-1])
-    assert check.order is None and check.given.misfit is None
-
-
 def test_misfits_are_those_of_least_squares() -> None:
     lights = scattered()
     normals, _ = vase()
@@ -200,25 +172,6 @@ def test_misfits_are_those_of_least_squares() -> None:
     assert factors.misfits(wrong[None])[0] == pytest.approx(expected, rel=1e-6)
     assert factors.misfits(lights[None])[0] < 1e-7
     assert random_misfits(factors, lights).min() > 0.01
-
-
-def test_orders() -> None:
-    assert shifted_orders(3).tolist() == [[0, 1, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0], [0, 2, 1], [1, 0, 2]]
-    assert swapped_orders(3).tolist() == [[1, 0, 2], [2, 1, 0], [0, 2, 1]]
-
-
-def test_rough_normals_are_those_of_the_surface() -> None:
-    normals, mask = vase()
-    rough = rough_normals(np.clip(normals @ scattered().T, 0, None), scattered(), mask)
-    cosines = (rough.normals[mask] * normals).sum(axis=1)
-    assert np.degrees(np.arccos(np.median(cosines).clip(-1, 1))) < 2  # they are smoothed
-
-
-@pytest.mark.parametrize("frame", PLANE_FRAMES, ids=str)
-def test_frames_are_read_as_they_are_written(frame: LightFrame) -> None:
-    assert parse_light_frame(str(frame)) == frame
-    twice = frame.after(LightFrame((1, -1, 1), exchanged=True))
-    np.testing.assert_array_equal(twice.matrix, frame.matrix @ LightFrame((1, -1, 1), exchanged=True).matrix)
 
 
 def test_the_columns_of_an_exchanged_file() -> None:

@@ -77,12 +77,6 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose([found[image] for image in IMAGES], DIRECTIONS, atol=1e-15)
 
 
-def test_names_with_spaces(tmp_path: Path) -> None:
-    lights = read_lights(write(tmp_path, "my shot 1.png 0 0 1\nmy shot 2.png, 0.6, 0, 0.8\nb 0 1 1"), 3)
-    assert isinstance(lights, NamedLights)
-    assert lights.names == ("my shot 1.png", "my shot 2.png", "b")
-
-
 def test_lp_files_with_decimal_commas(tmp_path: Path) -> None:
     path = tmp_path / "a.lp"
     path.write_text("2\nimg1.png 0,6 0 0,8\nimg2.png 0 -0,6 0,8", encoding="utf-16")
@@ -122,12 +116,6 @@ def test_angles(tmp_path: Path, text: str | None) -> None:
     np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
 
 
-def test_the_header_of_angles_tells_their_order(tmp_path: Path) -> None:
-    text = "Elevation,Azimuth\n90,0\n53.130102,0\n53.130102,270\n53.130102,143.130102"
-    directions = read_light_directions(write(tmp_path, text), 4, form="azel")
-    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -155,10 +143,3 @@ def test_angles_are_not_read_as_vectors(tmp_path: Path, text: str, message: str)
 def test_refused_angles(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_light_directions(write(tmp_path, text), form="azel")
-
-
-def test_positions_of_lamps_are_no_angles(tmp_path: Path) -> None:
-    at_one_height = "300 40 500\n-300 20 500\n0 -90 500\n10 80 500"
-    assert len(read_light_directions(write(tmp_path, at_one_height))) == 4
-    directions = read_light_directions(write(tmp_path, "300 400 1200\n-300 0 400\n0 900 1200\n1 2 2"))
-    np.testing.assert_allclose(directions[1], (-0.6, 0, 0.8))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.capture import find_captures, open_capture, read_capture
+from splinecli.capture import open_capture, read_capture
 from splinecli.errors import InputError
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
@@ -110,17 +110,6 @@ def test_images_that_no_light_names_are_left_out(write_folder: WriteFolder) -> N
     assert [path.name for path in open_capture(folder).files.images] == NAMES[:4]
 
 
-def test_a_named_light_file_goes_before_the_folder_s(write_folder: WriteFolder, tmp_path: Path) -> None:
-    folder = write_folder("dome")
-    (folder / "lights.txt").write_text("1 2 3\n")
-    other = tmp_path / "other.lp"
-    other.write_text(f"5\n{rows(NAMES)}")
-    source = open_capture(folder, lights=other)
-    np.testing.assert_allclose(
-        source.light_directions, LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
-    )
-
-
 def test_intensities_of_the_json_count_unless_a_file_is_given(
     write_folder: WriteFolder, tmp_path: Path
 ) -> None:
@@ -130,12 +119,6 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(
     file = tmp_path / "intensities.txt"
     file.write_text("3\n3\n3\n3\n3\n")
     assert open_capture(folder, intensities=file).light_intensities.tolist() == [[3.0] * 3] * 5
-
-
-def test_a_folder_with_an_lp_file_is_a_capture(write_folder: WriteFolder) -> None:
-    folder = write_folder("set/dome")
-    (folder / "a.lp").write_text(f"5\n{rows(NAMES)}")
-    assert find_captures(folder.parent) == [folder]
 
 
 @pytest.mark.parametrize(
@@ -192,14 +175,6 @@ def test_refused_json_files(write_folder: WriteFolder, text: str, message: str) 
     assert message in str(refused.value)
 
 
-def test_several_light_files(write_folder: WriteFolder) -> None:
-    folder = write_folder("dome")
-    for name in ("a.lp", "b.lp"):
-        (folder / name).write_text(f"5\n{rows(NAMES)}")
-    with pytest.raises(InputError, match=r"found 2 light files: a\.lp, b\.lp"):
-        open_capture(folder)
-
-
 def test_umlauts_of_older_programs_and_images_that_are_not_named(write_folder: WriteFolder) -> None:
     names = ["schräg 1.png", "schräg 2.png", "schräg 3.png", "schräg 4.png", "rest.png"]
     folder = write_folder("umlauts", names)
@@ -209,10 +184,3 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(write_folder: W
     assert [path.name for path in source.files.images] == names[:4]
     assert [warning.code for warning in source.warnings] == ["images_left_out"]
     assert "names 4 of the 5 images; the others are left out" in str(source.warnings[0])
-
-
-def test_psbox_with_calibrated_lights_alone(write_folder: WriteFolder, tmp_path: Path) -> None:
-    folder = write_folder("kitten/Objects", [f"{number}.png" for number in range(5)]).parent
-    (tmp_path / "lights.txt").write_text(rows(), "utf-8")
-    source = open_capture(folder, lights=tmp_path / "lights.txt")
-    assert (source.files.layout, source.files.name, source.n_lights) == ("PSBox", "kitten", 5)

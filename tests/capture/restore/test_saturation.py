@@ -48,26 +48,6 @@ def test_fewer_than_three_others_still_bound_them():
     assert np.abs(restored - truth)[few].mean() < 0.9 * np.abs(stored - truth)[few].mean()
 
 
-def test_a_highlight_is_no_reason_to_change_the_rest():
-    truth = matte(100)
-    stored = truth.astype(np.float32)
-    stored[:, 4] = 1.5  # brighter than any matte surface
-    saturated = np.zeros(truth.shape, bool)
-    saturated[:, 4] = True
-    restored = stored.copy()
-    restore_saturated(restored, saturated, LIGHTS)
-    np.testing.assert_allclose(restored, stored, rtol=1e-6)
-
-
-def test_what_is_saturated_throughout_or_nowhere_stays():
-    stored = np.vstack([np.ones((1, 9)), matte(1), np.zeros((1, 9))]).astype(np.float32)
-    saturated = np.zeros(stored.shape, bool)
-    saturated[0] = True
-    restored = stored.copy()
-    restore_saturated(restored, saturated, LIGHTS)
-    np.testing.assert_array_equal(restored, stored)
-
-
 @pytest.mark.parametrize(
     ("pixels", "expected"),
     [

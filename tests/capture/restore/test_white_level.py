@@ -12,11 +12,10 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from conftest import spiral_lights
+from scenes import spiral_lights
 from splinecli.capture import open_capture
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
-from splinecli.capture.summary import summarise_capture
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, unit
 
 SIDE = 60
@@ -57,12 +56,6 @@ def find(
 def test_levels_below_full_scale_are_found(level: int, exposure: float) -> None:
     images = clip(sphere()[0], level, exposure)
     assert find(images) == (WhiteLevel(level, "images"), np.count_nonzero(images == level))
-
-
-def test_a_saturated_background_does_not_hide_the_object() -> None:
-    images = clip(sphere()[0], 4095)
-    images[:, :20] = 4095
-    assert find(images)[0] == WhiteLevel(4095, "images")
 
 
 def test_the_file_s_full_scale_is_the_level_where_it_is_reached() -> None:
@@ -197,24 +190,6 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
     assert found == pytest.approx(full, abs=0.02)
     assert found < 0.5 * ls_error_deg(folder, normals, white_level=65_535)
     assert ls_error_deg(folder, normals, white_level=4095) == found
-
-
-def test_the_summary_uses_the_same_level(tmp_path: Path) -> None:
-    folder = write_capture(tmp_path / "vase", clip(sphere()[0], 4095))
-    summary = summarise_capture(open_capture(folder))
-    assert summary.white_level == WhiteLevel(4095, "images")
-    assert max(image.bright for image in summary.images) == pytest.approx(1)
-    assert max(image.saturated for image in summary.images) > 0.3
-    given = summarise_capture(open_capture(folder, white_level=8190))
-    assert given.white_level == WhiteLevel(8190, "given")
-    assert max(image.bright for image in given.images) == pytest.approx(0.5)
-    assert max(image.saturated for image in given.images) == 0
-
-
-@pytest.mark.parametrize("white_level", [0, -1, float("nan"), float("inf")])
-def test_levels_that_cannot_be(tmp_path: Path, white_level: float) -> None:
-    with pytest.raises(UsageError, match="expected a number above 0"):
-        open_capture(tmp_path, white_level=white_level)
 
 
 def add_sbit(path: Path, *bits: int) -> None:

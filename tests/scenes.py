@@ -1,0 +1,97 @@
+"""Lights, shapes and captures of known normals, which the tests of many rooms share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def directions_at(azimuth: Floats, zenith: Floats | float) -> Floats:
+    """Return the unit directions (count, 3) at these angles in radians."""
+    x, y, z = np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)
+    return np.stack((x, y, np.broadcast_to(z, x.shape)), axis=1)
+
+
+def cap_directions(count: int, limit_deg: float, seed: int = 0, *, even: bool = False) -> Floats:
+    """Random unit vectors (count, 3) within limit_deg of the view axis: even by angle, or even over the cap."""
+    rng = np.random.default_rng(seed)
+    azimuth, limit = rng.uniform(0, 2 * np.pi, count), np.radians(limit_deg)
+    zenith = limit * (np.sqrt(rng.uniform(0, 1, count)) if even else rng.uniform(0, 1, count))
+    return directions_at(azimuth, zenith)
+
+
+def spiral_lights(count: int, limit_deg: float = 35, start_deg: float = 5) -> Floats:
+    """Lights (count, 3) on a spiral, from start_deg to limit_deg from the view axis."""
+    return directions_at(np.arange(count) * 2.4, np.radians(np.linspace(start_deg, limit_deg, count)))
+
+
+def ring_lights(count: int, zenith_deg: float = 40, first_rad: float = 0.0) -> Floats:
+    """Lights (count, 3) evenly on a ring."""
+    return directions_at(first_rad + np.arange(count) * 2 * np.pi / count, np.radians(zenith_deg))
+
+
+def square_grid(size: int, reach: float = 1.0) -> tuple[Floats, Floats]:
+    """Return x (right) and y (up) of size x size points, from -reach to reach."""
+    axis = np.linspace(-reach, reach, size)
+    x, y = np.meshgrid(axis, -axis)
+    return x, y
+
+
+def sphere(size: int, reach: float = 0.97) -> tuple[Floats, Mask]:
+    """Normals (size, size, 3) of a unit sphere that touches the frame, and the mask of radius `reach`."""
+    x, y = square_grid(size)
+    inside = np.hypot(x, y) < reach
+    return np.stack((x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=-1), inside
+
+
+def sphere_cap(size: int, reach: float = 0.65) -> Floats:
+    """Normals (size, size, 3) of the part of a unit sphere that fills a square of half width `reach`."""
+    x, y = square_grid(size, reach)
+    return np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+
+
+def halfway(lights: Floats) -> Floats:
+    """Return the unit vectors (F, 3) between the lights and the view axis."""
+    half = lights + np.array((0.0, 0.0, 1.0))
+    return np.asarray(half / np.linalg.norm(half, axis=1, keepdims=True))
+
+
+def shade(
+    normals: Floats, lights: Floats, *, gloss: float = 0.0, exponent: float = 30, noise: float = 0.0
+) -> Floats:
+    """Observations (..., F): Lambert's cosine, a Blinn-Phong lobe, attached shadows, and noise of this deviation."""
+    cosine = np.clip(normals @ lights.T, 0, None)
+    seen = cosine + gloss * np.clip(normals @ halfway(lights).T, 0, None) ** exponent * (cosine > 0)
+    if noise:
+        seen = seen + np.random.default_rng(5).normal(0, noise, seen.shape)
+    return np.asarray(np.clip(seen, 0, None))
+
+
+def write_capture(
+    folder: Path,
+    images: NDArray[np.generic],
+    lights: NDArray[np.floating],
+    *,
+    mask: Mask | None = None,
+    normals: NDArray[np.floating] | None = None,
+    intensities: NDArray[np.floating] | None = None,
+) -> Path:
+    """Write images (F, H, W) or (F, H, W, 3) RGB as PNGs, with the lights and what else is given."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, image in enumerate(images):
+        stored = image if image.ndim == 2 else image[..., ::-1]
+        assert cv2.imwrite(str(folder / f"{number:03}.png"), stored)
+    np.savetxt(folder / "light_directions.txt", lights, fmt="%.9f")
+    if mask is not None:
+        assert cv2.imwrite(str(folder / "mask.png"), mask.astype(np.uint8) * 255)
+    if normals is not None:
+        np.save(folder / "normals_gt.npy", normals)
+    if intensities is not None:
+        np.savetxt(folder / "light_intensities.txt", intensities)
+    return folder
