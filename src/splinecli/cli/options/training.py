@@ -22,8 +22,6 @@ IMAGE_SIZE = Option(
 SCENE_LIGHTS = Option(
     None, "--n-lights", metavar="N", min=16, help="Number of lights of a rendered scene. [default: 500]"
 )
-MEASURED = Option(None, metavar="FILE", help="Also use these measured materials (.npz).")
-MEASURED_SHARE = Option(0.5, metavar="SHARE", min=0, max=1, help="Share of the materials that are measured.")
 
 # Settings of train.
 
