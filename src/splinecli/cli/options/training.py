@@ -14,7 +14,7 @@ SOURCES = Argument(
 )
 SCENES = Option(0, metavar="N", min=0, help="Render N random scenes.")
 MESHES = Option(
-    None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...). May be repeated."
+    None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated."
 )
 IMAGE_SIZE = Option(
     None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"
