@@ -1,10 +1,10 @@
 """How often wrong light files are recognised, and how often right ones are doubted.
 
-python benchmarks/wrong_lights.py CAPTURE... [--scenes 20] [--measured FILE.npz] [--draws 20] [--lights 12]
+python benchmarks/wrong_lights.py CAPTURE... [--scenes 20] [--draws 20] [--lights 12]
 
 Of each capture, draws of lights are checked (all lights where it has no more). Each draw is checked as it is and in
-every wrong way. Scenes that no default seed uses are rendered in all classes of materials, and with --measured also in
-measured ones. Prints a table in Markdown: how many are named / how many get the right mend, of how many.
+every wrong way. Scenes that no default seed uses are rendered in all classes of materials. Prints a table in Markdown:
+how many are named / how many get the right mend, of how many.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.capture.sample import sample_observations
-from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
 Array = NDArray[np.floating]
@@ -79,19 +78,12 @@ def words(check: LightCheck) -> str:
     return check.order or (check.best.name if check.best is not None else "")
 
 
-def rendered(count: int, measured: Path | None, n_lights: int) -> Iterator[Lit]:
+def rendered(count: int, n_lights: int) -> Iterator[Lit]:
     """Yield rendered scenes, by their class of material, with lights up to 60 degrees from the view."""
-    library = None if measured is None else read_measured(measured)
     config = SceneConfig(size=80, lights=4, samples=2, directions=48, bounces=2)
     for index in range(FIRST_SCENE, FIRST_SCENE + count):
         scene = draw_scene(SEED, index, config)
         rng = np.random.default_rng([SEED, index])
-        if library is not None:
-            generator = torch.Generator().manual_seed(index)
-            patches = int(scene.patch_of_face.max()) + 1
-            scene = dataclasses.replace(
-                scene, materials={**scene.materials, "measured": library.draw(patches, generator)}
-            )
         z, azimuth = rng.uniform(0.5, 0.99, n_lights), rng.uniform(0, 2 * np.pi, n_lights)
         radius = np.sqrt(1 - z * z)
         lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1).astype(np.float32)
@@ -118,7 +110,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--measured", type=Path)
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--lights", type=int, default=12)
     options = parser.parse_args(arguments)
@@ -128,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rng, longest = np.random.default_rng(SEED), 0.0
     sources = (
         real(options.captures, options.lights, options.draws),
-        rendered(options.scenes, options.measured, options.lights),
+        rendered(options.scenes, options.lights),
     )
     for source in sources:
         for name, observations, lights, mask, known in source:

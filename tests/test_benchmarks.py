@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from splinecli.methods import method_names
 from splinecli.networks.config import NetworkConfig
@@ -26,15 +30,20 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the benchmark of this name and return what it prints."""
 
     def run_benchmark(name: str, *arguments: str) -> str:
-        spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        main: Callable[[Sequence[str]], None] = module.main
+        main: Callable[[Sequence[str]], None] = load(name).main
         main(arguments)
         return capsys.readouterr().out
 
     return run_benchmark
+
+
+def load(name: str) -> Any:
+    """Import the benchmark of this name."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def numbers(line: str) -> list[float]:
@@ -159,3 +168,41 @@ def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
     ).splitlines()
     trained, fit = (float(re.findall(r": (\S+) degrees", line)[0]) for line in printed)
     assert trained < 0.7 * fit
+
+
+def test_measured_materials_are_those_of_explicit_vectors(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    shapes = {"W1": (3, 6, 5), "b1": (3, 5), "W2": (3, 5, 4), "b2": (3, 4), "W3": (3, 4, 3), "b3": (3, 3)}
+    arrays = {key: random.normal(0.2, 0.3, shape) for key, shape in shapes.items()}
+    np.savez(tmp_path / "materials.npz", names=["first", "brass", "third"], **arrays)
+    materials = load("measured_spheres").read_materials(tmp_path / "materials.npz")
+    assert materials.names == ["first", "third"]  # not the implausible one
+    normals, lights = (random.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
+    normals, lights = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normals, lights))
+    n, light = (torch.from_numpy(v).float() for v in (normals, lights))
+    shaded = materials.shade(torch.tensor([0, 1] * 3), n @ light.T, n[:, 2:], light[:, 2])
+    for pixel, column in np.ndindex(6, 20):
+        expected = _brdf(arrays, 2 * (pixel % 2), normals[pixel], lights[column])
+        expected *= math.pi * max(normals[pixel] @ lights[column], 0)
+        # In float32, the angles are known to some 1e-4 where half vector and normal all but meet.
+        assert shaded[pixel, column].item() == pytest.approx(expected, rel=1e-3, abs=1e-5)
+
+
+def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
+    """The gray BRDF by Rusinkiewicz's definition, with rotations of explicit vectors, in float64."""
+    view = np.array((0.0, 0.0, 1.0))
+    if light @ n < view @ n:
+        light, view = view, light
+    half = (light + view) / np.linalg.norm(light + view)
+    tangent = half - (half @ n) * n
+    tangent /= np.linalg.norm(tangent)
+    frame = np.stack(
+        (tangent, np.cross(n, tangent), n)
+    )  # the normal along z, the half vector at azimuth zero
+    half, light = frame @ half, frame @ light
+    cosine, sine = half[2], math.sqrt(1 - half[2] ** 2)
+    difference = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ light
+    value = np.concatenate((half, (difference[0], abs(difference[1]), difference[2])))
+    for layer in (1, 2):
+        value = np.maximum(value @ arrays[f"W{layer}"][material] + arrays[f"b{layer}"][material], 0)
+    return float(np.maximum(np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1, 0).mean())

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
+import warnings
 
-from splinecli.cli.signals import end_on_sigterm, ignore_signals, report_interruption
+from splinecli.cli.signals import INTERRUPTED, end_on_signals, ignore_signals, report_interruption
 
 
 def run() -> None:
     """Run the command of the arguments and exit. SIGTERM is treated like Ctrl-C."""
     try:
-        end_on_sigterm()
+        end_on_signals()
+        _quieten_libraries()
         # The imports take a second or more. A signal that comes meanwhile is handled, too.
         from splinecli.cli.main import main
 
@@ -19,13 +22,20 @@ def run() -> None:
     except KeyboardInterrupt:  # outside of the command
         code = report_interruption()
     ignore_signals()
-    if "TORCHELASTIC_RUN_ID" in os.environ:
-        # PyTorch's communication threads sometimes abort a process of torchrun after its work is done, and torchrun
-        # counts that as a failure. os._exit does not wait for these threads.
+    if code == INTERRUPTED or "TORCHELASTIC_RUN_ID" in os.environ:
+        # os._exit does not wait for threads. Those of Dask, in the middle of their start, would print tracebacks. Those
+        # of PyTorch sometimes abort a process of torchrun after its work is done, which torchrun counts as a failure.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _quieten_libraries() -> None:
+    """Keep libraries from printing: their warnings and logs are no messages for users, who get errors and warnings."""
+    logging.lastResort = logging.NullHandler()
+    if not sys.warnoptions:  # python -W
+        warnings.simplefilter("ignore")
 
 
 if __name__ == "__main__":

@@ -21,12 +21,6 @@ CASES = {
         "--n-lights is '20.5'; expected a whole number from 16. See 'splinecli prepare --help'."
     ),
     "prepare -o s --n-lights 4": "--n-lights is 4; expected at least 16. See 'splinecli prepare --help'.",
-    "prepare -o s --measured-share 2": (
-        "--measured-share is 2; expected at most 1. See 'splinecli prepare --help'."
-    ),
-    "prepare -o s --measured-share x": (
-        "--measured-share is 'x'; expected a number from 0 to 1. See 'splinecli prepare --help'."
-    ),
     "evaluate X --light-noise-deg 1 --light-noise-deg x": (
         "--light-noise-deg is 'x'; expected a number from 0. See 'splinecli evaluate --help'."
     ),

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tifffile
+import trimesh
 from scipy.io import savemat
 
 SHAPE = (16, 18)
@@ -121,6 +122,7 @@ def normal_maps(folder: Path) -> None:
     tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
     np.save(folder / "n.npy", normals())
     savemat(folder / "n.mat", {"n": normals()})
+    savemat(folder / "packed.mat", {"words": "text", "n": normals()}, do_compression=True)
     cv2.imwrite(str(folder / "mask.png"), np.full(SHAPE, 255, np.uint8))
     cv2.imwrite(str(folder / "colours.jpg"), np.full((*SHAPE, 3), 90, np.uint8))
     (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
@@ -145,6 +147,27 @@ def mirror_ball(folder: Path) -> None:
     np.savetxt(folder / "known.txt", LIGHTS[:4])
 
 
+def thin(folder: Path) -> None:
+    """Images one pixel wide, and crops of one pixel."""
+    for name, shape in (("column", (40, 1)), ("row", (1, 40))):
+        (folder / name).mkdir()
+        for number, light in enumerate(LIGHTS):
+            picture = np.resize(shaded(light), shape)
+            cv2.imwrite(str(folder / name / f"{number}.png"), picture)
+        np.savetxt(folder / name / "light_directions.txt", LIGHTS)
+
+
+def meshes(folder: Path) -> None:
+    """A tetrahedron in every format."""
+    corners, faces = (
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)),
+    )
+    shape = trimesh.Trimesh(corners, faces)
+    for ending in ("ply", "obj", "stl", "stl_ascii", "off"):
+        shape.export(folder / f"m.{ending}", file_type=ending)
+
+
 def earlier_results(folder: Path) -> None:
     """A capture whose results are read again: reports, finished trials."""
     (folder / "capture").mkdir()
@@ -162,6 +185,7 @@ def weights(folder: Path) -> None:
     config = NetworkConfig(map_size=8, width=2, li_blocks=1, ne_blocks=1, head_width=4, fits=("ls",))
     save_weights(SplineNet(config), folder / "w.safetensors")
     torch.save({"a": torch.zeros(3)}, folder / "g.ckpt")
+    torch.save({"a": torch.zeros(3)}, folder / "old.ckpt", _use_new_zipfile_serialization=False)
     (folder / "capture").mkdir()
     png_capture(folder / "capture")
 
@@ -225,7 +249,22 @@ TARGETS = (
         ("*",),
         tuple(
             f"integrate {name} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out --overwrite"
-            for name in ("n.png", "n.tif", "n.npy", "n.mat")
+            for name in ("n.png", "n.tif", "n.npy", "n.mat", "packed.mat")
+        ),
+    ),
+    Target(
+        "thin",
+        thin,
+        ("*/*",),
+        tuple(f"infer {name} --method ls -o out --overwrite" for name in ("column", "row")),
+    ),
+    Target(
+        "meshes",
+        meshes,
+        ("m.*",),
+        tuple(
+            f"prepare --mesh m.{ending} --size 8 --n-lights 16 -o out/{ending}"
+            for ending in ("ply", "obj", "stl", "stl_ascii", "off")
         ),
     ),
     Target(
@@ -250,10 +289,11 @@ TARGETS = (
     Target(
         "weights",
         weights,
-        ("w.safetensors", "g.ckpt"),
+        ("w.safetensors", "*.ckpt"),
         (
             "infer capture --weights w.safetensors -o out --overwrite",
             "import-weights g.ckpt g.ckpt -o out/w.safetensors --overwrite",
+            "import-weights old.ckpt g.ckpt -o out/w.safetensors --overwrite",
         ),
     ),
     Target(
@@ -286,7 +326,7 @@ def write_corpus(
             target.write(case)
             first = target.earlier or target.commands[0]
             for command in dict.fromkeys((first, *(target.commands if tried else target.commands[:1]))):
-                assert run(case, command) == 0 or "g.ckpt" in command, command
+                assert run(case, command) == 0 or ".ckpt" in command, command
             if tried:
                 shutil.rmtree(case)
         folder.mkdir(exist_ok=True)

@@ -201,6 +201,27 @@ def safetensors_header(data: bytes, rng: random.Random) -> bytes:
 OF_BYTES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
     flip, flip, flip_header, flip_header, cut, splice, odd_word, odd_word, fill, garbage,
 )  # fmt: skip
+
+
+def mat_type(data: bytes, rng: random.Random) -> bytes:
+    """Change the type of an element of a .mat file, in its compressed content if there is one."""
+    if data[128:132] == struct.pack("<I", 15):
+        length = struct.unpack("<I", data[132:136])[0]
+        try:
+            inner = _another_type(zlib.decompress(data[136 : 136 + length]), rng)
+        except zlib.error:
+            return flip(data, rng)
+        packed = zlib.compress(inner)
+        return data[:128] + struct.pack("<II", 15, len(packed)) + packed + data[136 + length :]
+    return data[:128] + _another_type(data[128:], rng)
+
+
+def _another_type(content: bytes, rng: random.Random) -> bytes:
+    place = 8 * rng.randrange(min(10, len(content) // 8) or 1)
+    kind = rng.choice((0, 8, 10, 11, 14, 15, 16, 17, 18, 20, 200, 65_535, 0x40001, 0x8000FFFF))
+    return content[:place] + struct.pack("<I", kind) + content[place + 4 :]
+
+
 OF_TEXTS = (number, number, number, lines, lines)
 
 
@@ -213,6 +234,8 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
         choices += OF_TEXTS * 2 + (long,)
     if path.suffix in (".png", ".tif", ".mat"):
         choices.append(lambda _, __: _bomb(path.suffix))
+    if path.suffix == ".mat":
+        choices += [mat_type] * 8
     if path.suffix == ".json":
         choices += [json_value] * 15
     if path.suffix == ".png":

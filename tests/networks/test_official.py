@@ -7,6 +7,7 @@ weights, are saved as the authors save theirs, imported, and asked the same ques
 from __future__ import annotations
 
 import pickle
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -235,6 +236,51 @@ def test_tensors_that_do_not_fit(
 def test_exchanged_files(files: Files) -> None:
     with pytest.raises(ModelError, match=r"Give the authors' NUMBER-G\.ckpt first and NUMBER-D\.ckpt second"):
         import_official(*reversed(files))
+
+
+def deflated(path: Path) -> None:
+    torch.save({"a": torch.zeros(50_000_000)}, path)
+    with zipfile.ZipFile(path) as archive:
+        records = {record.filename: archive.read(record) for record in archive.infolist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in records.items():
+            archive.writestr(name, content)
+
+
+def countless_records(path: Path) -> None:
+    torch.save({"a": torch.zeros(3)}, path)
+    with zipfile.ZipFile(path, "a") as archive:
+        for number in range(20_000):
+            archive.writestr(f"archive/extra/{number}", b"")
+
+
+def countless_tensors(path: Path) -> None:
+    empty = torch.zeros(0)
+    torch.save({str(number): empty[:0] for number in range(60_000)}, path)
+
+
+def countless_old_tensors(path: Path) -> None:
+    empty = torch.zeros(0)
+    state = {str(number): empty[:0] for number in range(60_000)}
+    torch.save(state, path, _use_new_zipfile_serialization=False)
+
+
+@pytest.mark.parametrize("write", [deflated, countless_records, countless_tensors, countless_old_tensors])
+def test_checkpoints_that_expand_are_refused_unread(
+    write: Callable[[Path], None], files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "G.ckpt")
+    monkeypatch.setattr(torch, "load", None)
+    with pytest.raises(ModelError, match=r"G\.ckpt: not a PyTorch checkpoint, or damaged") as error:
+        import_official(tmp_path / "G.ckpt", files[1])
+    assert type(error.value.__cause__) is ValueError
+
+
+def test_tensors_without_numbers_are_refused(files: Files, tmp_path: Path) -> None:
+    for tensor in (torch.zeros(3).to_sparse(), torch.zeros(3, device="meta")):
+        torch.save({"a": tensor}, tmp_path / "G.ckpt")
+        with pytest.raises(ModelError, match="not a state dictionary"):
+            import_official(tmp_path / "G.ckpt", files[1])
 
 
 def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:

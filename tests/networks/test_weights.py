@@ -197,3 +197,12 @@ def test_weights_that_are_not_finite(tmp_path: Path) -> None:
     save_weights(network, tmp_path / "nan.safetensors")
     with pytest.raises(ModelError, match="not finite"):
         load_weights(tmp_path / "nan.safetensors")
+
+
+def test_countless_empty_tensors_are_refused_unread(tmp_path: Path) -> None:
+    header = json.dumps(
+        {str(number): {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for number in range(30_000)}
+    ).encode()
+    (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(ModelError, match=r"not a safetensors file, or cut short \(a header of \d+ b"):
+        load_weights(tmp_path / "a.safetensors")

@@ -8,12 +8,14 @@ from importlib import resources
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from browser import OpenPage
 from splinecli.evaluation.outcome import Evaluation, Result
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.report import html_report
-from splinecli.results.index import Entry, index_page
+from splinecli.results.files import NORMALS
+from splinecli.results.index import Entry, Row, index_page
 
 ASSETS = resources.files("splinecli") / "assets"
 PAGES = ("index.html", "page.html", "report.html")
@@ -66,3 +68,20 @@ def test_the_report_fits_a_narrow_screen(open_page: OpenPage):
     )
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
     assert page.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)") == 400
+
+
+def test_pictures_of_earlier_results_that_are_none_of_ours_are_not_shown(tmp_path: Path) -> None:
+    folder = tmp_path / "other"
+    folder.mkdir()
+    entry = Entry(Row("other"), (NORMALS["png"],))
+    picture = folder / NORMALS["png"]
+    cv2.imwrite(str(picture), np.full((9, 9, 3), 200, np.uint8))
+    assert "data:image/jpeg" in index_page([entry], tmp_path)
+    content = bytearray(picture.read_bytes())
+    content[16:24] = (20_000).to_bytes(4, "big") * 2  # the size, in a file of few bytes
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    picture.write_bytes(content)
+    with mock.patch("splinecli.capture.formats.decoding._decode", side_effect=AssertionError):
+        assert "data:image/jpeg" not in index_page([entry], tmp_path)
+    tifffile.imwrite(picture, np.zeros((9, 9, 3), np.float32), photometric="rgb")
+    assert "data:image/jpeg" not in index_page([entry], tmp_path)

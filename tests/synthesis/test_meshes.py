@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from splinecli.errors import InputError
+from splinecli.synthesis import meshes
 from splinecli.synthesis.meshes import REACH, Mesh, fit_to_frame, read_mesh, split_long_edges
 
 trimesh: Any = pytest.importorskip("trimesh", reason="needs the extra 'render'")
@@ -26,10 +28,11 @@ def area(mesh: Mesh) -> float:
     return float(np.linalg.norm(facing, axis=1).sum() / 2)
 
 
-@pytest.mark.parametrize("ending", ["ply", "obj", "stl", "off", "glb"])
+@pytest.mark.parametrize("ending", ["ply", "obj", "stl", "stl_ascii", "off"])
 def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"ball.{ending}"
-    trimesh.creation.icosphere(subdivisions=4, radius=17.0).apply_translation((5, -3, 40)).export(path)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=17.0).apply_translation((5, -3, 40))
+    ball.export(path, file_type=ending)
     mesh = read_mesh(path)
     assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
     assert np.abs(mesh.vertices).max() == pytest.approx(REACH, abs=1e-3)
@@ -77,7 +80,7 @@ def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_text("ply, but not really")
     with pytest.raises(InputError, match=r"broken\.ply: not a mesh that can be read"):
         read_mesh(tmp_path / "broken.ply")
-    (tmp_path / "notes.txt").write_text("v 0 0 0")
+    (tmp_path / "notes.txt").write_text("nothing but words")
     with pytest.raises(InputError, match="not a mesh that can be read"):
         read_mesh(tmp_path / "notes.txt")
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
@@ -87,3 +90,25 @@ def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "needle.obj").write_text("v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n")
     with pytest.raises(InputError, match="no extent that a camera along -z could see"):
         read_mesh(tmp_path / "needle.obj")
+
+
+def test_archives_and_files_of_other_formats_are_refused(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere()
+    for ending in ("zip", "ply"):
+        with zipfile.ZipFile(tmp_path / f"archive.{ending}", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a.ply", ball.export(file_type="ply"))
+        with pytest.raises(InputError, match=r"not a mesh that can be read .*has none of these formats"):
+            read_mesh(tmp_path / f"archive.{ending}")
+    ball.export(tmp_path / "ball.glb")
+    with pytest.raises(InputError, match="Give a triangle mesh as PLY, OBJ, STL or OFF"):
+        read_mesh(tmp_path / "ball.glb")
+
+
+def test_large_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "long.obj").write_bytes(b"v 0 0 0\n" + b" " * 32_000_000)
+    with pytest.raises(InputError, match=r"long\.obj: found a longer file than 32 MB"):
+        read_mesh(tmp_path / "long.obj")
+    (tmp_path / "fan.obj").write_bytes(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + b" 1 2 3" * 700)
+    monkeypatch.setattr(meshes, "MOST_FACES", 2000)
+    with pytest.raises(InputError, match=r"fan\.obj: found 2098 triangles, expected at most 2000"):
+        read_mesh(tmp_path / "fan.obj")

@@ -112,5 +112,3 @@ def test_patches_are_connected_areas_of_about_one_size() -> None:
 def test_settings_out_of_range(name: str) -> None:
     with pytest.raises(UsageError, match=f"{name} is -1"):
         SceneConfig(**{name: -1})
-    with pytest.raises(UsageError, match="measured_share is 2"):
-        SceneConfig(measured_share=2)

@@ -123,10 +123,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("updates=alternating", {"updates": "alternating"}),
         ('updates="alternating"', {"updates": "alternating"}),
         ("network.size = paper", {"network": {"size": "paper"}}),
-        (
-            "pixels.measured_materials=/data/a=b.npz",
-            {"pixels": {"measured_materials": "/data/a=b.npz"}},
-        ),
+        ("start_from=/data/a=b.safetensors", {"start_from": "/data/a=b.safetensors"}),
         ("a.b.c=1", {"a": {"b": {"c": 1}}}),
         ("sources={generator = 1.0}", {"sources": {"generator": 1.0}}),
         ("seed=", {"seed": ""}),
@@ -181,12 +178,10 @@ def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: 
     config = configure(
         changes=[
             {"sources": {"~/set": 1.0}},
-            {"pixels": {"measured_materials": "~/merl.npz"}},
             {"start_from": "~/mine.safetensors"},
         ]
     )
     assert config.sources == {str(tmp_path / "set"): 1.0}
-    assert config.pixels.measured_materials == str(tmp_path / "merl.npz")
     assert config.start_from == str(tmp_path / "mine.safetensors")
 
 
@@ -204,3 +199,13 @@ def test_sources_of_the_command_line() -> None:
     assert parse_sources(sets, None) == {"a": 1.0, "b": 1.0}
     assert parse_sources(sets, 0.5) == {"a": 1.0, "b": 1.0, GENERATOR: 0.5}
     assert parse_sources([], 0.0) == {}
+
+
+def test_removed_settings_of_earlier_versions(tmp_path: Path) -> None:
+    unused = write(tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n")
+    assert configure("compact", unused) == preset("compact")
+    used = write(tmp_path / "used.toml", "[pixels]\nmeasured_share = 0.5\n")
+    with pytest.raises(
+        ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"
+    ):
+        configure("compact", used)

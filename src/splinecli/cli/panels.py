@@ -83,7 +83,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "prepare": {
         "Input": ("--as-stored", "--update", "--white-level", *LIMITS),
-        "Scenes": ("--scenes", "--mesh", "--size", "--n-lights", "--measured", "--measured-share", "--seed"),
+        "Scenes": ("--scenes", "--mesh", "--size", "--n-lights", "--seed"),
         "Output": ("--output", *REPEAT),
         "Speed": ("--workers",),
     },

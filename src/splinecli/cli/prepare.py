@@ -28,8 +28,6 @@ def prepare(
     mesh: list[Path] | None = training.MESHES,
     size: int | None = training.IMAGE_SIZE,
     n_lights: int | None = training.SCENE_LIGHTS,
-    measured: Path | None = training.MEASURED,
-    measured_share: float = training.MEASURED_SHARE,
     seed: int = inputs.SEED,
     workers: str = distribution.SCENE_WORKERS,
     as_json: bool = outputs.JSON,
@@ -53,7 +51,7 @@ def prepare(
     options = PrepareOptions(
         output=output,
         captures=tuple(folder for source in sources or [] for folder in find_captures(source)),
-        scenes=_plan(scenes, mesh or [], seed, size, n_lights, measured, measured_share),
+        scenes=_plan(scenes, mesh or [], seed, size, n_lights),
         as_stored=as_stored,
         white_level=white_level,
         update=update,
@@ -64,26 +62,13 @@ def prepare(
     return worst_exit_code(capture["exit_code"] for capture in summary["skipped"])
 
 
-def _plan(
-    scenes: int,
-    meshes: list[Path],
-    seed: int,
-    size: int | None,
-    n_lights: int | None,
-    measured: Path | None,
-    measured_share: float,
-) -> ScenePlan:
+def _plan(scenes: int, meshes: list[Path], seed: int, size: int | None, n_lights: int | None) -> ScenePlan:
     from splinecli.pixel_sets.rendered import ScenePlan
     from splinecli.synthesis.scenes import SceneConfig
 
     config = SceneConfig()
-    config = replace(
-        config,
-        size=size or config.size,
-        lights=n_lights or config.lights,
-        measured_share=measured_share if measured else 0.0,
-    )
-    return ScenePlan(config, seed, scenes, tuple(meshes), measured)
+    config = replace(config, size=size or config.size, lights=n_lights or config.lights)
+    return ScenePlan(config, seed, scenes, tuple(meshes))
 
 
 def _in_words(summary: dict[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""SIGTERM, which job schedulers send, ends the process like Ctrl-C, and within two seconds."""
+"""Ctrl-C and SIGTERM, which job schedulers send, end the process with exit code 130; SIGTERM within two seconds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from contextlib import suppress
-from typing import Any, NoReturn
+from types import FrameType
 
 INTERRUPTED = 130
 """Exit code of an interrupted process."""
@@ -16,13 +16,21 @@ GRACE_SECONDS = 1.5
 """Time that the command has to clean up."""
 
 
-def end_on_sigterm() -> None:
-    """Raise KeyboardInterrupt in the main thread at SIGTERM, and end the process if that does not end it.
+_IMPORT_SECONDS = 0.05
+"""Time between two looks at whether an import is done."""
+
+_IMPORTS = "<frozen importlib._bootstrap>"
+
+
+def end_on_signals() -> None:
+    """Raise KeyboardInterrupt in the main thread at Ctrl-C and SIGTERM; end the process if SIGTERM does not end it.
 
     Python delivers a signal only between two of its instructions. One call into a library may take minutes, and an
     exception in a callback of a library is lost. Another thread learns of the signal at once.
     """
     signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as by nohup
+        signal.signal(signal.SIGINT, _interrupt)
     if os.name == "nt":
         return
     reader, writer = os.pipe()
@@ -44,8 +52,17 @@ def report_interruption() -> int:
     return INTERRUPTED
 
 
-def _interrupt(number: int, frame: Any) -> NoReturn:
-    signal.signal(number, signal.SIG_IGN)
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, but during an import only afterwards: trimesh, for one, goes on after any exception."""
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORTS:
+            again = threading.Timer(_IMPORT_SECONDS, signal.raise_signal, (number,))
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    if number == signal.SIGTERM:
+        signal.signal(number, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 

@@ -14,7 +14,9 @@ Their normals are assumed to be in our frame: x right, y up, z to the camera.
 
 from __future__ import annotations
 
+import pickletools
 import warnings
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from splinecli.capture.paths import check_file
 from splinecli.errors import InputError, ModelError
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import load_strictly
+from splinecli.networks.weights import check_length, load_strictly
 
 # Our module names and theirs. LI-Net differs in the name of its sequences, NE-Net in the name of each module.
 _LI_NET_SEQUENCE = ("layers", "main")
@@ -44,6 +46,8 @@ _NE_NET_MODULES = {
 # map, also at test time (it never leaves the training mode), so these values are not used.
 _TRACKED = ("running_mean", "running_var", "num_batches_tracked")
 _MOST_NAMES = 5
+_MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
+"""Records of an archive, bytes and instructions of a pickle. The authors' have some dozens, 10 kB and 2,000."""
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
@@ -150,20 +154,54 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:
         check_file(path, "a checkpoint")
+        check_length(path, hint)
+        _check_content(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the errors below cover what PyTorch warns of
             state = torch.load(path, map_location="cpu", weights_only=True)
     except InputError as error:
         raise ModelError(error.problem, path=path, hint=hint) from error
+    except ModelError:
+        raise
     except OSError as error:
         raise ModelError(f"cannot be read ({error.strerror or error})", path=path, hint=hint) from error
     except Exception as error:  # damaged pickles raise many kinds of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in state.items()
+        isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor)
+        for name, tensor in state.items()
     ):
         raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
     return state
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    return tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
+
+
+def _check_content(path: Path) -> None:
+    """Raise ValueError for a checkpoint that would take far more memory than it has bytes.
+
+    It may be an archive, as torch.save writes since 1.6, whose records are not compressed; or pickles and numbers.
+    """
+    with path.open("rb") as file:
+        if file.read(4) == b"PK\3\4":
+            # Before the directory is read: each record has such a mark in it.
+            if sum(part.count(b"PK\1\2") for part in iter(lambda: file.read(1 << 20), b"")) > _MOST_RECORDS:
+                raise ValueError("too many records")
+            records = zipfile.ZipFile(file).infolist()
+            expanded = sum(record.file_size for record in records)
+            pickled = sum(record.file_size for record in records if record.filename.endswith(".pkl"))
+            if expanded > path.stat().st_size or pickled > _LONGEST_PICKLE:
+                raise ValueError("records that are compressed, or too many tensors")
+            return
+        file.seek(0)
+        steps = 0
+        for _ in range(5):  # a mark, the version, the system, the tensors, and the names of their numbers
+            for _ in pickletools.genops(file):
+                steps += 1
+                if steps > _MOST_STEPS:
+                    raise ValueError("too many tensors")
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -20,8 +20,11 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 
 FORMAT = "splinecli-weights-1"
+LONGEST = 500_000_000
+"""Bytes of the longest file of tensors that is read; a checkpoint of the paper's networks has 170 MB."""
+
 _LENGTH_BYTES = 8  # of the number at the start of a safetensors file, the length of its header
-_LONGEST = 500_000_000  # bytes of a file; a checkpoint of the paper's networks has 170 MB
+_LONGEST_HEADER = 1 << 20  # bytes; a tensor has about 100
 SHIPPED = resources.files("splinecli") / "assets"
 
 
@@ -96,12 +99,10 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
             raise ModelError("is not a file", path=path, hint=hint)
         if not path.is_file():
             raise ModelError("no such file", path=path, hint=hint)
-        if path.stat().st_size > _LONGEST:
-            raise ModelError(
-                f"found {path.stat().st_size / 1e6:.0f} MB, expected at most {_LONGEST / 1e6:.0f}",
-                path=path,
-                hint=hint,
-            )
+        check_length(path, hint)
+        with path.open("rb") as start:
+            if (length := int.from_bytes(start.read(_LENGTH_BYTES), "little")) > _LONGEST_HEADER:
+                raise SafetensorError(f"a header of {length} bytes")
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             found = metadata.get("format", "none")
@@ -114,6 +115,13 @@ def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str,
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
         raise ModelError("damaged: the tensors do not match the checksum in the file", path=path, hint=hint)
     return tensors, metadata
+
+
+def check_length(path: Path, hint: str) -> None:
+    """Raise ModelError for a file of more than LONGEST bytes."""
+    if (length := path.stat().st_size) > LONGEST:
+        found = f"found {length / 1e6:.0f} MB, expected at most {LONGEST / 1e6:.0f}"
+        raise ModelError(found, path=path, hint=hint)
 
 
 def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str, Any]:

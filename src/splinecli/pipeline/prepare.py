@@ -62,7 +62,7 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         reason and an exit code.
 
     Raises:
-        InputError: a mesh or the file of measured materials cannot be used.
+        InputError: a mesh cannot be used.
         OutputError: the set cannot be written, or has a scene that was rendered with other settings.
         UsageError: the packages of the extra `render` are not installed.
     """

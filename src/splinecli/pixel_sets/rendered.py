@@ -16,8 +16,6 @@ from splinecli.files import file_sha256
 from splinecli.pixel_sets.captures import free_name
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
-from splinecli.synthesis.measured import MeasuredLibrary
-from splinecli.synthesis.measured_files import read_measured
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.principled import CLASSES
 from splinecli.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
@@ -38,19 +36,12 @@ class ScenePlan:
         seed: seed of all random numbers.
         count: number of random scenes.
         meshes: mesh files of the user.
-        measured_materials: a file of measured materials, or None.
     """
 
     config: SceneConfig
     seed: int
     count: int
     meshes: tuple[Path, ...] = ()
-    measured_materials: Path | None = None
-
-    @cached_property
-    def library(self) -> MeasuredLibrary | None:
-        """The measured materials. Raises InputError."""
-        return None if self.measured_materials is None else read_measured(self.measured_materials)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -71,18 +62,14 @@ class ScenePlan:
             **asdict(self.config),
             "seed": self.seed,
             "mesh": file_sha256(self.meshes[position]) if position < len(self.meshes) else None,
-            "measured_materials": self._materials_sha256,
+            "measured_share": 0.0,  # earlier versions had a choice
         }
-
-    @cached_property
-    def _materials_sha256(self) -> str | None:
-        return None if self.measured_materials is None else file_sha256(self.measured_materials)
 
     def check_inputs(self) -> None:
         """Check what rendering needs, before anything is rendered.
 
         Raises:
-            InputError: a mesh or the file of measured materials cannot be used.
+            InputError: a mesh cannot be used.
             UsageError: there are scenes and the packages of the extra `render` are not installed.
         """
         if self.names:
@@ -90,7 +77,6 @@ class ScenePlan:
                 import_extra(package, "render")
         for path in self.meshes:
             read_mesh(path)
-        _ = self.library
 
     def check_set(self, writer: PixelSetWriter) -> None:
         """Raise OutputError if the set has one of the scenes, rendered with other settings."""
@@ -124,7 +110,7 @@ def add_scene(
         The names of the scene's entries.
 
     Raises:
-        InputError: the mesh or the file of measured materials cannot be used, or the camera sees nothing.
+        InputError: the mesh cannot be used, or the camera sees nothing.
         OutputError: an entry cannot be written.
         UsageError: the packages of the extra `render` are not installed.
     """
@@ -177,8 +163,7 @@ def render_planned(
     mesh_file = plan.meshes[position] if position < len(plan.meshes) else None
     mesh = None if mesh_file is None else read_mesh(mesh_file)
     index = position - len(plan.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
-    draw_measured = plan.library.draw if plan.library else None
-    scene = draw_scene(plan.seed, index, plan.config, mesh, draw_measured=draw_measured)
+    scene = draw_scene(plan.seed, index, plan.config, mesh)
     rendered = render_scene(scene, plan.config, progress)
     if not rendered.mask.any():
         raise InputError(

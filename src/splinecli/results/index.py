@@ -19,6 +19,9 @@ INDEX = "index.html"
 THUMBNAIL = 256, 192
 """Largest width and height of a small normal map in pixels: twice its size on the page, for sharp screens."""
 
+_LARGEST_SHOWN = 10**9
+"""Bytes of the largest normal map that is shown small: 33 megapixels of 16 bits. Others in the folder may be bombs."""
+
 _OURS = b'<meta name="generator" content="splinecli">'
 _START = 1 << 16  # bytes of a page, which contain this mark
 
@@ -99,11 +102,16 @@ def _thumbnail(path: Path) -> str | None:
     import cv2
     import numpy as np
 
-    from splinecli.capture.formats.decoding import decode_image
+    from splinecli.capture.formats.decoding import decode_image, stored_size
+    from splinecli.capture.formats.image_size import image_bytes
 
     try:
+        if image_bytes(*stored_size(path)) > _LARGEST_SHOWN:
+            return None
         picture = decode_image(path)
     except InputError:
+        return None
+    if picture.dtype.kind != "u":
         return None
     height, width = picture.shape[:2]
     shrink = min(1, THUMBNAIL[0] / width, THUMBNAIL[1] / height)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from splinecli.observation_map import dot, rotate_about_view_axis
-from splinecli.synthesis.material import Material
+from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.random_numbers import draw_uniform
 
 
@@ -55,7 +55,7 @@ class Wall:
         )
         return 1 - (depth / self.softness).clamp(0, 1)
 
-    def reflected(self, normals: Tensor, material: Material, directions: Tensor) -> Tensor:
+    def reflected(self, normals: Tensor, material: PrincipledMaterial, directions: Tensor) -> Tensor:
         """Return the radiance (P, D) that light from the wall adds to pixels of these normals (P, 3) and material.
 
         The reflected light comes from one direction, `towards`. On a metal it makes a highlight. Real walls and

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +12,16 @@ from numpy.typing import NDArray
 
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
+from splinecli.memory import is_out_of_memory
 
 Floats = NDArray[np.floating]
 
 REACH = 0.94
 """Half-width of the object in the camera's square."""
+
+MOST_FACES = 2_000_000
+_LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
+"""Bytes of a file of each format. A byte of the first three may give a triangle, of 110 bytes in memory."""
 
 
 @dataclass(frozen=True)
@@ -32,30 +39,39 @@ class Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a mesh file in any format that trimesh reads (PLY, OBJ, STL, OFF, glTF) and fit it into the frame.
+    """Read a mesh file (PLY, OBJ, STL or OFF) and fit it into the frame.
 
     The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces around it, weighted by
     angle. Long edges are split, so that every part of the surface has vertices and can have its own material.
 
     Raises:
-        InputError: the file is missing, not a mesh, or has no faces.
+        InputError: the file is missing, too long, not a mesh, or has no faces.
     """
     import trimesh
 
-    check_file(Path(path), "a mesh")
+    check_file(path := Path(path), "a mesh")
     try:
-        loaded = trimesh.load_mesh(path, process=True)
+        kind, content = _read_known(path)
+        # From its content, so that no file that it names is read.
+        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False)
+        if (count := len(loaded.faces)) > MOST_FACES:
+            raise InputError(f"found {count} triangles, expected at most {MOST_FACES}", path=path)
+        loaded.process()
         # Texture coordinates split vertices, and would split the smooth normals too.
         loaded.merge_vertices(merge_tex=True, merge_norm=True)
         if len(loaded.faces) and loaded.is_watertight and loaded.volume < 0:
             loaded.invert()  # the mesh is inside out, so the camera would see nothing
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
         normals = np.asarray(loaded.vertex_normals) if len(faces) else np.zeros((0, 3))
-    except Exception as error:  # the readers of two dozen formats raise many kinds
+    except InputError:
+        raise
+    except Exception as error:  # the readers raise many kinds
+        if is_out_of_memory(error):
+            raise
         raise InputError(
             f"not a mesh that can be read ({type(error).__name__}: {str(error).strip() or 'no reason given'})",
             path=path,
-            hint="Give a triangle mesh as PLY, OBJ, STL, OFF or glTF",
+            hint="Give a triangle mesh as PLY, OBJ, STL or OFF",
         ) from error
     if not len(faces):
         raise InputError("the mesh has no faces", path=path, hint="Point clouds cannot be rendered")
@@ -63,6 +79,29 @@ def read_mesh(path: str | Path) -> Mesh:
         raise InputError("the mesh has no extent that a camera along -z could see", path=path)
     mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
     return split_long_edges(fit_to_frame(mesh), longest=0.03)
+
+
+def _read_known(path: Path) -> tuple[str, bytes]:
+    """Return the format of a mesh file, by its content, and its content.
+
+    Raises:
+        InputError: it is of another format or too long.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        content = file.read(max(_LONGEST.values()) + 1)
+    triangles = int.from_bytes(content[80:84], "little")
+    if content.startswith((b"ply", b"OFF")):
+        kind = content[:3].decode().lower()
+    elif content.startswith(b"solid") or len(content) == 84 + 50 * triangles:
+        kind = "stl"
+    elif b"\0" not in content and re.search(rb"^\s*v\s", content, re.MULTILINE):
+        kind = "obj"
+    else:
+        raise ValueError("it has none of these formats")
+    if len(content) > (most := _LONGEST[kind]):
+        raise InputError(f"found a longer file than {most / 1e6:.0f} MB", path=path, hint="Decimate the mesh")
+    return kind, content
 
 
 def fit_to_frame(mesh: Mesh, *, reach: float = REACH) -> Mesh:
@@ -73,7 +112,7 @@ def fit_to_frame(mesh: Mesh, *, reach: float = REACH) -> Mesh:
     return Mesh(vertices.astype(np.float32), mesh.faces, mesh.vertex_normals)
 
 
-def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = 2_000_000) -> Mesh:
+def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = MOST_FACES) -> Mesh:
     """Divide faces into four until no edge is longer than `longest` or there would be more than `most_faces` faces."""
     # Interpolate positions and normals together, so that the shading stays the same.
     corners = np.concatenate((mesh.vertices, mesh.vertex_normals), axis=1).astype(np.float64)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splinecli.errors import ModelError
 from splinecli.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
 from splinecli.synthesis.effects import (
@@ -21,11 +20,7 @@ from splinecli.synthesis.effects import (
     draw_wall,
 )
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
-from splinecli.synthesis.material import Material
-from splinecli.synthesis.measured import MeasuredLibrary
-from splinecli.synthesis.measured_files import read_measured
-from splinecli.synthesis.mixed_material import MixedMaterial, choose
-from splinecli.synthesis.principled import draw_material
+from splinecli.synthesis.principled import PrincipledMaterial, choose, draw_material
 
 
 @dataclass(frozen=True)
@@ -38,9 +33,6 @@ class PixelGeneratorConfig(CaptureConfig):
     second_wall_share: float = 0.2
     ambient_share: float = 0.5
     mixed_share: float = 0.2
-    # Share of the materials that come from a file of measured ones (docs/files-and-frames.md), and its path.
-    measured_share: float = 0.0
-    measured_materials: str = ""
 
 
 @dataclass(frozen=True)
@@ -48,7 +40,7 @@ class PixelScene:
     """P pixels seen from +z. `mixed` is a second surface of the first M pixels: an edge, or a second material."""
 
     normals: Tensor
-    material: Material
+    material: PrincipledMaterial
     walls: tuple[Wall, ...]
     ambient: Tensor
     mixed: PixelScene | None = None
@@ -115,50 +107,10 @@ def draw_neighbour_normals(normals: Tensor, generator: torch.Generator) -> Tenso
     return torch.nn.functional.normalize(moved, dim=1)
 
 
-def read_library(config: PixelGeneratorConfig, device: torch.device) -> MeasuredLibrary | None:
-    """Read the measured materials of a configuration; None where their share is 0.
-
-    Raises ModelError where it names no file, InputError where the file cannot be used.
-    """
-    if not config.measured_share:
-        return None
-    if not config.measured_materials:
-        raise ModelError(
-            f"training setting 'measured_share' is {config.measured_share}, but 'measured_materials' names no file",
-            hint="Name a file of measured materials there, or set the share to 0",
-        )
-    return read_measured(config.measured_materials, device)
-
-
-def draw_reflectance(
-    pixels: int, share: float, library: MeasuredLibrary | None, generator: torch.Generator
-) -> Material:
-    """Draw random materials, with probability `share` from the library, else from the principled model."""
-    material = draw_material(pixels, generator)
-    if library is None or not share:
-        return material
-    measured = library.draw(pixels, generator)
-    kind = (torch.rand(pixels, generator=generator, device=generator.device) < share).long()
-    return MixedMaterial((material, measured), kind, torch.arange(pixels, device=kind.device))
-
-
-def draw_scene(
-    pixels: int,
-    config: PixelGeneratorConfig,
-    generator: torch.Generator,
-    library: MeasuredLibrary | None = None,
-) -> PixelScene:
-    """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials.
-
-    Args:
-        library: the measured materials; read from the configuration's file where it is None.
-
-    Raises:
-        ModelError, InputError: as read_library does.
-    """
-    library = library or read_library(config, generator.device)
+def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
+    """Draw random pixels. Half of the mixed pixels lie on an edge, with a second normal; half blend two materials."""
     normals = draw_visible_normals(pixels, generator)
-    material = draw_reflectance(pixels, config.measured_share, library, generator)
+    material = draw_material(pixels, generator)
     walls = tuple(
         draw_wall(
             normals, share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
@@ -172,8 +124,7 @@ def draw_scene(
         return PixelScene(normals, material, walls, ambient)
     # Every second mixed pixel is an edge, with one material on two normals. The others have two materials.
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
-    other = draw_reflectance(count, config.measured_share, library, generator)
-    second = choose(edge, material.take(slice(count)), other)
+    second = choose(edge, material.take(slice(count)), draw_material(count, generator))
     second_normals = torch.where(edge, draw_neighbour_normals(normals[:count], generator), normals[:count])
     mixed = PixelScene(second_normals, second, (), ambient[:count])
     weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(edge, 0.4, 0.7)
@@ -184,15 +135,13 @@ class PixelGenerator:
     """Draws batches of pixels on the device of `generator`, reproducible from its seed."""
 
     def __init__(self, config: PixelGeneratorConfig, generator: torch.Generator) -> None:
-        """Read the measured materials, if any. Raises ModelError, InputError."""
         self.config = config
         self.generator = generator
-        self.library = read_library(config, generator.device)
 
     def draw(self, pixels: int) -> PixelBatch:
         """Draw a batch of P pixels, each with its own rig. F is the largest number of lights."""
         config, generator = self.config, self.generator
-        scene = draw_scene(pixels, config, generator, self.library)
+        scene = draw_scene(pixels, config, generator)
         counts = draw_light_counts(
             pixels, config.min_lights, config.max_lights, config.usual_lights, generator
         )

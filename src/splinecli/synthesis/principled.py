@@ -59,11 +59,17 @@ class PrincipledMaterial:
     retro: Tensor
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
-        """Return the materials of some of the pixels."""
+        """Return the materials of some of the pixels. An index tensor may name a pixel several times."""
         return PrincipledMaterial(*(getattr(self, field.name)[pixels] for field in fields(self)))
 
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
-        """Return pi times the reflected radiance (P, D). Arguments as in Material.shade."""
+        """Return pi times the reflected radiance, the BRDF times max(n.l, 0), under unit light (P, D).
+
+        Args:
+            n_dot_l: (P, D) cosines of normal and light. They are negative in attached shadow, where radiance is zero.
+            n_dot_v: (P, 1) cosines of normal and viewing direction, positive.
+            l_dot_v: (D) or (P, D) cosines of light and viewing direction.
+        """
         lit = n_dot_l.clamp(min=0)
         # Light from behind the surface has no half vector. Rounding would make it NaN.
         l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
@@ -102,6 +108,12 @@ class PrincipledMaterial:
     def albedo(self) -> Tensor:
         """Return the diffuse albedo plus the mean specular reflectance (P, 1)."""
         return self.base + 0.08 * self.specular * (1 - self.metallic)
+
+
+def choose(condition: Tensor, first: PrincipledMaterial, second: PrincipledMaterial) -> PrincipledMaterial:
+    """Return the materials of `first` where condition (P, 1) is true, else of `second`. Both have P pixels."""
+    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
+    return PrincipledMaterial(*(torch.where(condition, one, other) for one, other in pairs))
 
 
 def draw_material(

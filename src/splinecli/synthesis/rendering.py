@@ -23,9 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.synthesis.camera import VisibleSurface
-from splinecli.synthesis.material import Material
 from splinecli.synthesis.meshes import Floats
-from splinecli.synthesis.mixed_material import MixedMaterial
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer
 from splinecli.synthesis.sampling import LOBES, draw_directions
@@ -40,7 +38,7 @@ MOST_RADIANCE = 8.0
 SHADED_ROWS = 512
 """Number of points that are shaded together. A tensor then has about a megabyte and stays in the cache."""
 
-Materials = Mapping[str, Material]
+Materials = Mapping[str, PrincipledMaterial]
 Progress = Callable[[float], None]
 
 
@@ -146,18 +144,14 @@ def render_indirect(
     return radiance
 
 
-def soften(material: Material) -> Material:
+def soften(material: PrincipledMaterial) -> PrincipledMaterial:
     """Return the reflectance without its sharpest lobes, for surfaces that light other surfaces."""
-    if isinstance(material, PrincipledMaterial):
-        return replace(
-            material,
-            roughness=material.roughness.clamp(min=SOFTEST),
-            second_roughness=material.second_roughness.clamp(min=SOFTEST),
-            clearcoat_gloss=torch.zeros_like(material.clearcoat_gloss),
-        )
-    if isinstance(material, MixedMaterial):
-        return replace(material, parts=tuple(soften(part) for part in material.parts))
-    return material
+    return replace(
+        material,
+        roughness=material.roughness.clamp(min=SOFTEST),
+        second_roughness=material.second_roughness.clamp(min=SOFTEST),
+        clearcoat_gloss=torch.zeros_like(material.clearcoat_gloss),
+    )
 
 
 def _extend(

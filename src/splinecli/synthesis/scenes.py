@@ -15,17 +15,14 @@ from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
 from splinecli.synthesis.camera import find_visible_surface
-from splinecli.synthesis.material import Material
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.principled import CLASSES, draw_class
+from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_class
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
 MIN_LIGHT_Z = 0.03
 """Lowest z of a light, the cosine of its angle to the viewing direction."""
-
-DrawMeasured = Callable[[int, torch.Generator], Material]
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,6 @@ class SceneConfig:
         samples: k of the k x k samples per pixel.
         directions: number of paths per pixel for indirect light.
         bounces: largest number of reflections before the visible surface; 0 for direct light only.
-        measured_share: share of the material classes that are drawn from measured reflectances, if there are any.
 
     Raises:
         UsageError: a number is out of range.
@@ -49,15 +45,12 @@ class SceneConfig:
     samples: int = 4
     directions: int = 256
     bounces: int = 4
-    measured_share: float = 0.0
 
     def __post_init__(self) -> None:
         low = {"size": 4, "lights": 1, "samples": 1, "directions": 1, "bounces": 0}
         for name, least in low.items():
             if getattr(self, name) < least:
                 raise UsageError(f"{name} is {getattr(self, name)} and has to be at least {least}")
-        if not 0 <= self.measured_share <= 1:
-            raise UsageError(f"measured_share is {self.measured_share} and has to be from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -77,7 +70,7 @@ class Scene:
     shape: str
     mesh: Mesh
     lights: Floats
-    materials: dict[str, Material]
+    materials: dict[str, PrincipledMaterial]
     patch_of_face: NDArray[np.int64]
     seed: int
 
@@ -101,14 +94,7 @@ class RenderedScene:
     observations: dict[str, Floats]
 
 
-def draw_scene(
-    seed: int,
-    index: int,
-    config: SceneConfig,
-    mesh: Mesh | None = None,
-    *,
-    draw_measured: DrawMeasured | None = None,
-) -> Scene:
+def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None) -> Scene:
     """Draw scene number `index` of the set with this seed.
 
     The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %. In half of the
@@ -116,7 +102,6 @@ def draw_scene(
 
     Args:
         mesh: the shape. None draws one at random.
-        draw_measured: draws measured reflectances, for `config.measured_share` of the classes.
 
     Raises:
         UsageError: the extra `render` is not installed.
@@ -127,11 +112,12 @@ def draw_scene(
     one_gloss = rng.random() < 0.5
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     render_seed = int(rng.integers(2**62))
-    materials: dict[str, Material] = {}
+    materials: dict[str, PrincipledMaterial] = {}
     for name in CLASSES:
-        measured = torch.rand((), generator=generator) < config.measured_share
-        drawn = draw_measured(patches, generator) if draw_measured is not None and measured else None
-        materials[name] = drawn or draw_class(name, patches, generator, one_gloss=one_gloss)
+        torch.rand(
+            (), generator=generator
+        )  # not used, but drawn by earlier versions, whose scenes stay the same
+        materials[name] = draw_class(name, patches, generator, one_gloss=one_gloss)
     # The shape comes last, because the number of random values that it needs varies.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1

@@ -125,6 +125,8 @@ class TrainingConfig:
             if not isinstance(table, dict):
                 raise ModelError(f"training setting {name!r} is {table!r}; expected a table of settings")
         _check_settings(values, cls())
+        # Every configuration of an earlier version has them, most often unused: 0 and "".
+        pixels = {name: value for name, value in pixels.items() if name not in _REMOVED or value}
         _check_settings(pixels, PixelGeneratorConfig())
         for name, weight in sources.items():
             if not _is_number(weight) or not 0 <= weight < math.inf:
@@ -149,6 +151,8 @@ _LOWEST = {
     "min_lights": 3, "max_lights": 3, "usual_lights": 3,
 }  # fmt: skip
 
+_REMOVED = ("measured_share", "measured_materials")
+
 _BELOW_ONE = ("beta1", "beta2", "average_decay")
 
 
@@ -160,6 +164,11 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
     """Raise ModelError for a setting that `defaults` lacks, or whose type or range differs."""
     known = vars(defaults)
     for name, value in values.items():
+        if name in _REMOVED:
+            raise ModelError(
+                f"training setting {name!r} is {value!r}, but training with measured materials was removed",
+                hint="Leave measured_share and measured_materials out",
+            )
         if name not in known or name in ("network", "pixels", "sources"):
             raise ModelError(f"unknown training setting {name!r}; known are {', '.join(sorted(known))}")
         default = known[name]

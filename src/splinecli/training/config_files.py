@@ -169,13 +169,10 @@ def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
     sources = {
         name if name == GENERATOR else _absolute(name): weight for name, weight in config.sources.items()
     }
-    pixels = config.pixels
-    if pixels.measured_materials:
-        pixels = replace(pixels, measured_materials=_absolute(pixels.measured_materials))
     start_from = config.start_from
     if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
         start_from = _absolute(start_from)
-    return replace(config, sources=sources, pixels=pixels, start_from=start_from)
+    return replace(config, sources=sources, start_from=start_from)
 
 
 def _absolute(path: str) -> str:

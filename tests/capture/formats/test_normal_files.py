@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from splinecli.capture import read_normal_map
+from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.errors import InputError
 from splinecli.normals import angle_between_deg, encode_picture, unit
@@ -194,6 +197,53 @@ def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
     plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
     scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
     np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", SHAPE, MASK), plane * MASK[..., None])
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("dtype", ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
+def test_matlab_s_numbers_are_those_that_scipy_reads(tmp_path: Path, dtype: str, compressed: bool) -> None:
+    values = np.random.default_rng(0).integers(0, 100, (*SHAPE, 3)).astype(dtype)
+    arrays = {"a": np.eye(2), "words": "text", "parts": {"b": 1}, "z": np.ones(3, complex), "N": values}
+    scipy.io.savemat(tmp_path / "a.mat", arrays, do_compression=compressed)
+    read = read_mat(tmp_path / "a.mat", None)
+    np.testing.assert_array_equal(read, scipy.io.loadmat(tmp_path / "a.mat")["N"])
+    assert read.dtype == values.dtype
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_matlab_s_files_of_either_byte_order(tmp_path: Path, order: str, compressed: bool) -> None:
+    values = np.arange(60.0).reshape(*SHAPE, 3)
+    path = write_mat(tmp_path / "a.mat", values, order, kind=9, compressed=compressed)
+    np.testing.assert_array_equal(read_mat(path, None), values)
+    np.testing.assert_array_equal(scipy.io.loadmat(path)["N"], values)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("kind", [0, 8, 10, 14, 15, 16, 20, 200, 65_535])
+def test_matlab_s_undefined_types_are_refused(tmp_path: Path, kind: int, compressed: bool) -> None:
+    """SciPy's reader ends the process."""
+    path = write_mat(tmp_path / "a.mat", np.zeros((*SHAPE, 3)), "<", kind=kind, compressed=compressed)
+    with pytest.raises(InputError, match="the MATLAB file is damaged and cannot be read"):
+        read_normals(path, SHAPE, MASK)
+
+
+def write_mat(path: Path, values: NDArray[np.float64], order: str, *, kind: int, compressed: bool) -> Path:
+    """Write the variable N by the description of the format, its numbers with a type."""
+
+    def element(kind: int, content: bytes) -> bytes:
+        return struct.pack(order + "II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
+
+    sizes = struct.pack(order + "3i", *values.shape)
+    numbers = values.ravel("F").astype(order + "f8").tobytes()
+    parts = (6, struct.pack(order + "II", 6, 0)), (5, sizes), (1, b"N"), (kind, numbers)
+    matrix = element(14, b"".join(element(*part) for part in parts))
+    if compressed:
+        packed = zlib.compress(matrix)
+        matrix = struct.pack(order + "II", 15, len(packed)) + packed
+    mark = struct.pack(order + "HH", 0x100, 0x4D49)
+    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + mark + matrix)
+    return path
 
 
 def test_a_path_that_the_system_refuses(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from splinecli.capture.lights.light_fit import find_factors, random_misfits
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame, parse_light_frame
 from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.errors import UsageError
+from splinecli.normals import unit
 
 Array = NDArray[np.float64]
 MEDALLION = Path(__file__).resolve().parents[3] / "examples/medallion"
@@ -213,3 +214,12 @@ def test_a_few_outshining_pixels_do_not_hide_the_object() -> None:
     factors = find_factors(observations)
     assert factors is not None
     assert factors.misfits(scattered()[None])[0] < 0.05
+
+
+@pytest.mark.parametrize("shape", [(1, 60), (60, 1), (1, 1)])
+def test_a_line_of_pixels_tells_no_frame(shape: tuple[int, int]) -> None:
+    generator = np.random.default_rng(0)
+    lights = unit(generator.normal((0, 0, 1), 0.3, (12, 3)))
+    normals = unit(generator.normal((0, 0, 1), 0.2, (shape[0] * shape[1], 3)))
+    check = check_lights((normals @ lights.T).clip(0), np.ones(shape, bool), lights)
+    assert check.best is None

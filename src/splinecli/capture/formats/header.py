@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
+from splinecli.capture.formats.tiff import first_page
 from splinecli.errors import InputError
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
@@ -133,14 +134,11 @@ def _stated_by_png(file: BinaryIO) -> int | None:
 
 
 def _stated_by_tiff(path: Path) -> int | None:
-    import tifffile
-
     try:
-        with tifffile.TiffFile(path) as file:
-            page: Any = file.pages.first
+        with first_page(path) as page:
             bits = int(page.bitspersample)
             tags = {code: page.tags.valueof(code) for code in (_MAX_SAMPLE_VALUE, _WHITE_LEVEL)}
-    except Exception:  # a damaged header causes struct, key, value or memory errors; decoding names it
+    except InputError:  # decoding names it
         return None
     if bits < 16:
         return _level(bits)

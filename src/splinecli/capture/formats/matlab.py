@@ -1,13 +1,17 @@
-"""Normal maps in MATLAB's .mat files. Sizes are checked before anything is read or expanded."""
+"""Normal maps in MATLAB's .mat files of version 5, 6 and 7 (MathWorks, "MAT-File Format").
+
+A reader of its own, for arrays of real numbers alone: SciPy's ends the process at types that it does not know.
+"""
 
 from __future__ import annotations
 
-import io
 import math
+import struct
 import zlib
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +23,16 @@ KEY = "Normal_gt"
 
 _HEADER_BYTES, _TAG_BYTES = 128, 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
-_ITEM_BYTES = 16  # of a complex number, the largest
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_NUMERIC = range(6, 16)  # classes of arrays: double, single and whole numbers
+_COMPLEX = 1 << 11  # a flag of an array
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
 _MOST_ELEMENTS = 10_000
-_CHUNK = 1 << 20
-
-Order = Literal["little", "big"]
 
 
 class _Variable(NamedTuple):
-    """A variable of a file: its name, its shape, and the bytes of its element."""
+    """A numeric variable of a file: its name, its shape, and the place and length of its element."""
 
     name: str
     shape: tuple[int, ...]
@@ -39,14 +42,14 @@ class _Variable(NamedTuple):
 
 
 def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
-    """Return the array Normal_gt of a file of version 5, 6 or 7, or else its only array H x W x 3.
+    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type of the stored numbers.
+
+    Sizes are checked before anything is read or expanded.
 
     Raises:
         InputError: there is no such array, or it is too large or not of the expected size.
-        Exception: SciPy raises a dozen types for damaged files.
+        KeyError, ValueError, struct.error, zlib.error: the file is damaged.
     """
-    from scipy.io import loadmat
-
     with path.open("rb") as file:
         header = file.read(_HEADER_BYTES)
         if header.startswith(b"MATLAB 7.3"):
@@ -55,11 +58,13 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
                 path=path,
                 hint="Save it with MATLAB's option -v7",
             )
-        variable = _choose(list(_variables(file, "little" if header[126:] == b"IM" else "big")), path)
+        order = "<" if header[126:] == b"IM" else ">"
+        variable = _choose(list(_variables(file, order)), path)
         check_stored_size(variable.shape, 8, path, expected)
-        element = _read_element(file, variable)
-    # SciPy sees this variable alone. Those before it might expand to any size.
-    return np.asarray(loadmat(io.BytesIO(header + element))[variable.name])
+        most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
+        content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
+    kind, numbers = next(islice(_parts(content, order), 3, None))
+    return np.frombuffer(numbers, order + _NUMBERS[kind]).reshape(variable.shape, order="F")
 
 
 def _choose(variables: list[_Variable], path: Path) -> _Variable:
@@ -76,53 +81,42 @@ def _choose(variables: list[_Variable], path: Path) -> _Variable:
     return chosen
 
 
-def _variables(file: BinaryIO, order: Order) -> Iterator[_Variable]:
-    """Yield the variables of a file that is positioned behind its header. Raises ValueError for too many elements."""
+def _variables(file: BinaryIO, order: str) -> Iterator[_Variable]:
+    """Yield the numeric variables of a file that is positioned behind its header."""
     for _ in range(_MOST_ELEMENTS):
         if len(tag := file.read(_TAG_BYTES)) < _TAG_BYTES:
             return
-        kind, length = _integers(tag, order)
-        start = file.tell()
-        content = file.read(min(length, _START_BYTES))
-        if kind == _COMPRESSED:
-            content = zlib.decompressobj().decompress(content, _START_BYTES)[_TAG_BYTES:]
+        kind, length = struct.unpack(order + "II", tag)
+        start, compressed = file.tell(), kind == _COMPRESSED
         if kind in (_COMPRESSED, _MATRIX):
-            yield _Variable(*_name_and_shape(content, order), start, length, kind == _COMPRESSED)
+            content = _read(file, start, min(length, _START_BYTES), _START_BYTES, compressed=compressed)
+            parts = _parts(content, order)
+            (flags, *_) = struct.unpack(order + "II", next(parts)[1])
+            if flags & 0xFF in _NUMERIC and not flags & _COMPLEX:
+                shape, name = next(parts)[1], next(parts)[1]
+                sizes = struct.unpack(f"{order}{len(shape) // 4}I", shape)
+                yield _Variable(bytes(name).decode("latin-1"), sizes, start, length, compressed)
         file.seek(start + length)
     raise ValueError("the file has too many elements")
 
 
-def _name_and_shape(content: bytes, order: Order) -> tuple[str, tuple[int, ...]]:
-    """Return what the start of a matrix says: flags, sizes, name, each with a tag and filled up to 8 bytes."""
-    place = 2 * _TAG_BYTES  # behind the flags
-    length = _integers(content[place : place + _TAG_BYTES], order)[1]
-    place += _TAG_BYTES
-    shape = _integers(content[place : place + length], order)
-    place += -(-length // 8) * 8
-    kind, length = _integers(content[place : place + _TAG_BYTES], order)
-    if kind >> 16:  # a name of up to four letters stands in the tag
-        name = content[place + 4 : place + 4 + (kind >> 16)]
-    else:
-        name = content[place + _TAG_BYTES : place + _TAG_BYTES + length]
-    return name.decode("latin-1"), shape
+def _read(file: BinaryIO, start: int, length: int, most: int, *, compressed: bool) -> memoryview:
+    """Return the content of a matrix, at most so many bytes of it."""
+    file.seek(start)
+    content = file.read(min(length, most))
+    if compressed:
+        content = zlib.decompressobj().decompress(content, most)
+    return memoryview(content)[_TAG_BYTES if compressed else 0 :]
 
 
-def _integers(content: bytes, order: Order) -> tuple[int, ...]:
-    return tuple(int.from_bytes(content[place : place + 4], order) for place in range(0, len(content), 4))
-
-
-def _read_element(file: BinaryIO, variable: _Variable) -> bytes:
-    """Return the bytes of a variable. Raises ValueError if it is longer, or expands to more, than its shape allows."""
-    most = math.prod(variable.shape) * _ITEM_BYTES + _MOST_OVERHEAD
-    if variable.length > most:
-        raise ValueError("the variable is longer than its shape allows")
-    file.seek(variable.start - _TAG_BYTES)
-    element = file.read(_TAG_BYTES + variable.length)
-    decoder, expanded = zlib.decompressobj(), 0
-    pending = element[_TAG_BYTES:] if variable.compressed else b""
-    while pending:
-        expanded += len(decoder.decompress(pending, _CHUNK))
-        if expanded > most:
-            raise ValueError("the variable expands to more than its shape allows")
-        pending = decoder.unconsumed_tail
-    return element
+def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and bytes of the parts of a matrix: flags, sizes, name, numbers. Each is filled up to 8 bytes."""
+    place = 0
+    while place + _TAG_BYTES <= len(content):
+        kind, length = struct.unpack_from(order + "II", content, place)
+        if kind >> 16:  # up to four bytes stand in the tag
+            yield kind & 0xFFFF, content[place + 4 : place + 4 + (kind >> 16)]
+            length = 0
+        else:
+            yield kind, content[place + _TAG_BYTES : place + _TAG_BYTES + length]
+        place += _TAG_BYTES + -(-length // 8) * 8

@@ -114,8 +114,10 @@ def _outward(mask: NDArray[np.bool_]) -> Array:
 
 
 def _derivatives(values: Array) -> tuple[Array, Array]:
-    """Return the derivatives to the right and upwards."""
-    downwards, right = np.gradient(values)
+    """Return the derivatives to the right and upwards; zero along a side of one pixel."""
+    downwards, right = (
+        np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values) for axis in (0, 1)
+    )
     return np.asarray(right), np.asarray(-downwards)
 
 

@@ -14,7 +14,7 @@ SOURCES = Argument(
 )
 SCENES = Option(0, metavar="N", min=0, help="Render N random scenes.")
 MESHES = Option(
-    None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, ...). May be repeated."
+    None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated."
 )
 IMAGE_SIZE = Option(
     None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"
@@ -22,8 +22,6 @@ IMAGE_SIZE = Option(
 SCENE_LIGHTS = Option(
     None, "--n-lights", metavar="N", min=16, help="Number of lights of a rendered scene. [default: 500]"
 )
-MEASURED = Option(None, metavar="FILE", help="Also use these measured materials (.npz).")
-MEASURED_SHARE = Option(0.5, metavar="SHARE", min=0, max=1, help="Share of the materials that are measured.")
 
 # Settings of train.
 
