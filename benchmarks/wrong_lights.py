@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -100,7 +98,7 @@ def rendered(count: int, measured: Path | None, n_lights: int) -> Iterator[Lit]:
             yield f"rendered, {name}", observations, lights.astype(np.float64), result.mask, True
 
 
-def real(folders: list[Path], n_lights: int, draws: int) -> Iterator[Lit]:
+def real(folders: Sequence[Path], n_lights: int, draws: int) -> Iterator[Lit]:
     for folder in folders:
         source = open_capture(folder)
         # As the check of infer, it sees no intensities that were estimated under the lights in question.
@@ -110,6 +108,29 @@ def real(folders: list[Path], n_lights: int, draws: int) -> Iterator[Lit]:
             chosen = list(draw)
             lights = capture.light_directions[chosen]
             yield folder.name, capture.observations[:, chosen], lights, capture.mask, known
+
+
+def count(
+    captures: Sequence[Path], scenes: int, measured: Path | None, *, draws: int, n_lights: int
+) -> dict[str, dict[str, tuple[int, int, int]]]:
+    """Return for each kind of file and each capture or class: how many are named, get the right mend, there are."""
+    counts: dict[str, dict[str, tuple[int, int, int]]] = {}
+    rng = np.random.default_rng(SEED)
+    for source in (real(captures, n_lights, draws), rendered(scenes, measured, n_lights)):
+        for name, observations, lights, mask, known in source:
+            sample = sample_observations(observations, mask)
+            for kind, given, is_right in wrong_files(lights, rng):
+                factors = find_factors(sample.observations, intensities_known=known)
+                check = check_lights(sample.observations, sample.mask, given, factors=factors)
+                doubted = check.order is not None or check.best is not None or check.odd_image is not None
+                named, mended, total = counts.setdefault(kind, {}).get(name, (0, 0, 0))
+                mended += doubted and is_right(check)
+                counts[kind][name] = named + doubted, mended, total + 1
+    return counts
+
+
+def cell(kind: str, named: int, mended: int, total: int) -> str:
+    return f"{named}" + ("" if kind == "right" else f" / {mended}") + f" of {total}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -123,36 +144,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--lights", type=int, default=12)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    named: Counter[tuple[str, str]] = Counter()
-    mended, total = named.copy(), named.copy()
-    rng, longest = np.random.default_rng(SEED), 0.0
-    sources = (
-        real(options.captures, options.lights, options.draws),
-        rendered(options.scenes, options.measured, options.lights),
+    counts = count(
+        options.captures, options.scenes, options.measured, draws=options.draws, n_lights=options.lights
     )
-    for source in sources:
-        for name, observations, lights, mask, known in source:
-            sample = sample_observations(observations, mask)
-            for kind, given, is_right in wrong_files(lights, rng):
-                started = time.perf_counter()
-                factors = find_factors(sample.observations, intensities_known=known)
-                check = check_lights(sample.observations, sample.mask, given, factors=factors)
-                longest = max(longest, time.perf_counter() - started)
-                doubted = check.order is not None or check.best is not None or check.odd_image is not None
-                named[kind, name] += doubted
-                mended[kind, name] += doubted and is_right(check)
-                total[kind, name] += 1
-    names = list(dict.fromkeys(name for _, name in total))
-    print("| light file |", " | ".join(names), "|\n|---|" + "---:|" * len(names))
-    for kind in dict.fromkeys(kind for kind, _ in total):
-        cells = (
-            f"{named[kind, name]}"
-            + ("" if kind == "right" else f" / {mended[kind, name]}")
-            + f" of {total[kind, name]}"
-            for name in names
-        )
-        print(f"| {kind} |", " | ".join(cells), "|")
-    print(f"\nThe longest check took {longest:.2f} s.")
+    print("| light file |", " | ".join(counts["right"]), "|\n|---|" + "---:|" * len(counts["right"]))
+    for kind, by_name in counts.items():
+        print(f"| {kind} |", " | ".join(cell(kind, *found) for found in by_name.values()), "|")
 
 
 if __name__ == "__main__":
