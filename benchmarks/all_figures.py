@@ -5,7 +5,7 @@
 DATA has the folders DiLiGenT/pmsData, synth/L17, uw, psbox and merl_nbrdf. Everything together takes hours on two
 cores. Each row is stored in docs/figures.json when it is done, with the version and the weights; rows of the shipped
 weights are not measured again, and a stopped evaluation goes on in --results. --only names measurements, or a row of
-one, as in lights/iw12. "speed" and "sizes" run only if they are named, because they need a quiet machine.
+one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a quiet machine.
 """
 
 from __future__ import annotations
@@ -65,11 +65,9 @@ class Bench:
             for result in document["results"]
         ]
 
-    def lights(self, method: str) -> Cells:
-        # CNN-PS was trained with ten lights. All lights together are one trial.
-        counts = (10,) if method == "cnn-ps" else tuple(None if n == 96 else n for n in tables.LIGHTS)
-        found = self.errors("lights", self.objects, method, n_lights=counts)
-        return {f"{r['label']} {r['n_lights']}": r["mae_deg"] for r in found}
+    def lights(self, method: str, count: int) -> Cells:
+        found = self.errors("lights", self.objects, method, n_lights=(None if count == 96 else count,))
+        return {f"{r['label']} {count}": r["mae_deg"] for r in found}
 
     def noise(self, method: str) -> Cells:
         found = self.errors("lights", self.objects, method, n_lights=(10,))
@@ -147,26 +145,11 @@ class Bench:
     def wrong_lights(self) -> dict[str, Cells]:
         import wrong_lights
 
-        photographs = [
-            *self.objects.values(),
-            self.data / "uw/gray",
-            self.data / "uw/horse",
-            self.data / "psbox",
-        ]
-        groups = {"rendered, metallic": "metal"} | {
-            f"rendered, {name}": "diffuse, specular, measured" for name in ("diffuse", "specular", "measured")
-        }
+        captures = [*self.objects.values(), *(self.data / name for name in ("uw/gray", "uw/horse", "psbox"))]
         counts = wrong_lights.count(
-            photographs, 12, self.data / "merl_nbrdf/merl_nbrdf.npz", draws=4, n_lights=12
+            captures, 12, self.data / "merl_nbrdf/merl_nbrdf.npz", draws=4, n_lights=12
         )
-        rows: dict[str, Cells] = {}
-        for kind, by_name in counts.items():
-            sums: dict[str, Any] = {}
-            for name, found in by_name.items():
-                group = groups.get(name, "photographs")
-                sums[group] = np.add(sums.get(group, (0, 0, 0)), found)
-            rows[kind] = {group: wrong_lights.cell(kind, *found) for group, found in sums.items()}
-        return rows
+        return {kind: wrong_lights.grouped(kind, found) for kind, found in counts.items()}
 
     def near_lamps(self) -> dict[str, Cells]:
         import near_lamps
@@ -217,21 +200,26 @@ class Bench:
         import large_captures
 
         seconds, report = large_captures.measure(float(megapixels), "spline-net", "png,npy")
-        relative = seconds / float(megapixels)
-        memory = report["peak_memory_mib"]
-        return {"processor s": seconds, "memory MiB": memory, "processor s a megapixel": relative}
+        names = ("processor s", "memory MiB", "processor s a megapixel")
+        return dict(
+            zip(names, (seconds, report["peak_memory_mib"], seconds / float(megapixels)), strict=True)
+        )
 
     def measurements(self) -> dict[str, Rows]:
         """Return what measures each row of each measurement."""
         captures = (*OBJECTS, *SYNTH)
-        bits = {
-            "16 bits": lambda image: image,
-            "rounded to 8 bits": lambda image: np.round(image / 257).astype(np.uint8),
-            "cut to 8 bits": lambda image: (image >> 8).astype(np.uint8),
-        }
+        rounded, cut = (
+            lambda image: np.round(image / 257).astype("u1"),
+            lambda image: (image >> 8).astype("u1"),
+        )
+        bits = {"16 bits": lambda image: image, "rounded to 8 bits": rounded, "cut to 8 bits": cut}
         return {
             "calibration": each(self.calibration, tables.MIRROR_BALLS),
-            "lights": {m: partial(self.lights, m) for m in (*FITS, *reversed(NETWORKS), "cnn-ps")},
+            **{
+                f"lights-{count}": {m: partial(self.lights, m, count) for m in (*FITS, *NETWORKS)}
+                for count in (10, 96, 4, 20)
+            },
+            "cnn-ps": {"cnn-ps": partial(self.lights, "cnn-ps", 10)},
             "synth": {name: partial(self.synth_errors, name) for name in SYNTH},
             "noise": {m: partial(self.noise, m) for m in (*FITS, *NETWORKS)},
             "eight-bits": {name: partial(self.eight_bits, convert, name) for name, convert in bits.items()},

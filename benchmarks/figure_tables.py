@@ -26,6 +26,8 @@ FITS = ("ls", "ls-trimmed", "l1", "iw12", "st14", "ia14")
 NETWORKS = ("spline-net-pixelwise", "spline-net")
 OBJECTS = {"Ball": "ballPNG", "Cat": "catPNG", "Reading": "readingPNG"}
 SYNTH = [f"{shape} {material}" for shape in ("sphere", "relief", "bowl") for material in "SM"]
+PUBLISHED = "published"
+"""Figures of papers, for ten lights."""
 SCENES = [f"{look} {shape}" for shape in ("sphere", "relief", "plane") for look in ("matte", "glossy")]
 LIGHTS = (4, 10, 20, 96)
 NOISE_DEG = (2.0, 4.0, 8.0)
@@ -46,7 +48,7 @@ class Table:
     """One table of the documentation: which cells of which measurements it shows, and how.
 
     Args:
-        sources: measurements; the rows of the first have their caption below the table.
+        sources: measurements, whose cells are put together.
         rows, columns: label -> key in the measurement.
         form: how a number is written.
     """
@@ -59,15 +61,22 @@ class Table:
 
     def text(self, measured: Measured, weights: str) -> str:
         """Return the Markdown of the table, and which version and weights it was measured with."""
-        if self.sources[0] not in measured:
+        sources = [source for source in self.sources if source in measured]
+        known: dict[str, dict[str, Any]] = {}
+        for source in sources:
+            for row, cells in measured[source]["rows"].items():
+                known.setdefault(row, {}).update(cells)
+        if not known.keys() & set(self.rows.values()):
             return "(not measured with these weights)"
-        known = {row: cells for source in self.sources for row, cells in measured[source]["rows"].items()}
         lines = ["| " + " | ".join((self.head, *self.columns)) + " |", "|---|" + "---:|" * len(self.columns)]
         for label, row in self.rows.items():
             values = [known.get(row, {}).get(column, "-") for column in self.columns.values()]
             shown = (value if isinstance(value, str) else self.form.format(value) for value in values)
             lines.append("| " + " | ".join((label, *shown)) + " |")
-        return "\n".join(lines) + "\n\n" + caption(measured[self.sources[0]], weights)
+        captions = dict.fromkeys(
+            caption(measured[source], weights) for source in sources if source != PUBLISHED
+        )
+        return "\n".join(lines) + f"\n\n{' '.join(captions)}"
 
 
 def caption(measurement: Mapping[str, Any], weights: str) -> str:
@@ -91,7 +100,7 @@ def code(keys: Iterable[str]) -> dict[str, str]:
 
 TABLES = {
     "ten-lights": Table(
-        ("lights", "published"),
+        ("lights-10", PUBLISHED),
         "method",
         {
             "least squares": "LS",
@@ -108,7 +117,7 @@ TABLES = {
     ),
     **{
         f"lights-{label.lower()}": Table(
-            ("lights",),
+            (*(f"lights-{count}" for count in LIGHTS), "cnn-ps"),
             f"{label}, lights",
             code((*FITS, "cnn-ps", *NETWORKS)),
             {str(count): f"{label} {count}" for count in LIGHTS},

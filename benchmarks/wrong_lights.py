@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +131,16 @@ def count(
 
 def cell(kind: str, named: int, mended: int, total: int) -> str:
     return f"{named}" + ("" if kind == "right" else f" / {mended}") + f" of {total}"
+
+
+def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str, str]:
+    """Return one kind of file for all photographs, for metal, and for all other rendered scenes together."""
+    sums: dict[str, NDArray[np.integer]] = {}
+    for name, found in by_name.items():
+        group = "diffuse, specular, measured" if name.startswith("rendered") else "photographs"
+        group = "metal" if name == "rendered, metallic" else group
+        sums[group] = np.add(sums.get(group, np.zeros(3, int)), found)
+    return {group: cell(kind, *found.tolist()) for group, found in sums.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
