@@ -53,23 +53,31 @@ def command_seconds(capture: str, repeats: int) -> float:
     return statistics.median(seconds)
 
 
+def speeds(pixels: int, repeats: int) -> dict[str, float]:
+    """Return the pixels per second of the paper's layers, and of the shipped network in both number formats."""
+    paper_network = SplineNet(NetworkConfig(size="paper")).eval().to(memory_format=torch.channels_last)
+    paper = LoadedNetwork(paper_network, "paper", "")
+    found = {"layers of the paper, float32": pixels_per_second(paper, "float32", pixels // 32, repeats)}
+    shipped = resolve_weights("spline-net")
+    precisions: tuple[Precision, ...] = ("float32", "bfloat16")
+    for precision in precisions:
+        name = f"spline-net-pixelwise, {precision}"
+        found[name] = pixels_per_second(shipped, precision, pixels, repeats)
+    return found
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("capture", nargs="?")
     parser.add_argument("--pixels", type=int, default=16_384)
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args(arguments)
-    print(f"{torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}")
-    paper_network = SplineNet(NetworkConfig(size="paper")).eval().to(memory_format=torch.channels_last)
-    loaded = LoadedNetwork(paper_network, "paper", "")
-    paper = pixels_per_second(loaded, "float32", options.pixels // 32, options.repeats)
-    print(f"paper      float32   {paper:8.0f} pixels/s")
-    shipped = resolve_weights("spline-net")
-    precisions: tuple[Precision, ...] = ("float32", "bfloat16")
-    for precision in precisions:
-        speed = pixels_per_second(shipped, precision, options.pixels, options.repeats)
-        auto = " (auto)" if choose_precision("auto", torch.device("cpu")) == precision else ""
-        print(f"spline-net {precision:9} {speed:8.0f} pixels/s, {speed / paper:.0f} times the paper's{auto}")
+    chosen = choose_precision("auto", torch.device("cpu"))
+    print(f"{torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}; auto is {chosen}")
+    found = speeds(options.pixels, options.repeats)
+    first = next(iter(found.values()))
+    for name, speed in found.items():
+        print(f"{name:32} {speed:8.0f} pixels/s, {speed / first:.0f} times the paper's")
     if options.capture:
         print(f"infer {options.capture}: {command_seconds(options.capture, options.repeats):.1f} s")
 

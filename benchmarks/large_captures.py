@@ -20,6 +20,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,8 +52,8 @@ def relief(height: int, width: int) -> NDArray[np.float32]:
     return np.stack((slopes[0] / length, slopes[1] / length, 1 / length), axis=-1)
 
 
-def write_capture(folder: Path, megapixels: float) -> tuple[int, int]:
-    """Write a capture of about this size, and return its width and height."""
+def write_capture(folder: Path, megapixels: float) -> None:
+    """Write a capture of about this size."""
     height = max(8, round((megapixels * 1e6 / 1.5) ** 0.5))
     width = round(1.5 * height)
     normals, rng = relief(height, width), np.random.default_rng(1)
@@ -67,7 +68,6 @@ def write_capture(folder: Path, megapixels: float) -> tuple[int, int]:
         cv2.imwrite(str(folder / f"{number:02d}.png"), stored)
     np.savetxt(folder / "light_directions.txt", directions())
     np.savetxt(folder / "light_intensities.txt", np.ones((LIGHTS, 3)))
-    return width, height
 
 
 def draw_plot(path: Path, rows: Sequence[tuple[float, float, float]]) -> None:
@@ -85,6 +85,21 @@ def draw_plot(path: Path, rows: Sequence[tuple[float, float, float]]) -> None:
     figure.savefig(path, dpi=100)
 
 
+def measure(megapixels: float, method: str, formats: str) -> tuple[float, dict[str, Any]]:
+    """Return the seconds of all processor cores that `infer` takes for a capture of this size, and its report."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "relief"
+        folder.mkdir()
+        write_capture(folder, megapixels)
+        before = os.times()
+        command = [sys.executable, "-m", "splinecli", "infer", str(folder), "-o", place, "--json"]
+        command += ["--method", method, "--format", formats]
+        (report,) = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+        after = os.times()
+    used = after.children_user + after.children_system - before.children_user - before.children_system
+    return used, report
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--megapixels", type=float, nargs="+", default=[0.05, 0.5, 2, 6, 24])
@@ -95,18 +110,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     print("megapixels      read  estimate     write   processor    memory  unlike")
     for megapixels in options.megapixels:
-        with tempfile.TemporaryDirectory() as place:
-            folder = Path(place) / "relief"
-            folder.mkdir()
-            width, height = write_capture(folder, megapixels)
-            before = os.times()
-            command = [sys.executable, "-m", "splinecli", "infer", str(folder), "-o", place, "--json"]
-            command += ["--method", options.method, "--format", options.formats]
-            (report,) = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
-            after = os.times()
-        processor = (
-            after.children_user + after.children_system - before.children_user - before.children_system
-        )
+        processor, report = measure(megapixels, options.method, options.formats)
+        width, height = report["image_size"]
         seconds, distilled = report["seconds"], report["distillation"]
         unlike = "exact" if distilled is None else distilled["unlike_pixels"]
         stages = " ".join(f"{seconds[stage]:7.1f} s" for stage in ("read", "estimate", "write"))

@@ -11,7 +11,7 @@ is wrong by these factors. For the plane, also the range of its heights in perce
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -157,6 +157,34 @@ def height_range_percent(estimate: NormalEstimate) -> float:
     return 100 * float(np.ptp(integrate_normals(estimate.normal_map, mask)[mask])) / mask.shape[1]
 
 
+Cell = tuple[float, float | None]
+"""Mean angular error in degrees, and for the plane the range of its heights in percent."""
+
+
+def measure(
+    method: str, size: int, widths: Sequence[float], off: Sequence[float]
+) -> Iterator[tuple[str, list[tuple[str, Cell]]]]:
+    """Yield the name of each scene, and its cells with their names."""
+    estimator = make_estimator(method)
+
+    def cell(capture: Capture) -> Cell:
+        estimate = estimate_normals(capture, estimator)
+        assert estimate.errors is not None
+        heights = height_range_percent(estimate) if capture.name == "plane" else None
+        return estimate.errors.mean, heights
+
+    names = {"no": None, "yes": 1.0, **{f"x {factor:g}": factor for factor in off}}
+    for shape in ("sphere", "relief", "plane"):
+        for glossy in (False, True):
+            bench = Bench(shape, size, glossy=glossy)
+            cells = [("distant", cell(bench.under_distant_lights()))]
+            for width in widths:
+                for name, factor in names.items():
+                    capture = bench.under_lamps(width * bench.width, off=factor)
+                    cells.append((f"{width:g}: {name}", cell(capture)))
+            yield f"{'glossy' if glossy else 'matte'} {shape}", cells
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -166,29 +194,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--widths", type=float, nargs="+", default=[2, 4, 8])
     parser.add_argument("--off", type=float, nargs="*", default=[0.8, 1.2])
     options = parser.parse_args(arguments)
-    estimator = make_estimator(options.method)
-
-    def cell(estimate: NormalEstimate) -> str:
-        assert estimate.errors is not None
-        heights = ""
-        if estimate.capture.name == "plane":
-            heights = f" ({height_range_percent(estimate):.1f} %)"
-        return f"{estimate.errors.mean:.2f}{heights}"
-
-    names = ["no", "yes", *(f"x {off:g}" for off in options.off)]
-    columns = [f"{width:g}: {name}" for width in options.widths for name in names]
     print(f"{options.method}, {options.size} x {options.size} pixels")
-    print("  ".join(f"{text:>14}" for text in ("scene", "distant", *columns)))
-    for name in ("sphere", "relief", "plane"):
-        for glossy in (False, True):
-            bench = Bench(name, options.size, glossy=glossy)
-            cells = [f"{'glossy' if glossy else 'matte'} {name}"]
-            cells.append(cell(estimate_normals(bench.under_distant_lights(), estimator)))
-            for width in options.widths:
-                for off in (None, 1.0, *options.off):
-                    capture = bench.under_lamps(width * bench.width, off=off)
-                    cells.append(cell(estimate_normals(capture, estimator)))
-            print("  ".join(f"{text:>14}" for text in cells), flush=True)
+    columns: list[str] = []
+    for scene, cells in measure(options.method, options.size, options.widths, options.off):
+        if not columns:
+            columns = ["scene", *(name for name, _ in cells)]
+            print("  ".join(f"{text:>14}" for text in columns))
+        texts = (f"{mae:.2f}" + ("" if high is None else f" ({high:.1f} %)") for _, (mae, high) in cells)
+        print("  ".join(f"{text:>14}" for text in (scene, *texts)), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
-"""Measure how splinecli handles overexposure, unknown light intensities, and its own confidence.
+"""Measure how splinecli handles overexposure and unknown light intensities.
 
     python benchmarks/photographs.py CAPTURE... [--draws 2] [--pixels 1500]
 
 The captures need ground truth. Each is measured under draws of ten lights (seed 0) on a random subset of its pixels:
 
 1. the errors of overexposed pixels, if a fifth of the observations is cut off;
-2. the estimated light intensities, if the measured ones are withheld;
-3. the errors that the confidence predicts, and the actual ones. The last row is for all captures together.
+2. the estimated light intensities, if the measured ones are withheld.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ from splinecli.capture import open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
-from splinecli.methods.estimator import CONFIDENT_DEG
-from splinecli.networks.error_head import probability_within
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights
 from splinecli.normals import angle_between_deg
@@ -66,15 +63,14 @@ def read_draws(folder: Path, n_draws: int, n_pixels: int) -> list[Draw]:
 @torch.inference_mode()
 def estimate(
     network: SplineNet, observations: NDArray[np.float32], draw: Draw, valid: NDArray[np.bool_] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return errors (P,) in degrees and confidences (P,)."""
-    normals, error = network(
+) -> NDArray[np.float64]:
+    """Return the errors (P,) in degrees."""
+    normals, _ = network(
         torch.from_numpy(observations),
         torch.from_numpy(draw.lights).float(),
         None if valid is None else torch.from_numpy(valid),
     )
-    assert error is not None
-    return angle_between_deg(normals.numpy(), draw.normals), probability_within(error, CONFIDENT_DEG).numpy()
+    return angle_between_deg(normals.numpy(), draw.normals)
 
 
 def overexposed(network: SplineNet, draw: Draw) -> list[float]:
@@ -86,7 +82,7 @@ def overexposed(network: SplineNet, draw: Draw) -> list[float]:
     affected = saturated.any(axis=1)
     return [
         float(errors[affected].mean())
-        for errors, _ in (
+        for errors in (
             estimate(network, draw.observations, draw),
             estimate(network, stored, draw),
             estimate(network, np.where(saturated, 0, stored), draw, ~saturated),
@@ -106,16 +102,9 @@ def without_intensities(network: SplineNet, draw: Draw) -> tuple[bool, list[floa
     used = np.ones(N_LIGHTS) if estimated is None else estimated
     spreads = [100 * float(np.std(np.log(s / draw.intensities))) for s in (np.ones(N_LIGHTS), used)]
     errors = [
-        estimate(network, o, draw)[0].mean()
-        for o in (draw.observations, raw, (raw / used).astype(np.float32))
+        estimate(network, o, draw).mean() for o in (draw.observations, raw, (raw / used).astype(np.float32))
     ]
     return estimated is not None, [*spreads, *(float(error) for error in errors)]
-
-
-def share_detected(confidence: NDArray[np.float32], errors_deg: NDArray[np.float64]) -> float:
-    """Return the share of the largest tenth of the errors that is in the least confident tenth of the pixels."""
-    large = errors_deg > np.quantile(errors_deg, 0.9)
-    return float(large[confidence <= np.quantile(confidence, 0.1)].sum() / large.sum())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -140,23 +129,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         means = np.mean([numbers for _, numbers in results], axis=0)
         estimated = sum(is_estimated for is_estimated, _ in results)
         print(f"{name:18} {estimated:3} of {len(draws):3}" + " ".join(f"{mean:10.2f}" for mean in means))
-
-    print(
-        "\nconfidence: share under 5 degrees expected, actual; share of the large errors in the least confident tenth"
-    )
-    everything: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
-    for name, draws in captures.items():
-        errors, confidence = map(
-            np.concatenate, zip(*(estimate(network, d.observations, d) for d in draws), strict=True)
-        )
-        everything.append((errors, confidence))
-        print_confidence(name, errors, confidence)
-    print_confidence("all", *map(np.concatenate, zip(*everything, strict=True)))
-
-
-def print_confidence(name: str, errors: NDArray[np.float64], confidence: NDArray[np.float32]) -> None:
-    actual = (errors <= CONFIDENT_DEG).mean()
-    print(f"{name:18} {confidence.mean():6.2f} {actual:6.2f} {share_detected(confidence, errors):6.2f}")
 
 
 if __name__ == "__main__":

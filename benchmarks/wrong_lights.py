@@ -3,17 +3,15 @@
 python benchmarks/wrong_lights.py CAPTURE... [--scenes 20] [--draws 20] [--lights 12]
 
 Of each capture, draws of lights are checked (all lights where it has no more). Each draw is checked as it is and in
-every wrong way. Scenes that no default seed uses are rendered in all classes of materials. Prints a table in Markdown:
-how many are named / how many get the right mend, of how many.
+every wrong way. Scenes that no default seed uses are rendered in all classes of materials. Prints a table in
+Markdown: how many are named / how many get the right mend, of how many.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +90,7 @@ def rendered(count: int, n_lights: int) -> Iterator[Lit]:
             yield f"rendered, {name}", observations, lights.astype(np.float64), result.mask, True
 
 
-def real(folders: list[Path], n_lights: int, draws: int) -> Iterator[Lit]:
+def real(folders: Sequence[Path], n_lights: int, draws: int) -> Iterator[Lit]:
     for folder in folders:
         source = open_capture(folder)
         # As the check of infer, it sees no intensities that were estimated under the lights in question.
@@ -102,6 +100,39 @@ def real(folders: list[Path], n_lights: int, draws: int) -> Iterator[Lit]:
             chosen = list(draw)
             lights = capture.light_directions[chosen]
             yield folder.name, capture.observations[:, chosen], lights, capture.mask, known
+
+
+def count(
+    captures: Sequence[Path], scenes: int, *, draws: int, n_lights: int
+) -> dict[str, dict[str, tuple[int, int, int]]]:
+    """Return for each kind of file and each capture or class: how many are named, get the right mend, there are."""
+    counts: dict[str, dict[str, tuple[int, int, int]]] = {}
+    rng = np.random.default_rng(SEED)
+    for source in (real(captures, n_lights, draws), rendered(scenes, n_lights)):
+        for name, observations, lights, mask, known in source:
+            sample = sample_observations(observations, mask)
+            for kind, given, is_right in wrong_files(lights, rng):
+                factors = find_factors(sample.observations, intensities_known=known)
+                check = check_lights(sample.observations, sample.mask, given, factors=factors)
+                doubted = check.order is not None or check.best is not None or check.odd_image is not None
+                named, mended, total = counts.setdefault(kind, {}).get(name, (0, 0, 0))
+                mended += doubted and is_right(check)
+                counts[kind][name] = named + doubted, mended, total + 1
+    return counts
+
+
+def cell(kind: str, named: int, mended: int, total: int) -> str:
+    return f"{named}" + ("" if kind == "right" else f" / {mended}") + f" of {total}"
+
+
+def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str, str]:
+    """Return one kind of file for all photographs, for metal, and for all other rendered scenes together."""
+    sums: dict[str, NDArray[np.integer]] = {}
+    for name, found in by_name.items():
+        group = "diffuse, specular" if name.startswith("rendered") else "photographs"
+        group = "metal" if name == "rendered, metallic" else group
+        sums[group] = np.add(sums.get(group, np.zeros(3, int)), found)
+    return {group: cell(kind, *found.tolist()) for group, found in sums.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -114,36 +145,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--lights", type=int, default=12)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    named: Counter[tuple[str, str]] = Counter()
-    mended, total = named.copy(), named.copy()
-    rng, longest = np.random.default_rng(SEED), 0.0
-    sources = (
-        real(options.captures, options.lights, options.draws),
-        rendered(options.scenes, options.lights),
-    )
-    for source in sources:
-        for name, observations, lights, mask, known in source:
-            sample = sample_observations(observations, mask)
-            for kind, given, is_right in wrong_files(lights, rng):
-                started = time.perf_counter()
-                factors = find_factors(sample.observations, intensities_known=known)
-                check = check_lights(sample.observations, sample.mask, given, factors=factors)
-                longest = max(longest, time.perf_counter() - started)
-                doubted = check.order is not None or check.best is not None or check.odd_image is not None
-                named[kind, name] += doubted
-                mended[kind, name] += doubted and is_right(check)
-                total[kind, name] += 1
-    names = list(dict.fromkeys(name for _, name in total))
-    print("| light file |", " | ".join(names), "|\n|---|" + "---:|" * len(names))
-    for kind in dict.fromkeys(kind for kind, _ in total):
-        cells = (
-            f"{named[kind, name]}"
-            + ("" if kind == "right" else f" / {mended[kind, name]}")
-            + f" of {total[kind, name]}"
-            for name in names
-        )
-        print(f"| {kind} |", " | ".join(cells), "|")
-    print(f"\nThe longest check took {longest:.2f} s.")
+    counts = count(options.captures, options.scenes, draws=options.draws, n_lights=options.lights)
+    print("| light file |", " | ".join(counts["right"]), "|\n|---|" + "---:|" * len(counts["right"]))
+    for kind, by_name in counts.items():
+        print(f"| {kind} |", " | ".join(cell(kind, *found) for found in by_name.values()), "|")
 
 
 if __name__ == "__main__":

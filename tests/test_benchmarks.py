@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import math
 import re
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.methods import method_names
+from splinecli import __version__
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import save_weights
@@ -30,20 +30,12 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the benchmark of this name and return what it prints."""
 
     def run_benchmark(name: str, *arguments: str) -> str:
-        main: Callable[[Sequence[str]], None] = load(name).main
+        module = importlib.import_module(name)
+        main: Callable[[Sequence[str]], None] = module.main
         main(arguments)
         return capsys.readouterr().out
 
     return run_benchmark
-
-
-def load(name: str) -> Any:
-    """Import the benchmark of this name."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def numbers(line: str) -> list[float]:
@@ -62,24 +54,18 @@ def test_training_speed(run: Run) -> None:
     assert all(min(numbers(line[25:])) > 0 for line in printed[1:])
 
 
-def test_method_speed(run: Run) -> None:
-    printed = run("method_speed", MEDALLION, "--pixels", "40", "--repeats", "1").splitlines()
-    assert printed[0] == "medallion, 10 lights"
-    assert [line.split()[0] for line in printed[1:]] == method_names()
-
-
 def test_inference_speed(run: Run) -> None:
     printed = run("inference_speed", "--pixels", "64", "--repeats", "1").splitlines()
-    assert [line.split()[0] for line in printed[1:]] == ["paper", "spline-net", "spline-net"]
-    assert sum("(auto)" in line for line in printed) == 1
+    names = [line.split(",")[0] for line in printed[1:]]
+    assert names == ["layers of the paper", "spline-net-pixelwise", "spline-net-pixelwise"]
+    assert min(numbers(line)[0] for line in printed[1:]) > 0
 
 
 def test_photographs(run: Run) -> None:
     printed = run("photographs", MEDALLION, "--draws", "1", "--pixels", "60")
-    overexposed, intensities, confidence = printed.split("\n\n")
+    overexposed, intensities = printed.split("\n\n")
     assert len(numbers(overexposed.splitlines()[1])) == 4
     assert len(numbers(intensities.splitlines()[1])) == 7
-    assert [line.split()[0] for line in confidence.splitlines()[1:]] == ["medallion", "all"]
 
 
 def test_render_accuracy(run: Run) -> None:
@@ -126,25 +112,29 @@ def test_busy_machine(run: Run) -> None:
     assert (default - half) / (passive + half) - half <= ratio <= (default + half) / (passive - half) + half
 
 
-def test_diligent_figures(run: Run, tmp_path: Path) -> None:
-    """The mean is that of the trials; figures of both files are stored once."""
-    entry = {"method": "ls", "capture": "ball", "n_lights": 10, "light_noise_deg": 0.0, "trials": 2}
-    entry |= {"mae_deg": 2.5, "std_deg": 0.5, "maes_deg": [2.0, 3.0]}
-    documents = [[entry, {**entry, "n_lights": 96}], [entry, {**entry, "light_noise_deg": 4.0}]]
-    for name, results in zip(("lights.json", "noise.json"), documents, strict=True):
-        (tmp_path / name).write_text(json.dumps({"protocol": {"seed": 0}, "results": results}))
+def test_all_figures(run: Run, tmp_path: Path) -> None:
+    """A row is stored with what it was measured with, and is not measured again."""
+    for name in ("ballPNG", "catPNG", "readingPNG"):
+        place = tmp_path / "data/DiLiGenT/pmsData" / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.symlink_to(MEDALLION)
     stored = tmp_path / "figures.json"
-    printed = run(
-        "diligent_figures",
-        str(tmp_path / "lights.json"),
-        str(tmp_path / "noise.json"),
-        "--output",
-        str(stored),
-    )
-    assert "| n_lights | 10 | 96 |" in printed
-    assert "| light_noise_deg | 0.0 | 4.0 |" in printed
-    assert printed.count("| ball, `ls` | 2.50 | 2.50 |") == 2
-    assert len(json.loads(stored.read_text())["results"]) == 3
+    places = (str(tmp_path / "data"), "--results", str(tmp_path / "results"), "--figures", str(stored))
+    arguments = (*places, "--trials", "2", "--only", "noise/ls")
+    assert run("all_figures", *arguments).startswith("noise, ls: ")
+    measured = json.loads(stored.read_text())["noise"]
+    assert (measured["version"], len(measured["weights"])) == (__version__, 8)
+    assert list(measured["rows"]) == ["ls"]
+    assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]
+    assert measured["rows"]["ls"]["0"] < measured["rows"]["ls"]["8"]
+    assert run("all_figures", *arguments) == ""
+
+
+def test_figure_tables(run: Run) -> None:
+    """The documentation has them all filled; tests/test_docs.py compares what they say."""
+    before = [(ROOT / name).read_bytes() for name in ("README.md", "docs/measurements.md")]
+    assert run("figure_tables").startswith("README.md: 1 tables")
+    assert [(ROOT / name).read_bytes() for name in ("README.md", "docs/measurements.md")] == before
 
 
 def test_wrong_lights(run: Run) -> None:
@@ -175,7 +165,7 @@ def test_measured_materials_are_those_of_explicit_vectors(tmp_path: Path) -> Non
     shapes = {"W1": (3, 6, 5), "b1": (3, 5), "W2": (3, 5, 4), "b2": (3, 4), "W3": (3, 4, 3), "b3": (3, 3)}
     arrays = {key: random.normal(0.2, 0.3, shape) for key, shape in shapes.items()}
     np.savez(tmp_path / "materials.npz", names=["first", "brass", "third"], **arrays)
-    materials = load("measured_spheres").read_materials(tmp_path / "materials.npz")
+    materials = importlib.import_module("measured_spheres").read_materials(tmp_path / "materials.npz")
     assert materials.names == ["first", "third"]  # not the implausible one
     normals, lights = (random.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
     normals, lights = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normals, lights))

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import typer
 
+import figure_tables
 from splinecli.capture import capture_warnings
 from splinecli.cli.app import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
@@ -20,8 +21,6 @@ from test_imports import ROOMS
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 PAGES = sorted([*REPOSITORY.glob("*.md"), *DOCS.glob("*.md"), REPOSITORY / "examples/README.md"])
-FIGURES = json.loads((DOCS / "diligent.json").read_text("utf-8"))
-OBJECTS = {"Ball": "ballPNG", "Cat": "catPNG", "Reading": "readingPNG"}
 
 
 def text_of(name: str) -> str:
@@ -160,67 +159,37 @@ def test_places_of_the_contributing_page():
     assert [path for path in paths if not any((r / path).exists() for r in roots)] == []
 
 
-def rows(page: str, head: str) -> dict[str, list[str]]:
-    """The cells of the table that has `head` in its first line, by their first cell without markup."""
-    _, _, rest = text_of(page).partition(head)
-    assert rest, f"{page} has no table {head}"
-    table = rest.partition("\n\n")[0].splitlines()[2:]
-    cells = [[cell.strip(" *`") for cell in line.strip("|").split("|")] for line in table]
-    return {re.sub(r"[*`]", "", row[0]): row[1:] for row in cells}
+@pytest.mark.parametrize("name", figure_tables.PAGES)
+def test_tables_of_figures(name):
+    """Each table says what docs/figures.json says. `python benchmarks/figure_tables.py` writes them."""
+    measured = json.loads(figure_tables.FIGURES.read_text("utf-8"))
+    text = text_of(name)
+    assert text == figure_tables.fill(text, measured, figure_tables.shipped_weights())
+    assert text.count("<!-- figures: ") == text.count("<!-- end -->") > 0
 
 
-def figure(method: str, capture: str, n_lights: int = 10, noise: float = 0) -> str:
-    for entry in FIGURES["results"]:
-        if (entry["method"], entry["capture"], entry["n_lights"], entry["light_noise_deg"]) == (
-            method, capture, n_lights, noise,
-        ):  # fmt: skip
-            return f"{entry['mae_deg']:.2f}"
-    raise KeyError((method, capture, n_lights, noise))
+def test_every_table_of_figures_is_shown():
+    shown = [
+        found
+        for name in figure_tables.PAGES
+        for found in re.findall(r"<!-- figures: (\S+) -->", text_of(name))
+    ]
+    assert sorted(shown) == sorted(figure_tables.TABLES)
 
 
-def average(method: str, n_lights: int = 10, noise: float = 0) -> str:
-    mean = sum(float(figure(method, capture, n_lights, noise)) for capture in OBJECTS.values()) / len(OBJECTS)
-    return f"{mean:.2f}"
-
-
-METHODS = {
-    "least squares (ls)": "ls",
-    "splinecli (spline-net)": "spline-net",
-    "without refinement (spline-net-pixelwise)": "spline-net-pixelwise",
-}
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/measurements.md"])
-def test_table_of_quality(page):
-    """All tables have the figures of one measurement, docs/diligent.json."""
-    found = rows(page, "| method | Ball | Cat | Reading |")
-    assert len(found) == 7
-    for name, cells in found.items():
-        if "published" not in name:
-            method = METHODS.get(name, name)
-            assert cells[:3] == [figure(method, capture) for capture in OBJECTS.values()]
-
-
-def light_counts() -> list[int]:
-    return sorted({entry["n_lights"] for entry in FIGURES["results"]})
-
-
-def test_tables_of_the_number_of_lights():
-    head = "| lights | " + " | ".join(map(str, light_counts())) + " |"
-    for name, cells in rows("docs/measurements.md", head).items():
-        label, _, method = name.rpartition(", ")
-        assert cells == [figure(method, OBJECTS[label], n) for n in light_counts()]
-
-
-def test_table_of_light_noise():
-    noises = sorted({entry["light_noise_deg"] for entry in FIGURES["results"]})
-    head = "| sigma in degrees | " + " | ".join(f"{noise:g}" for noise in noises) + " |"
-    for method, cells in rows("docs/measurements.md", head).items():
-        assert [float(cell) for cell in cells] == pytest.approx(
-            [float(average(method, noise=noise)) for noise in noises], abs=0.011
-        )
-
-
-def test_table_of_the_model_card():
-    for name, cells in rows("MODEL_CARD.md", "| lights | Ball | Cat | Reading |").items():
-        assert cells == [figure("spline-net", capture, int(name)) for capture in OBJECTS.values()]
+def test_figures_of_other_weights_are_marked():
+    """New weights never leave old figures unmarked."""
+    rows = {row: dict.fromkeys(("4", "10"), 1.0) for row in ("ls",)}
+    table = figure_tables.Table(
+        ("lights",), "method", {"least squares": "ls"}, {"4": "4", "10": "10", "20": "20"}
+    )
+    measured = {"lights": {"version": "0.2.0", "weights": "old", "machine": "", "rows": rows}}
+    assert table.text(measured, "old").splitlines()[2:] == [
+        "| least squares | 1.00 | 1.00 | - |",
+        "",
+        "(version 0.2.0, weights old)",
+    ]
+    assert table.text(measured, "new").endswith(
+        "(**not measured with these weights**: version 0.2.0, weights old)"
+    )
+    assert table.text({}, "new") == "(not measured with these weights)"

@@ -62,18 +62,6 @@ def test_every_command_has_an_example():
     assert {shlex.split(example)[1] for example, _ in EXAMPLES} == set(COMMANDS)
 
 
-def test_the_page_of_infer_shows_the_help(run, request):
-    """`pytest --update-golden` writes the block again."""
-    page = REPOSITORY / "docs/infer.md"
-    begin = "```text\n$ splinecli infer --help\n"
-    before, _, after = page.read_text("utf-8").partition(begin)
-    shown = run("infer", "--help").out + "```\n"
-    if request.config.getoption("--update-golden"):
-        page.write_text(before + begin + shown, "utf-8")
-    else:
-        assert after == shown
-
-
 def test_help_and_ls_do_not_import_torch(capture):
     """`infer --method ls` and all help run without torch; help also without OpenCV and rich."""
     script = (
