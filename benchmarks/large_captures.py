@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LIGHTS = 10
+STAGES = ("read", "distil", "estimate", "refine", "write")
 COLOUR = np.array((0.8, 1.0, 0.7), np.float32)
 
 
@@ -108,13 +109,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--plot", type=Path, help="a PNG file")
     options = parser.parse_args(arguments)
     rows = []
-    print("megapixels      read  estimate     write   processor    memory  unlike")
+    print("megapixels", *(f"{stage:>9}" for stage in STAGES), " processor    memory  unlike")
     for megapixels in options.megapixels:
         processor, report = measure(megapixels, options.method, options.formats)
         width, height = report["image_size"]
         seconds, distilled = report["seconds"], report["distillation"]
         unlike = "exact" if distilled is None else distilled["unlike_pixels"]
-        stages = " ".join(f"{seconds[stage]:7.1f} s" for stage in ("read", "estimate", "write"))
+        stages = " ".join(f"{seconds[stage]:7.1f} s" for stage in STAGES)
         print(
             f"{width * height / 1e6:10.3f} {stages} {processor:9.1f} s {report['peak_memory_mib']:5d} MiB  {unlike}",
             flush=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -22,6 +23,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff"
     )
+
+
+@pytest.fixture(autouse=True)
+def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Print none of the lines that come every half minute, because a busy machine would add them to compared text."""
+    monkeypatch.setattr("splinecli.cli.console.LINE_SECONDS", math.inf)
 
 
 @pytest.fixture(scope="session")

@@ -66,6 +66,24 @@ def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Pa
     assert estimate.normal_map.tobytes() == expected.tobytes()
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
+    """Three lights of a small part: the network was not trained with so few."""
+    images, directions, intensities, mask = medallion()
+    small = np.zeros_like(mask)
+    small[80:110, 80:110] = mask[80:110, 80:110]
+    assert cv2.imwrite(str(tmp_path / "mask.png"), small * np.uint8(255))
+    options = ["--light-indices", "0,3,6", "--mask", str(tmp_path / "mask.png"), "-q", "-o", str(tmp_path)]
+    assert main(["infer", str(MEDALLION), *options]) == 0
+    chosen = [0, 3, 6]
+    estimate = splinecli.estimate_normals(
+        images[chosen], directions[chosen], small, light_intensities=intensities[chosen]
+    )
+    told = json.loads((tmp_path / "medallion/report.json").read_text())["warnings"]
+    assert [warning.code for warning in estimate.capture.warnings] == [warning["code"] for warning in told]
+    assert "untrained_lights" in [warning["code"] for warning in told]
+
+
 def test_normals_and_confidence_of_the_network() -> None:
     images, directions, intensities, mask = medallion()
     small = np.zeros_like(mask)

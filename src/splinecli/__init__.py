@@ -89,15 +89,14 @@ def estimate_normals(
         Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and normal estimation
         networks, ICCV 2019.
     """
-    from dataclasses import replace
+    from functools import partial
     from warnings import warn
 
     from splinecli.capture.arrays import capture_from_arrays
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
-    from splinecli.inference import estimate_normals
     from splinecli.methods import MethodOptions, check_method, make_estimator
-    from splinecli.pipeline.distillation import distil_for
-    from splinecli.pipeline.input_checks import check_arrays, check_confidence
+    from splinecli.pipeline.estimate import estimate_capture
+    from splinecli.pipeline.input_checks import check_arrays
 
     check_method(method)
     capture = capture_from_arrays(
@@ -111,14 +110,12 @@ def estimate_normals(
     )
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)
-    warnings = [*capture.warnings, *check_arrays(capture, intensities_measured=light_intensities is not None)]
-    distilled, found = distil_for(capture, estimator, distil)
-    estimate = estimate_normals(capture, distilled or estimator, progress=progress)
-    warnings += [*found, *check_confidence(estimate.expected_under_5)]
-    for warning in warnings:
+    check = partial(check_arrays, intensities_measured=light_intensities is not None)
+    estimate, _ = estimate_capture(capture, estimator, check, distil=distil, progress=progress)
+    for warning in estimate.capture.warnings:
         if warning.code in PROBABLY_WRONG:
             warn(str(warning), stacklevel=2)
-    return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))
+    return estimate
 
 
 def integrate_normals(

@@ -130,10 +130,10 @@ def _estimate(
         estimate(rows, light_of(rows), progress)
     refiner = refiner_of(estimator)
     if refiner is not None and errors is not None:
-        indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
-        if indirect is not None:
-            light_of = partial(_light_on, capture, without=indirect)
-            with begin("removing indirect light") as advance:
+        with begin("removing indirect light") as advance:
+            indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
+            if indirect is not None:
+                light_of = partial(_light_on, capture, without=indirect)
                 for rows in parts_of_rows(capture.n_pixels, tile_pixels):
                     changed = rows[indirect.counts_at(capture.observations[rows], rows)]
                     if len(changed):

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import RadiometricCalibration, open_capture
-from splinecli.capture.stamp import digest, stamp_capture
-from splinecli.errors import InputError
+from splinecli.capture.lights.named_lights import read_lights
+from splinecli.capture.stamp import digest
 from splinecli.pixel_sets.captures import add_capture
 from splinecli.pixel_sets.writer import PixelSetWriter
 
@@ -39,7 +40,7 @@ def folder(tmp_path: Path, write_image: WriteImage) -> Path:
 
 def stamp(folder: Path) -> str:
     flat = RadiometricCalibration(flat_field=(folder.parent / "flat.png",))
-    return digest(stamp_capture(open_capture(folder, radiometry=flat)))
+    return digest(open_capture(folder, radiometry=flat).stamp)
 
 
 @pytest.mark.parametrize("name", ["1.png", "../flat.png"])
@@ -81,9 +82,28 @@ def test_a_new_ambient_image_replaces_the_pixels_that_prepare_kept(
     assert recipe() != before
 
 
-@pytest.mark.parametrize("name", ["mask.png", "1.png"])
-def test_a_file_that_is_gone_is_named(folder: Path, name: str) -> None:
-    source = open_capture(folder)
-    (folder / name).unlink()
-    with pytest.raises(InputError, match=f"{name}: the file cannot be read"):
-        stamp_capture(source)
+@pytest.mark.parametrize("name", ["light_directions.txt", "mask.png", "1.png"])
+def test_a_file_that_changes_while_the_capture_is_read_has_another_stamp_the_next_time(
+    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stamp is older than what is read, so that it never belongs to content that was not used."""
+    before = stamp(folder)
+
+    def change_and_read(*arguments: Any, **options: Any) -> Any:
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content + b"\n")
+        os.utime(folder / name, ns=(1, 1))
+        return read_lights(*arguments, **options)
+
+    monkeypatch.setattr("splinecli.capture.reader.read_lights", change_and_read)
+    during = stamp(folder)
+    monkeypatch.undo()
+    assert during == before != stamp(folder)
+
+
+def test_pixel_sizes_are_stamped(folder: Path) -> None:
+    (folder / "light_directions.txt").rename(folder / "light_positions.txt")
+    (folder / "pixel_size.txt").write_text("0.1")
+    before = stamp(folder)
+    (folder / "pixel_size.txt").write_text("0.2")
+    assert stamp(folder) != before

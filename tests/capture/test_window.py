@@ -15,6 +15,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import InfoOptions, describe_capture
+from splinecli.surface.camera import pixel_rays
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]
@@ -121,3 +122,10 @@ def test_a_mask_of_the_part_goes_back_into_the_whole() -> None:
     whole = window.whole(mask)
     assert whole.shape == (7, 9)
     assert [tuple(place) for place in np.argwhere(whole)] == [(1, 2), (1, 4), (1, 6), (3, 2), (3, 4), (3, 6)]
+
+
+def test_the_camera_of_the_part_sees_the_same_rays() -> None:
+    window, matrix = Window((2, 1, 5, 4), 2, (7, 9)), np.array([(90, 1, 3.5), (0, 80, 2.5), (0, 0, 1)])
+    whole = pixel_rays(np.ones((7, 9), np.bool_), matrix).reshape(7, 9, 3)
+    part = pixel_rays(np.ones((2, 3), np.bool_), window.camera(matrix)).reshape(2, 3, 3)
+    np.testing.assert_allclose(part, window.of(whole), atol=1e-12)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from splinecli.cli.main import main
+from splinecli.results.clock import STAGES
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 SIZE = 24
@@ -138,5 +139,6 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
 
 def _without_measurements(text: str) -> str:
     """The text with seconds, memory, version and absolute paths blanked out."""
-    text = re.sub(r'("(?:read|estimate|write|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text)
+    text = re.sub(rf'("(?:{"|".join(STAGES)}|total|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text)
+    text = re.sub(r", [\d.]+ s\n", ", ... s\n", text)
     return re.sub(r'("(?:version|inputs_sha256|folder|light_file)": )"[^"]*"', r'\1"..."', text)

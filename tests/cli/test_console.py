@@ -14,6 +14,7 @@ from splinecli.cli.console import LINE_SECONDS, Messages
 
 def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
     now = 0.0
+    monkeypatch.setattr(console, "LINE_SECONDS", LINE_SECONDS)
     monkeypatch.setattr(console.time, "monotonic", lambda: now)
     with Messages(quiet=False).progress("cat: estimating", 400) as advance:
         for _ in range(400):

@@ -26,7 +26,10 @@ def read_report(folder: Path) -> dict:
 def test_writes_the_contract(capture, truth, run, golden):
     result = run("infer", capture, "--method", "ls", "--format", "png,npy,tiff")
     assert (result.code, result.err) == (0, "")
-    assert result.out == "out/sphere: 448 pixels, 8 lights, ls, MAE 0.00 deg (median 0.00)\n"
+    seconds = json.loads(Path("out/sphere/report.json").read_text())["seconds"]
+    line = "out/sphere: 448 pixels, 8 lights, ls, MAE 0.00 deg (median 0.00)"
+    assert result.out == f"{line}, {seconds['total']:.1f} s\n"
+    assert sum(seconds.values()) == pytest.approx(2 * seconds["total"], abs=0.01)
     out = Path("out/sphere")
     golden("report_ls.json", (out / "report.json").read_text("utf-8"))
     assert sorted(path.name for path in out.iterdir()) == sorted(read_report(out)["files"])

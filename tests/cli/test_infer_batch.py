@@ -16,14 +16,18 @@ import numpy as np
 import pytest
 import tifffile
 
+from splinecli import inference
+from splinecli.capture import source
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.files import UNFINISHED
 from splinecli.methods.least_squares import LeastSquares
+from splinecli.pipeline import distillation, input_checks, surface
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
 from splinecli.publishing import UNDONE
+from splinecli.results import albedo, clock, files
 
 
 def read_report(folder: Path) -> dict:
@@ -472,6 +476,55 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
         ("second: reading", 8),
         ("second: estimating", 448),
     ]
+
+
+@pytest.mark.parametrize("stage", ["reading", "estimating"])
+@pytest.mark.parametrize("name", ["light_directions.txt", "image3.png"])
+def test_a_file_that_changes_during_the_run_is_read_anew_in_the_next(capture, stage, name):
+    """The report states the files that were used, not those that lie there at the end."""
+
+    class Meddler(Observer):
+        def progress(self, label, total, *, start=0.0, unit=""):
+            if label == f"sphere: {stage}":
+                (capture / name).write_bytes((capture / name).read_bytes() + b"\n")
+            return super().progress(label, total)
+
+    def status(observer: Observer) -> str:
+        (outcome,) = infer_batch([capture], InferOptions(method="ls"), observer, redo="changed")
+        return outcome.status
+
+    assert [status(Meddler()), status(Observer()), status(Observer())] == ["done", "done", "skipped"]
+
+
+def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
+    now = 0.0
+
+    def takes(seconds: float, function):
+        def call(*arguments, **options):
+            nonlocal now
+            now += seconds
+            return function(*arguments, **options)
+
+        return call
+
+    monkeypatch.setattr(clock.time, "perf_counter", lambda: now)
+    for module, name, seconds in (
+        (source.CaptureSource, "read", 1),
+        (input_checks, "check_capture", 10),
+        (distillation, "distil_for", 100),
+        (inference, "estimate_normals", 1000),
+        (albedo, "albedo_map", 10_000),
+        (surface, "make_surface", 100_000),
+        (files, "write_normals", 1_000_000),
+    ):
+        monkeypatch.setattr(module, name, takes(seconds, getattr(module, name)))
+    options = InferOptions(method="ls", surface=True, maps=("albedo",), formats=("npy",))
+    found = infer_capture(capture, options)["seconds"]
+    assert {stage: seconds for stage, seconds in found.items() if seconds} == {
+        "read": 1, "check": 10, "distil": 100, "estimate": 1000, "pictures": 10_000, "surface": 100_000,
+        "write": 1_000_000, "total": 1_111_111,
+    }  # fmt: skip
+    assert list(found) == [*clock.STAGES, "total"]
 
 
 def test_as_stored_is_named_and_a_white_level_is_used(capture, run):

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from PIL import Image
 
+from bump_capture import POSITIONS, write_bump
 from splinecli.capture.capture_size import results_bytes
 from splinecli.capture.formats import image_size
 from splinecli.files import COMPLETE
@@ -62,12 +63,15 @@ def test_formats_of_normal_maps(run, arguments):
     assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
 
 
-@pytest.mark.parametrize("form", ["png", "png8"])
-def test_the_convention_of_a_folder_is_recognised(run, capture, form):
+@pytest.mark.parametrize("given", [[], ["--convention", "directx"]], ids=["found", "given"])
+@pytest.mark.parametrize("form", ["png", "png8", "npy", "tiff"])
+def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
+    """The values of .npy and .tiff have y up, whatever the green of the pictures means."""
     for convention in ("opengl", "directx"):
         arguments = ["--method", "ls", "--format", form, "--convention", convention, "-o", convention]
         assert run("infer", capture, *arguments).code == 0
-        assert run("integrate", f"{convention}/sphere", "--format", "npy").code == 0
+        more = given if convention == "directx" else []
+        assert run("integrate", f"{convention}/sphere", "--format", "npy", *more).code == 0
     here, there = (np.load(f"{convention}/sphere/depth.npy") for convention in ("opengl", "directx"))
     np.testing.assert_allclose(here, there, atol=0.2)
     assert np.nanmax(here) - np.nanmin(here) > 1
@@ -106,6 +110,60 @@ def test_results_of_infer_stay_together(run, capture):
     assert {"normals.npy", "depth.npy", "mesh.ply", "surface.json"} <= {
         path.name for path in folder.iterdir()
     }
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        [],
+        ["--pixel-size", 0.5],
+        ["--scale", "1/2", "--pixel-size", 0.5],
+        ["--crop", "4,2,16,18", "--pixel-size", 0.5],
+        ["--light-positions", "lamps.txt", "--pixel-size", 2],
+        ["--light-positions", "lamps.txt", "--pixel-size", 2, "--camera-matrix", "camera.txt"],
+    ],
+    ids=["pixels", "millimetres", "scale", "crop", "near", "perspective"],
+)
+def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
+    """Camera, pixel size and frame of the results are in their report."""
+    import trimesh
+
+    np.savetxt("lamps.txt", POSITIONS)
+    Path("camera.txt").write_text("100 0 15.5\n0 100 15.5\n0 0 1\n")
+    folder = write_bump(Path("bump")) if "lamps.txt" in view else capture
+    arguments = ["--method", "ls", "--maps", "albedo", "--surface", "--mesh-format", "ply,glb", "--json"]
+    [report] = json.loads(run("infer", folder, *view, *arguments).out)
+    Path("camera.txt").unlink()
+    results = Path("out") / folder
+    again = json.loads(run("integrate", results, "-o", "again", "--format", "ply,glb,npy", "--json").out)
+    assert {name: again[name] for name in report["surface"]} == report["surface"]
+    # Normals that are read are scaled to unit length again, which may change their last bit.
+    depths = [np.load(place / "depth.npy") for place in (results, Path("again"))]
+    np.testing.assert_allclose(*depths, rtol=1e-5, atol=1e-5)
+    for name in ("mesh.ply", "mesh.glb"):
+        one, other = (
+            trimesh.load(place / name, force="mesh", process=False) for place in (results, Path("again"))
+        )
+        np.testing.assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(one.faces, other.faces)
+
+
+def test_options_of_a_folder_of_results_concern_the_photographs(run, capture):
+    """--pixel-size of `integrate` means what it means to `infer`."""
+    for output, more in (("out", []), ("sized", ["--surface", "--pixel-size", 0.5])):
+        assert run("infer", capture, "--method", "ls", "--scale", "1/2", *more, "-o", output).code == 0
+    assert run("integrate", "out/sphere", "--pixel-size", 0.5, "--format", "npy").code == 0
+    assert Path("out/sphere/depth.npy").read_bytes() == Path("sized/sphere/depth.npy").read_bytes()
+
+
+def test_a_report_that_says_nothing_of_the_camera_is_refused(run, capture):
+    assert run("infer", capture, "--method", "ls").code == 0
+    path = Path("out/sphere/report.json")
+    report = json.loads(path.read_text())
+    for change in ({"near_lamps": {"camera": "perspective"}}, {"options": {}}, {"near_lamps": 1}):
+        path.write_text(json.dumps({**report, **change}))
+        result = run("integrate", "out/sphere")
+        assert (result.code, "report.json: is damaged, or from another version" in result.err) == (3, True)
 
 
 def test_a_part_in_colour_by_perspective(run):

@@ -27,7 +27,7 @@ REPORT = {
     "axis_angle_deg": [1.4, 58.6],
     "white_level": {"value": 255.0, "origin": "full scale"},
     "exposure": {"bright": [0.25, 0.5], "saturated": 0.0123},
-    "expect": {"memory_mib": 701, "seconds": 3},
+    "expect": {"memory_mib": 701, "seconds": 3, "seconds_with_surface": 4},
     "warnings": [],
 }
 
@@ -48,7 +48,7 @@ def test_lines_of_a_report() -> None:
         "ground truth none",
         "white level  255, the full scale of the files",
         "exposure     brightest 1 % from 25 to 50 % of the white level, at most 1.2 % of an image saturated",
-        "expect       701 MiB of memory and about 3 s on a laptop",
+        "expect       701 MiB of memory and about 3 s on a laptop, 4 s with --surface",
     ]
     assert "reads        5 x 4 pixels from (1, 2)" in summary_lines(
         {**REPORT, "reads": "5 x 4 pixels from (1, 2)"}

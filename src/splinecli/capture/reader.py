@@ -26,6 +26,7 @@ from splinecli.capture.paths import StrPath
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.capture.source import CaptureSource, Progress
+from splinecli.capture.stamp import stamp_files
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError, UsageError
 
@@ -87,28 +88,32 @@ def open_capture(
             "--crop and --scale are for distant lights; under near lamps, the whole image has to be read"
         )
     files = find_capture_files(folder, overrides)
+    found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
+    files = replace(files, ambient=radiometry.ambient or found)
+    stamp = stamp_files(files, radiometry.flat_field, () if near is None else near.stamp)
     source = _read_lights(files, radiometry, light_frame, form, near, equal=equal)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
-    ambient = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
-    if radiometry.ambient is None and ambient is not None:
-        radiometry = replace(radiometry, ambient=ambient)
-        warnings.append(capture_warnings.ambient_subtracted(ambient.name))
+    if radiometry.ambient is None and files.ambient is not None:
+        radiometry = replace(radiometry, ambient=files.ambient)
+        warnings.append(capture_warnings.ambient_subtracted(files.ambient.name))
     encoded = [is_display_encoded(image) for image in files.images] if radiometry.gamma == 1 else []
     if radiometry.automatic and encoded and all(encoded):
         radiometry = replace(radiometry, gamma=None)
         warnings.append(capture_warnings.display_decoded())
     elif any(encoded):
         warnings.append(capture_warnings.display_encoded())
+    decoded = ("sRGB",) if radiometry.automatic and radiometry.gamma is None else ()
     orientation = common_orientation(files.images)
     if orientation != UPRIGHT:
         warnings.append(capture_warnings.exif_orientation(orientation))
     return replace(
         source,
-        files=replace(files, ambient=radiometry.ambient),
         radiometry=radiometry,
         warnings=tuple(warnings),
         white_level=white_level,
         window=window.on(files.images[0]),
+        # Left out where they are not given, so that earlier stamps stay valid.
+        stamp=(*stamp, *decoded, *(() if white_level is None else (white_level,))),
     )
 
 

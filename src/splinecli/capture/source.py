@@ -53,6 +53,8 @@ class CaptureSource:
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
         lamps: what is known of near lamps, or None.
         window: the part of the images that is read. All masks but those in files have its size.
+        stamp: JSON values that change when a file that is read for the capture, or the given white level, does. They
+            are older than what was read: a file that changed meanwhile has another stamp the next time.
     """
 
     files: CaptureFiles
@@ -67,6 +69,7 @@ class CaptureSource:
     light_frame: LightFrame = USUAL_FRAME
     lamps: LampFiles | None = None
     window: Window = WHOLE
+    stamp: tuple[Any, ...] = ()
 
     @property
     def n_lights(self) -> int:

@@ -4,51 +4,56 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from splinecli.capture.formats.text import read_text
-from splinecli.capture.paths import is_substitution
-from splinecli.capture.source import CaptureSource
+from splinecli.capture.paths import check_file, is_substitution
 from splinecli.errors import InputError
 from splinecli.files import file_sha256
 
+if TYPE_CHECKING:
+    from splinecli.capture.layouts.capture_files import CaptureFiles
 
-def stamp_capture(source: CaptureSource) -> list[Any]:
-    """Return JSON values that change when any file read for the capture, or the given white level, does.
+LARGEST_HASHED = 1 << 26
+"""Bytes of the largest file that is stamped by its content."""
+
+
+def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
+    """Return JSON values that change when a file of the capture does. Take them before the files are read.
 
     Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
 
+    Args:
+        lamps: stamps of the files of near lamps.
+
     Raises:
         InputError: a file cannot be read.
     """
-    files = source.files
     small = (files.light_directions, files.light_intensities, files.mask, files.ground_truth, files.ambient)
-    lamps = () if source.lamps is None else source.lamps.paths
-    stamp: list[Any] = [
-        [_sha256(path) for path in (*files.boundaries, *small, *lamps) if path is not None],
+    return (
+        [*(stamp_content(path) for path in (*files.boundaries, *small) if path is not None), *lamps],
         [_path_size_and_time(path) for path in files.images],
-        [_path_size_and_time(path) for path in source.radiometry.flat_field],
-    ]
-    if source.radiometry.automatic and source.radiometry.gamma is None:
-        stamp.append("sRGB")  # earlier versions read such images as linear
-    # Left out where it is not given, so that earlier stamps stay valid.
-    return stamp if source.white_level is None else [*stamp, source.white_level]
+        [_path_size_and_time(path) for path in flat_field],
+    )
 
 
-def digest(stamp: list[Any]) -> str:
-    """Return the SHA-256 of a stamp, or of any JSON values, in hexadecimal digits."""
-    return hashlib.sha256(json.dumps(stamp).encode()).hexdigest()
-
-
-def _sha256(path: Path) -> str:
+def stamp_content(path: Path) -> Any:
+    """Return the SHA-256 of a file, or the path, size and time of change of a very large one. Raises InputError."""
+    check_file(path, "a file", pipe=True)
     try:
         if is_substitution(path):
             return hashlib.sha256(read_text(path)).hexdigest()
-        return file_sha256(path)
+        return file_sha256(path) if path.stat().st_size <= LARGEST_HASHED else _path_size_and_time(path)
     except OSError as error:
         raise _unreadable(path, error) from None
+
+
+def digest(stamp: Sequence[Any]) -> str:
+    """Return the SHA-256 of a stamp, or of any JSON values, in hexadecimal digits."""
+    return hashlib.sha256(json.dumps(stamp).encode()).hexdigest()
 
 
 def _path_size_and_time(path: Path) -> tuple[str, int, int]:

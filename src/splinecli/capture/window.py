@@ -57,6 +57,12 @@ class Window:
         self.of(whole)[...] = mask
         return whole
 
+    def camera(self, matrix: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the camera matrix (3, 3) of what is read, from that of whole images."""
+        left, top, *_ = self.box or (0, 0)
+        to_window = np.array([[1, 0, -left], [0, 1, -top], [0, 0, self.step]]) / self.step
+        return np.asarray(to_window @ matrix, np.float64)
+
     def on(self, image: Path) -> Window:
         """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
         if self.is_whole:

@@ -232,4 +232,4 @@ def _summary(report: dict[str, Any], output: Path) -> str:
     elif expected is not None:
         scored = f", {expected:.0%} of them likely within 5 deg"
     counts = f"{report['n_pixels']} pixels, {report['n_lights']} lights"
-    return f"{output / report['capture']}: {counts}, {report['method']}{scored}"
+    return f"{output / report['capture']}: {counts}, {report['method']}{scored}, {report['seconds']['total']:.1f} s"

@@ -16,7 +16,7 @@ def integrate(
     normals: Path = inputs.NORMALS,
     mask: Path | None = inputs.NORMALS_MASK,
     camera_matrix: Path | None = inputs.CAMERA_MATRIX,
-    convention: NormalConvention = inputs.NORMALS_CONVENTION,
+    convention: NormalConvention | None = inputs.NORMALS_CONVENTION,
     colours: Path | None = inputs.COLOURS,
     max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
     stiffness: float = computing.STIFFNESS,
@@ -50,7 +50,7 @@ def integrate(
         decimate=decimate,
         colours=colours,
         formats=tuple(split_commas(formats, "--format", list(SURFACE_FILES))),
-        convention=convention.value,
+        convention=None if convention is None else convention.value,
         overwrite=overwrite,
     )
     report = integrate_normal_map(options, Messages(quiet=quiet))

@@ -11,7 +11,6 @@ from splinecli.capture import CaptureSource, capture_name, open_capture
 from splinecli.capture.lights.draws import Draw, DrawsFile, draw_lights, read_draws
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
-from splinecli.capture.stamp import stamp_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.capture_notes import capture_notes
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
@@ -96,7 +95,6 @@ class CaptureJob:
         """Return the job of a capture. Returns None if no protocol can score it; the tasks then contain the reasons."""
         try:
             source = open_capture(folder, white_level=tasks[0].protocol.white_level)
-            stamp = stamp_capture(source)
         except (InputError, UsageError, OSError) as error:
             for task in tasks:
                 task.fail(name, as_input_error(error, folder))
@@ -109,7 +107,7 @@ class CaptureJob:
                 task.fail(name, error)
                 continue
             job.tasks.append(task)
-            by_method = [plan_trials(name, stamp, e, draws, task.protocol) for e in estimators]
+            by_method = [plan_trials(name, source.stamp, e, draws, task.protocol) for e in estimators]
             for estimator, trials in zip(estimators, by_method, strict=True):
                 task.trials[name, estimator.name] = trials
             # All methods of a draw come together: they share its capture, and the remaining time can be estimated.

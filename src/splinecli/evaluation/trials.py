@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Lock
@@ -144,7 +144,7 @@ class TrialStore:
 
 
 def plan_trials(
-    capture: str, stamp: list[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
+    capture: str, stamp: Sequence[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
 ) -> list[Trial]:
     """Return the trials of one method on one capture, given the stamp of the capture's files."""
     made_of = digest([__version__, estimator.fingerprint, *stamp])

@@ -63,13 +63,17 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
     return EarlierResults(report)
 
 
-def inputs_sha256(source: CaptureSource, weights: str | None) -> str:
-    """Return a digest that changes when any file that is read for the capture, or the weight file, changes."""
-    from splinecli.capture.stamp import digest, stamp_capture
+def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
+    """Return a digest that changes when any file that is read for the capture, or the weight file, changes.
+
+    `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
+    """
+    from splinecli.capture.stamp import digest
     from splinecli.files import file_sha256
 
-    weight_file = None if weights is None or not Path(weights).is_file() else file_sha256(Path(weights))
-    return digest([*stamp_capture(source), weight_file or weights])
+    if weights is not None and Path(weights).is_file():
+        weights = loaded or file_sha256(Path(weights))
+    return digest([*source.stamp, weights])
 
 
 def _differences(earlier: InferOptions, options: InferOptions) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 from splinecli.errors import UsageError
 from splinecli.pipeline.finished import inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.observer import SILENT, Advance, Observer
+from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from splinecli.capture import Capture, CaptureSource
-    from splinecli.capture.capture_warnings import CaptureWarning
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
+    from splinecli.results.clock import Clock
 
 
 def infer_capture(
@@ -56,57 +54,49 @@ def _infer_into(
     folder: Path, target: Path, options: InferOptions, observer: Observer, estimator: Estimator | None
 ) -> dict[str, Any]:
     """Do the work of infer_capture in the folder of results, which the caller holds."""
-    from splinecli.capture.capture_warnings import ROUGH_LIGHTS
-    from splinecli.pipeline.distillation import distil_for
-    from splinecli.pipeline.input_checks import check_capture, check_confidence, refuse_if_strict
+    from splinecli.pipeline.estimate import estimate_capture
+    from splinecli.pipeline.input_checks import check_capture
+    from splinecli.results.clock import Clock
     from splinecli.results.files import write_estimate
     from splinecli.results.report import report_of
 
-    source, capture, read_seconds = _read(folder, options, observer)
-    warnings = [*capture.warnings, *check_capture(source, capture, strict=options.strict)]
-    refuse_if_strict(warnings, capture.name, strict=options.strict)
-    if options.refine_lights:
-        from splinecli.capture.restore.light_refinement import refine_capture
-
-        warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
-        before = len(capture.warnings)
-        capture = refine_capture(
-            capture, error_deg=options.light_error_deg, intensities_known=source.intensities_known
-        )
-        warnings += capture.warnings[before:]
+    clock = Clock()
+    source, capture = _read(folder, options, observer)
     if estimator is None:
         estimator = make_method(options)
-    _check_memory(capture, folder, options)
-    if options.surface and "glb" in options.mesh_formats:
-        from splinecli.surface.mesh import check_triangles
-
-        check_triangles(capture.mask)  # now, because the normals would be lost
-    distilled, found = distil_for(capture, estimator, options.distil, observer)
-    warnings += found
-    estimate = _estimate(capture, distilled or estimator, observer)
-    warnings += _method_warnings(estimator, capture)
-    warnings += check_confidence(estimate.expected_under_5)
-    refuse_if_strict(warnings, capture.name, strict=options.strict)
-    for warning in warnings:
+    _check_results(capture, folder, options)
+    estimate, distilled = estimate_capture(
+        capture,
+        estimator,
+        partial(check_capture, source, strict=options.strict),
+        refine_lights=_light_refinement(source, options),
+        distil=options.distil,
+        strict=options.strict,
+        observer=observer,
+        clock=clock,
+    )
+    for warning in estimate.capture.warnings:
         observer.warn(f"{capture.name}: {warning}")
+    loaded = None if estimator.weights is None else estimator.weights["sha256"]
     report = report_of(
         estimate,
         estimator,
         options.as_dict(),
-        inputs_sha256(source, options.weights),
+        inputs_sha256(source, options.weights, loaded=loaded),
         light_file=source.files.light_directions,
         as_stored=options.as_stored,
-        read_seconds=read_seconds,
-        warnings=warnings,
         distillation=None if distilled is None else distilled.report(),
     )
+    further = _further_files(source, estimate, report, options, observer, clock)
+    clock.begin("write")
     return write_estimate(
         estimate,
         report,
         target,
         formats=options.formats,
         convention=options.convention,
-        more=_further_files(source, estimate, report, options, observer),
+        clock=clock,
+        more=further,
     )
 
 
@@ -130,9 +120,8 @@ def make_method(options: InferOptions) -> Estimator:
     return estimator
 
 
-def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture, float]:
-    """Return the opened capture, the capture under the chosen lights, and the seconds that reading took."""
-    started = time.perf_counter()
+def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture]:
+    """Return the opened capture, and the capture under the chosen lights."""
     source = options.open(folder)
     name = source.files.name
     if options.auto_mask:
@@ -142,7 +131,7 @@ def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[Capt
     count = source.n_lights if indices is None else len(indices)
     with observer.progress(f"{name}: reading", count) as advance:
         capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
-    return source, capture, time.perf_counter() - started
+    return source, capture
 
 
 def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int] | None:
@@ -153,8 +142,8 @@ def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int
     return draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
 
 
-def _check_memory(capture: Capture, folder: Path, options: InferOptions) -> None:
-    """Raise InputError where the results take more memory than is left, before hours of work."""
+def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
+    """Raise InputError, before hours of work, for results that take more memory than is left, or an empty mesh."""
     from splinecli.capture.capture_size import results_bytes
     from splinecli.capture.formats.image_size import check_memory
 
@@ -167,29 +156,19 @@ def _check_memory(capture: Capture, folder: Path, options: InferOptions) -> None
         + (", or leave --surface out" if options.surface else "")
         + (", or neither albedo in --maps nor --html" if albedo else ""),
     )
+    if options.surface and "glb" in options.mesh_formats:
+        from splinecli.surface.mesh import check_triangles
+
+        check_triangles(capture.mask)
 
 
-def _estimate(capture: Capture, estimator: Estimator, observer: Observer) -> NormalEstimate:
-    from splinecli.inference import estimate_normals
+def _light_refinement(source: CaptureSource, options: InferOptions) -> Callable[[Capture], Capture] | None:
+    if not options.refine_lights:
+        return None
+    from splinecli.capture.restore.light_refinement import refine_capture
 
-    with ExitStack() as stages:
-
-        def stage(name: str) -> AbstractContextManager[Advance]:
-            stages.close()  # one bar at a time
-            return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
-
-        advance = stages.enter_context(stage("estimating"))
-        return estimate_normals(capture, estimator, progress=advance, stage=stage)
-
-
-def _method_warnings(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:
-    if estimator.weights is None:
-        return []
-    from splinecli.capture.capture_warnings import UNTRAINED_LIGHTS, CaptureWarning
-    from splinecli.networks.weights import untrained_warning
-
-    texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
-    return [CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts]
+    known = source.intensities_known
+    return partial(refine_capture, error_deg=options.light_error_deg, intensities_known=known)
 
 
 def _further_files(
@@ -198,6 +177,7 @@ def _further_files(
     report: dict[str, Any],
     options: InferOptions,
     observer: Observer,
+    clock: Clock,
 ) -> list[Callable[[Path], None]]:
     """Compute what else the options ask for. Each function that is returned writes some files into a folder."""
     from splinecli.results import files
@@ -205,6 +185,7 @@ def _further_files(
     capture = estimate.capture
     writers: list[Callable[[Path], None]] = []
     albedo = colours = None
+    clock.begin("pictures")
     if "albedo" in options.maps or options.html:
         from splinecli.pictures.maps import albedo_picture
         from splinecli.results.albedo import albedo_map
@@ -221,9 +202,11 @@ def _further_files(
     if source.automatic_mask is not None:
         writers.append(partial(files.write_mask, capture.mask))
     if options.surface:
+        clock.begin("surface")
         writers.append(_surface(estimate, colours, report, options, observer))
     if options.html:
-        writers.append(_page(estimate, albedo, report))
+        clock.begin("pictures")
+        writers.append(_page(estimate, albedo, {**report, "seconds": clock.seconds()}))
     return writers
 
 
@@ -235,19 +218,15 @@ def _surface(
     observer: Observer,
 ) -> Callable[[Path], None]:
     """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
-    from splinecli.capture.window import parse_window
-    from splinecli.pipeline.surface import make_surface, share_of_iterations
+    from splinecli.pipeline.surface import make_surface, share_of_iterations, view_of_report
     from splinecli.surface.surface_files import DEPTH_FORMATS, write_surface
 
-    lamps = estimate.capture.lamps
-    pixel_size = options.pixel_size
-    if pixel_size is not None:
-        pixel_size *= parse_window(options.crop, options.scale).step
+    camera_matrix, pixel_size = view_of_report(report)
     with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
         surface, report["surface"] = make_surface(
             estimate.normal_map,
             estimate.capture.mask,
-            None if lamps is None else lamps.camera_matrix,
+            camera_matrix,
             colours,
             n_triangles=options.decimate,
             pixel_size_mm=pixel_size,

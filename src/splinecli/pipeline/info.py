@@ -24,6 +24,9 @@ LEARNED_PER_SECOND = 1000
 DISTILLED_PER_SECOND = 130_000
 """Speed of reading, of the distilled network, of the refinement and of writing together, on two cores."""
 
+SURFACE_PER_SECOND = 50_000
+"""Speed of integration, mesh and their files on one core. Noise of the normals and tears take longer."""
+
 STARTING_SECONDS = 3
 """Time that infer takes besides the pixels."""
 
@@ -121,7 +124,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("exposure", f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of the white level, at most"
                      f" {100 * exposure['saturated']:.1f} % of an image saturated"),
         ("expect", f"{report['expect']['memory_mib']} MiB of memory and about {report['expect']['seconds']} s"
-                   " on a laptop"),
+                   f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface"),
     ]  # fmt: skip
     return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
 
@@ -164,6 +167,7 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
     )
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
+    seconds = STARTING_SECONDS + _seconds(summary)
     if intensities is None and (source.light_intensities != 1).any():
         intensities = files.light_directions  # the light files of AliceVision have both
     return {
@@ -191,7 +195,8 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         },
         "expect": {
             "memory_mib": round(_memory_mib(summary)),
-            "seconds": round(STARTING_SECONDS + _seconds(summary)),
+            "seconds": round(seconds),
+            "seconds_with_surface": round(seconds + summary.n_pixels / SURFACE_PER_SECOND),
         },
     }
 

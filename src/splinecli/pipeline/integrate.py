@@ -6,11 +6,12 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from splinecli.errors import InputError, UsageError
 from splinecli.exr import check_exr
 from splinecli.files import is_unfinished, read_json
+from splinecli.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
     STIFFNESS,
@@ -18,6 +19,7 @@ from splinecli.pipeline.surface import (
     check_surface_options,
     make_surface,
     share_of_iterations,
+    view_of_report,
 )
 from splinecli.surface.surface_files import (
     DEFAULT_FORMATS,
@@ -31,9 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splinecli.normals import Convention
-
-SCHEMA = 1
+SCHEMA = 2
 """The version of the fields of surface.json. It rises when a field changes its meaning."""
 
 INPUT_FORMATS = ("npy", "tiff", "png", "png8")
@@ -48,14 +48,17 @@ class IntegrateOptions:
         normals: a normal map, or a folder that `infer` wrote.
         output: the folder of the results. None for the folder of the normal map.
         mask: a mask image. None takes all pixels that have a normal.
-        camera_matrix: a text file of 3 x 3 numbers, for a perspective camera. None for an orthographic camera.
+        camera_matrix: a text file of 3 x 3 numbers, for a perspective camera. None for that of the report of `infer`
+            beside the normal map, or else for an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 never tears it.
         largest_step: leaves out triangles that are higher, in pixels. None keeps all.
-        pixel_size: the width of a pixel on the object in millimetres. None for a surface without this unit.
+        pixel_size: the width of a pixel on the object in millimetres. None for that of the report, or else for a
+            surface without this unit.
         decimate: the number of triangles that the mesh is reduced to. None keeps all.
         colours: an image of the colours of the object. None for the albedo in the folder of the normal map, if any.
         formats: keys of `splinecli.surface.surface_files.SURFACE_FILES`.
-        convention: direction of the green channel of normal maps that are images.
+        convention: direction of the green channel of normal maps that are pictures. None for that of the report, or
+            else opengl.
         overwrite: replace earlier results.
 
     Raises:
@@ -72,7 +75,7 @@ class IntegrateOptions:
     decimate: int | None = None
     colours: Path | None = None
     formats: tuple[str, ...] = DEFAULT_FORMATS
-    convention: Convention = "opengl"
+    convention: Convention | None = None
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -112,14 +115,19 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
 
 def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, Any]:
     """Do the work of integrate_normal_map in the folder of results, which the caller holds."""
+    started = time.perf_counter()
     import numpy as np
 
+    from splinecli.capture import read_normal_map
     from splinecli.capture.capture_size import BYTES_OF_SURFACE
     from splinecli.capture.formats.image_size import check_memory
     from splinecli.capture.lights.lamp_files import read_camera_matrix
     from splinecli.publishing import new_files
 
-    normal_map = _read_normal_map(options)
+    path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
+    made_by = _report_of(path)
+    convention = options.convention or ("opengl" if made_by is None else made_by["options"]["convention"])
+    normal_map = read_normal_map(path, options.mask, convention=convention)
     mask = np.asarray(normal_map.any(axis=2))
     n_pixels = int(np.count_nonzero(mask))
     check_memory(
@@ -129,9 +137,11 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         hint="Mask the object with --mask, or reduce the normal map (infer --scale)",
     )
     camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
+    pixel_size = options.pixel_size
+    if made_by is not None:
+        camera_matrix, pixel_size = view_of_report(made_by, camera_matrix, pixel_size)
     picture = options.colours or _find_albedo(options.normals)
     colours = None if picture is None else _read_colours(picture, mask.shape)
-    started = time.perf_counter()
     with observer.progress("integrating", 1.0) as advance:
         surface, found = make_surface(
             normal_map,
@@ -141,7 +151,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             stiffness=options.stiffness,
             largest_step=options.largest_step,
             n_triangles=options.decimate,
-            pixel_size_mm=options.pixel_size,
+            pixel_size_mm=pixel_size,
             progress=share_of_iterations(advance),
         )
     report = {
@@ -151,10 +161,10 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "n_pixels": n_pixels,
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
-        "seconds": round(time.perf_counter() - started, 3),
     }
     with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as stage:
         write_surface(stage, surface, options.formats)
+        report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
         report["files"] = [
             name for name in options.files if (stage / name).exists() or name == SURFACE_REPORT
@@ -182,18 +192,6 @@ def _earlier_files(folder: Path) -> list[str]:
         return []
 
 
-def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
-    """Return the normal map (H, W, 3), y up, zero outside the mask."""
-    from splinecli.capture import read_normal_map
-
-    is_folder = options.normals.is_dir()
-    path = _find_normal_map(options.normals) if is_folder else options.normals
-    normal_map = read_normal_map(path, options.mask)
-    if options.convention == "directx" or (is_folder and _was_written_as_directx(path)):
-        normal_map[..., 1] *= -1
-    return normal_map
-
-
 def _find_normal_map(folder: Path) -> Path:
     from splinecli.results.files import NORMALS
 
@@ -214,15 +212,27 @@ def _find_normal_map(folder: Path) -> Path:
     )
 
 
-def _was_written_as_directx(path: Path) -> bool:
-    """Return whether the report beside an image of `infer` says that green points down."""
+def _report_of(path: Path) -> dict[str, Any] | None:
+    """Return the report of the `infer` that wrote a normal map; None for a normal map from elsewhere."""
     from splinecli.results.files import REPORT
 
     try:
-        report = read_json(path.parent / REPORT)
-        return path.suffix == ".png" and report["options"]["convention"] == "directx"
+        report: dict[str, Any] = read_json(path.parent / REPORT)
+        if path.name not in report["files"]:
+            return None
     except (OSError, ValueError, KeyError, TypeError):
-        return False
+        return None
+    try:
+        view_of_report(report)
+        if report["options"]["convention"] in get_args(Convention):
+            return report
+    except (ValueError, KeyError, TypeError, UsageError):
+        pass
+    raise InputError(
+        "is damaged, or from another version: it does not say how the normal map beside it was made",
+        path=path.parent / REPORT,
+        hint="Run 'splinecli infer' again, or move the normal map to another folder",
+    )
 
 
 def _find_albedo(folder: Path) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -75,6 +75,37 @@ def make_surface(
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
     surface = Surface(depth, mesh, unit, millimetres)
     return surface, _report(surface, camera_matrix is not None, stiffness, pixel_size_mm)
+
+
+def view_of_report(
+    report: Mapping[str, Any],
+    camera_matrix: NDArray[np.floating] | None = None,
+    pixel_size_mm: float | None = None,
+) -> tuple[NDArray[np.float64] | None, float | None]:
+    """Return camera matrix and pixel size in millimetres of the normal map that a report of `infer` describes.
+
+    Args:
+        report: see report_of.
+        camera_matrix, pixel_size_mm: of the photographs, in place of those of the report.
+
+    Raises:
+        KeyError, TypeError, ValueError, UsageError: it is no report of this version of `infer`.
+    """
+    import numpy as np
+
+    from splinecli.capture.window import parse_window
+
+    options, lamps = report["options"], report["near_lamps"]
+    window = parse_window(options["crop"], options["scale"])
+    if camera_matrix is None and lamps is not None and lamps["camera"] == "perspective":
+        camera_matrix = np.array(lamps["camera_matrix"], np.float64).reshape(3, 3)
+    if pixel_size_mm is None and options["pixel_size"] is not None:
+        pixel_size_mm = float(options["pixel_size"])
+    check_surface_options(None, pixel_size_mm)
+    return (
+        None if camera_matrix is None else window.camera(camera_matrix),
+        None if pixel_size_mm is None else pixel_size_mm * window.step,
+    )
 
 
 def check_decimation(n_triangles: int | None) -> None:

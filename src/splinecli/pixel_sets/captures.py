@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splinecli.capture import capture_name, open_capture
-from splinecli.capture.stamp import digest, stamp_capture
+from splinecli.capture.stamp import digest
 from splinecli.capture.stored import name_reading
 from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import Pixels
@@ -85,7 +85,7 @@ def add_capture(
         "reading": name_reading(as_stored=as_stored),
         "white_level": white_level,
         # The stamp depends on the white level too, so it is compared last.
-        "files": digest(stamp_capture(source)),
+        "files": digest(source.stamp),
     }
     if source.lamps is not None and source.lamps.used:
         raise InputError(

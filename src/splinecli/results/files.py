@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from splinecli.normals import Convention, describe, encode_picture
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
 from splinecli.publishing import new_files
+from splinecli.results.clock import Clock
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 
 NORMALS = {
@@ -58,6 +58,7 @@ def write_estimate(
     *,
     formats: Sequence[str],
     convention: Convention,
+    clock: Clock,
     more: Sequence[Callable[[Path], None]] = (),
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report.
@@ -70,12 +71,12 @@ def write_estimate(
         folder: the capture's folder of results.
         formats: keys of NORMALS.
         convention: whether green is y up or y down in pictures of normals.
+        clock: tells the seconds of all stages, of which writing is the last.
         more: functions that write further files of OWN_FILES into a folder, such as write_albedo.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    started = time.perf_counter()
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in OWN_FILES if name != FOUND_MASK]
     with new_files(folder, report=REPORT, stale=stale) as stage:
@@ -86,8 +87,7 @@ def write_estimate(
         for write in more:
             write(stage)
         files = [*(path.name for path in sorted(stage.iterdir())), REPORT]
-        seconds = {**report["seconds"], "write": round(time.perf_counter() - started, 3)}
-        report = {**report, "seconds": seconds, "folder": str(folder.absolute()), "files": files}
+        report = {**report, "seconds": clock.seconds(), "folder": str(folder.absolute()), "files": files}
         (stage / REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     return report
 

@@ -47,6 +47,7 @@ def row_of(report: Mapping[str, Any]) -> Row:
     if "error" in report:
         return Row(report["capture"], error=report["error"])
     errors, expected = report["angular_error_deg"], report["expected_under_5"]
+    seconds = report["seconds"]
     return Row(
         report["capture"],
         lights=str(report["n_lights"]),
@@ -54,7 +55,7 @@ def row_of(report: Mapping[str, Any]) -> Row:
         mae="" if errors is None else f"{errors['mean']:.2f}°",
         likely="" if expected is None else f"{expected:.0%}",
         warnings=str(len(report["warnings"]) or ""),
-        seconds=f"{sum(report['seconds'].values()):.1f}",
+        seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
     )
 
 

@@ -50,7 +50,7 @@ def result_page(
     states its size then. The figures on the page are those of the report, over all pixels.
 
     Args:
-        report: a report of `infer` (docs/infer.md); `seconds.write`, `files` and `surface` may be missing. Lengths on
+        report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths on
             the page are in millimetres if its surface is, else in pixels of the whole maps.
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
@@ -159,8 +159,17 @@ def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> lis
         ("Size", _TIMES.join(map(str, report["image_size"]))),
         *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels")]),
         *([] if reduced is None else [("Size on this page", _TIMES.join(map(str, reduced)))]),
-        ("Seconds", ", ".join(f"{step} {seconds:g}" for step, seconds in report["seconds"].items())),
+        ("Seconds", ", ".join(_seconds(report["seconds"]))),
         ("Device", f"{report['device']}, {report['precision']}"),
+    ]
+
+
+def _seconds(of_stages: Mapping[str, float]) -> list[str]:
+    """Return the seconds of the stages up to this page."""
+    return [
+        f"{name.replace('_', ' ')} {seconds:g}"
+        for name, seconds in of_stages.items()
+        if seconds and name != "total"
     ]
 
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from splinecli import __version__
-from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.stored import name_reading
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 
-SCHEMA = 1
+SCHEMA = 2
 """The version of the report's fields. It rises when a field changes its meaning."""
 
 
@@ -26,23 +25,19 @@ def report_of(
     *,
     light_file: Path,
     as_stored: bool,
-    read_seconds: float,
-    warnings: Sequence[CaptureWarning],
     distillation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
-    write_estimate adds `seconds.write`, `folder` and `files`.
+    write_estimate adds `seconds`, `folder` and `files`.
 
     Args:
-        estimate: the result.
+        estimate: the result. Its capture has what the user should know about it as warnings.
         estimator: the method that made it.
         options: the options of the run, ready for JSON.
         inputs: a digest that changes when an input file changes.
         light_file: the file that gave the lights.
         as_stored: whether the capture was read without any restoration.
-        read_seconds: seconds that reading the capture took.
-        warnings: what the user should know about the result.
         distillation: what DistilledEstimator.report returns; None where the method estimated every pixel.
     """
     capture = estimate.capture
@@ -64,9 +59,8 @@ def report_of(
         "device": estimator.device,
         "precision": estimator.precision,
         "distillation": distillation,
-        "seconds": {"read": round(read_seconds, 3), "estimate": round(estimate.seconds, 3)},
         "peak_memory_mib": peak_memory_mib(),
-        "warnings": [asdict(warning) for warning in warnings],
+        "warnings": [asdict(warning) for warning in capture.warnings],
         "angular_error_deg": None
         if errors is None
         else {name: round(value, 4) for name, value in asdict(errors).items()},

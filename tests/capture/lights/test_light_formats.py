@@ -68,13 +68,17 @@ def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | No
     ],
     ids=["csv", "paths", "header", "stems"],
 )
-def test_rows_that_name_their_image(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("stem", ["img", "2024_0"])
+def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> None:
+    """A name such as 2024_01, which Python would read as a number, is a name."""
+    text = text.replace("img", stem)
     lights = read_lights(write(tmp_path, text), 4)
     assert isinstance(lights, NamedLights)
-    images, how = lights.match(IMAGES)
+    wanted = [Path(image.name.replace("img", stem)) for image in IMAGES]
+    images, how = lights.match(wanted)
     assert how.startswith("name")
     found = dict(zip(images, lights.directions, strict=True))
-    np.testing.assert_allclose([found[image] for image in IMAGES], DIRECTIONS, atol=1e-15)
+    np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 
 def test_lp_files_with_decimal_commas(tmp_path: Path) -> None:

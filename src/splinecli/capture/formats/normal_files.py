@@ -25,7 +25,7 @@ from splinecli.capture.formats.images import cut_out, read_mask
 from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-from splinecli.normals import SHORTEST_IN_PICTURE, decode_picture
+from splinecli.normals import SHORTEST_IN_PICTURE, Convention, decode_picture
 
 _GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", *PICTURE_SUFFIXES)
 
@@ -35,13 +35,16 @@ _FEWEST_UNIT = 0.6  # share in a picture of normals; in photographs a third has 
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
 
 
-def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | Path | None = None) -> NDArray[np.float32]:
-    """Return a normal map (H, W, 3) float32 of any size: unit vectors, or zero where there is no normal.
+def read_normal_map(
+    path: StrPath, mask: NDArray[np.bool_] | Path | None = None, *, convention: Convention = "opengl"
+) -> NDArray[np.float32]:
+    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero where there is no normal.
 
     Args:
         path: any of the files above but text.
         mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's alpha channel cuts
             something out, that is left out, too.
+        convention: whether green is y up or y down where the values are colours.
 
     Raises:
         InputError: the file cannot be read, contains no normal map, or is not of the mask's size.
@@ -59,7 +62,10 @@ def read_normal_map(path: StrPath, mask: NDArray[np.bool_] | Path | None = None)
     opaque = None if stored.alpha is None else cut_out(stored.alpha)
     if opaque is not None:
         wanted = wanted & opaque
-    return _to_normals(stored, wanted, path, check_floats=True)
+    normals = _to_normals(stored, wanted, path, check_floats=True)
+    if stored.is_picture and convention == "directx":
+        normals[..., 1] *= -1
+    return normals
 
 
 def read_ground_truth(

@@ -193,11 +193,15 @@ def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
 
 def is_number(word: str) -> bool:
     """Return whether a word is a number, finite or not."""
+    return _to_number(word) is not None
+
+
+def _to_number(word: str) -> float | None:
     try:
-        float(word)
+        # float() also takes Python's notation "1_000", but "2024_01" is the name of an image.
+        return float(word) if "_" not in word else None
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def _is_number_with_comma(word: str) -> bool:
@@ -210,11 +214,7 @@ def _with_point(word: str) -> str:
 
 def parse_number(word: str, path: Path, line: int) -> float:
     """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
-    try:
-        # float() also takes Python's notation "1_000".
-        value = float(word) if "_" not in word else None
-    except ValueError:
-        value = None
+    value = _to_number(word)
     if value is None:
         raise InputError(f'found "{word[:40]}", expected a number', path=path, line=line)
     if not np.isfinite(value):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights
 from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.stamp import stamp_content
 from splinecli.errors import InputError, UsageError
 
 PIXEL_SIZE = ("pixel_size.txt",)
@@ -87,7 +89,7 @@ class LampFiles:
         distance: see LampOptions.
         pixel_size, object_width: the scale; see LampOptions. Both are None where it is unknown.
         camera_matrix: (3, 3), or None for an orthographic camera.
-        paths: the files that were found.
+        stamp: of the files that were found, from before they were read.
         used: whether the capture uses the lamps. If not, they are only compared with distant lights.
     """
 
@@ -96,7 +98,7 @@ class LampFiles:
     pixel_size: float | None
     object_width: float | None
     camera_matrix: NDArray[np.float64] | None
-    paths: tuple[Path, ...]
+    stamp: tuple[Any, ...]
     used: bool
 
     def in_words(self) -> str:
@@ -165,22 +167,25 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
             )
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
+    matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
     pixel_file, pixel_size = None, options.pixel_size
     if pixel_size is None and options.object_width is None:
         pixel_file = _find(folders, PIXEL_SIZE)
+    read = (positions, pixel_file, matrix_file)
+    stamp = tuple(stamp_content(path) for path in read if path is not None)
+    if pixel_size is None and options.object_width is None:
         pixel_size = None if pixel_file is None else _read_pixel_size(pixel_file)
         if pixel_size is None and used and positions in (find_lights(folder), _path(options.positions)):
             raise InputError(
                 "nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT
             )
-    matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
     return LampFiles(
         positions,
         options.distance,
         pixel_size,
         options.object_width,
         None if matrix_file is None else read_camera_matrix(matrix_file),
-        tuple(path for path in (positions, pixel_file, matrix_file) if path is not None),
+        stamp,
         used and (pixel_size is not None or options.object_width is not None),
     )
 

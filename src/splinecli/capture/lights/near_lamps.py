@@ -78,6 +78,7 @@ class NearLamps:
             "distances": distances.round(4).tolist(),
             "pixel_size": self.pixel_size,
             "camera": "orthographic" if self.camera_matrix is None else "perspective",
+            "camera_matrix": None if self.camera_matrix is None else self.camera_matrix.tolist(),
         }
 
     def turned(self, directions: Floats) -> NearLamps:

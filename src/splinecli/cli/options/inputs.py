@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typer import Argument, Option
 
-from splinecli.cli.options.values import LightForm, NormalConvention, complete_curves, complete_list
+from splinecli.cli.options.values import LightForm, complete_curves, complete_list
 from splinecli.memory import LARGEST_IMAGE
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
@@ -66,7 +66,8 @@ PIXEL_SIZE_MM = Option(
     None,
     "--pixel-size",
     metavar="MM",
-    help="Width of a pixel on the object in millimetres, for a surface in millimetres. [default: in pixels]",
+    help="Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres. [default: as"
+    " in report.json beside the normal map, or in pixels]",
 )
 OBJECT_WIDTH = Option(
     None, metavar="W", help="Near lamps: the width of the object in its mask, in place of --pixel-size."
@@ -197,11 +198,13 @@ NORMALS_MASK = Option(
 CAMERA_MATRIX = Option(
     None,
     metavar="FILE",
-    help="Text file of the 3 x 3 camera matrix in pixels, for a perspective camera. [default: orthographic]",
+    help="Text file of the 3 x 3 camera matrix in pixels, for a perspective camera. [default: as in report.json beside"
+    " the normal map, or orthographic]",
 )
 NORMALS_CONVENTION = Option(
-    NormalConvention.opengl,
-    help="Green channel of a normal map that is an image: opengl is y up, directx is y down.",
+    None,
+    help="Green channel of a normal map of colours: opengl is y up, directx is y down. [default: as in report.json"
+    " beside it, or opengl]",
 )
 COLOURS = Option(
     None,
