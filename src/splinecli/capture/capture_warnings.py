@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.restore.white_level import WhiteLevel
 
 
@@ -37,6 +38,7 @@ ENCODED_VALUES = "encoded_values"
 ESTIMATED_INTENSITIES = "estimated_intensities"
 EXIF_ORIENTATION = "exif_orientation"
 FEW_LIGHTS = "few_lights"
+GROUND_TRUTH_FRAME = "ground_truth_frame"
 GROUND_TRUTH_Z = "ground_truth_z"
 GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
@@ -63,6 +65,7 @@ WHITE_LEVEL = "white_level"
 PROBABLY_WRONG = frozenset(
     {
         ENCODED_VALUES,
+        GROUND_TRUTH_FRAME,
         GROUND_TRUTH_Z,
         IMAGE_ODD,
         IMAGES_SHIFTED,
@@ -180,11 +183,14 @@ def exif_orientation(orientation: int) -> CaptureWarning:
     )
 
 
-def ground_truth_z() -> CaptureWarning:
+def ground_truth_frame(frame: LightFrame, angle_deg: float, given_deg: float) -> CaptureWarning:
+    """Warn of a ground truth that differs less from the lights' normals once it is read in another frame."""
+    code = GROUND_TRUTH_Z if frame.signs[2] < 0 else GROUND_TRUTH_FRAME
+    lights = "" if code == GROUND_TRUTH_Z else ", or the light directions are in another frame than it"
     return CaptureWarning(
-        GROUND_TRUTH_Z,
-        "The normals of the ground truth point away from the camera (z < 0): its z is probably negated, so the errors"
-        " mean nothing.",
+        code,
+        f"The ground truth is {given_deg:.0f} degrees from normals that fit the images, but {angle_deg:.0f} degrees"
+        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing.",
     )
 
 
@@ -282,8 +288,8 @@ def kept_lights(reason: str) -> CaptureWarning:
     return CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {reason}.")
 
 
-def few_lights(n_lights: int) -> CaptureWarning:
-    return CaptureWarning(FEW_LIGHTS, f"There are {n_lights} lights; use ten or more, well spread.")
+def few_lights(n_lights: int, enough: int) -> CaptureWarning:
+    return CaptureWarning(FEW_LIGHTS, f"There are {n_lights} lights; use {enough} or more, well spread.")
 
 
 def high_lights(limit_deg: float) -> CaptureWarning:
