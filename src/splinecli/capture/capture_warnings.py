@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.light_frames import LightFrame
 from splinecli.capture.restore.white_level import WhiteLevel
 
 
@@ -47,6 +46,7 @@ IMAGES_LEFT_OUT = "images_left_out"
 IMAGES_SHIFTED = "images_shifted"
 LIGHTS_CROWDED = "lights_crowded"
 KEPT_LIGHTS = "kept_lights"
+LAMPS_NEAR = "lamps_near"
 LAMP_DISTANCE = "lamp_distance"
 LIGHTS_MATCHED = "lights_matched"
 LIGHTS_UNCHECKED = "lights_unchecked"
@@ -55,6 +55,7 @@ LIGHT_ORDER = "light_order"
 NEAR_LAMPS = "near_lamps"
 LOW_CONFIDENCE = "low_confidence"
 NOT_DISTILLED = "not_distilled"
+NO_MASK = "no_mask"
 REPEATED_IMAGES = "repeated_images"
 REFINED_LIGHTS = "refined_lights"
 ROUGH_LIGHTS = "rough_lights"
@@ -164,33 +165,12 @@ def display_encoded() -> CaptureWarning:
     )
 
 
-def encoded_values(ratio: float) -> CaptureWarning:
-    """Warn of images whose decoding leaves only a share of what the lights cannot explain."""
-    return CaptureWarning(
-        ENCODED_VALUES,
-        "The images fit the lights much better if their values are decoded: they look display-encoded, but are read as"
-        f" linear (what the lights cannot explain falls to {100 * ratio:.0f} %). Add --transfer srgb or"
-        " --transfer gamma:2.2.",
-    )
-
-
 def exif_orientation(orientation: int) -> CaptureWarning:
     """Warn of images that viewers turn."""
     return CaptureWarning(
         EXIF_ORIENTATION,
         f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
         " results are in the frame of the stored pixels.",
-    )
-
-
-def ground_truth_frame(frame: LightFrame, angle_deg: float, given_deg: float) -> CaptureWarning:
-    """Warn of a ground truth that differs less from the lights' normals once it is read in another frame."""
-    code = GROUND_TRUTH_Z if frame.signs[2] < 0 else GROUND_TRUTH_FRAME
-    lights = "" if code == GROUND_TRUTH_Z else ", or the light directions are in another frame than it"
-    return CaptureWarning(
-        code,
-        f"The ground truth is {given_deg:.0f} degrees from normals that fit the images, but {angle_deg:.0f} degrees"
-        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing.",
     )
 
 
@@ -281,6 +261,15 @@ def rough_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureWar
         ROUGH_LIGHTS,
         f"The light directions are probably rough: others, {moved_deg.mean():.1f} degrees away on average, leave"
         f" {100 * fit_ratio:.0f} % of the misfit. Try --refine-lights.",
+    )
+
+
+def no_mask(share: float) -> CaptureWarning:
+    """Warn of a capture without a mask, a large share of whose pixels is dark background."""
+    return CaptureWarning(
+        NO_MASK,
+        f"There is no mask, and {100 * share:.0f} % of the pixels are near black: the normals of this background mean"
+        " nothing. Add --auto-mask, or give a mask.",
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.capture_warnings import CaptureWarning, ground_truth_frame
+from splinecli.capture.capture_warnings import GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, CaptureWarning
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.robust_fit import fit_robustly, lit_rows, shadow_weights
 from splinecli.normals import angle_between_deg
@@ -41,4 +41,11 @@ def check_ground_truth(
     best = int(np.argmin(angles))
     if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
         return []
-    return [ground_truth_frame(_FRAMES[best], angles[best], angles[0])]
+    frame, lights = _FRAMES[best], ", or the light directions are in another frame than it"
+    code = GROUND_TRUTH_Z if frame.signs[2] < 0 else GROUND_TRUTH_FRAME
+    text = (
+        f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
+        f" with {frame.describe()}: it is probably in this frame{'' if code == GROUND_TRUTH_Z else lights}, so the"
+        " errors mean nothing."
+    )
+    return [CaptureWarning(code, text)]
