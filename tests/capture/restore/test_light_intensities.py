@@ -97,8 +97,8 @@ def test_flat_objects(widths, tilt):
         return angle_between_deg(fit, normals).mean()
 
     # The images leave the tilt open, which 0.05 makes 3 degrees.
-    assert error_deg(found) < 2 + 60 * tilt < 0.5 * error_deg(np.ones(8))
-    assert estimate_light_intensities((shaded).astype(np.float32), None, lambda rows: vectors[rows]) is None
+    assert error_deg(found) < 3 + 60 * tilt < 0.5 * error_deg(np.ones(8))
+    assert estimate_light_intensities(shaded.astype(np.float32), None, lambda rows: vectors[rows]) is None
 
 
 def test_saturated_observations_do_not_count():
