@@ -1,4 +1,4 @@
-"""Images against each other: the same one twice, values that are not linear; lights that crowd."""
+"""Images against each other: the same one twice; lights that crowd."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from splinecli.capture.image_checks import DISPLAY_RATIO, decoding_ratio, repeated_images
+from splinecli.capture.image_checks import repeated_images
 from splinecli.capture.lights.light_check import light_spread
-from splinecli.capture.lights.light_fit import find_factors
 
 Array = NDArray[np.float64]
 SIZE = 96
@@ -52,20 +51,6 @@ def test_the_same_image_twice(mask: NDArray[np.bool_]) -> None:
 
 def test_uniform_images_are_not_repeated() -> None:
     assert repeated_images(np.ones((50, 4))) == []
-
-
-def test_encoded_images(mask: NDArray[np.bool_]) -> None:
-    linear = images(shine=0.05)[mask]
-    ratio = decoding_ratio(linear, find_factors(linear), lights())
-    assert ratio is not None and ratio > 1.2
-    encoded = linear ** (1 / 2.2)
-    ratio = decoding_ratio(encoded, find_factors(encoded), lights())
-    assert ratio is not None and ratio < DISPLAY_RATIO
-
-
-def test_too_few_pixels_are_not_judged() -> None:
-    few = np.ones((5, 10))
-    assert decoding_ratio(few, find_factors(few), lights()) is None
 
 
 def test_the_spread_of_lights() -> None:

@@ -55,16 +55,24 @@ def test_shifted_images_are_named(run, medallion):
     assert words.removesuffix(".") in refused(run, "--method", "ls")
 
 
-def test_ground_truth_that_points_away(run, medallion):
+@pytest.mark.parametrize(
+    ("signs", "negated", "code"),
+    [
+        ((1, 1, -1), "z", "ground_truth_z"),
+        ((-1, 1, 1), "x", "ground_truth_frame"),
+        ((1, -1, 1), "y", "ground_truth_frame"),
+    ],
+)
+def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     (medallion / "normals_gt.png").rename("truth.png")
     picture = cv2.imread("truth.png", cv2.IMREAD_UNCHANGED)[..., ::-1]
     normals = picture / np.iinfo(picture.dtype).max * 2 - 1
-    np.save(medallion / "normals_gt.npy", normals * (1, 1, -1))
+    np.save(medallion / "normals_gt.npy", normals * signs)
     result = run("infer", medallion, "--method", "ls")
     assert result.code == 0
-    assert "The normals of the ground truth point away from the camera (z < 0)" in result.err
-    assert codes() == ["ground_truth_z"]
-    assert "its z is probably negated" in refused(run, "--method", "ls")
+    assert f"degrees with {negated} negated: it is probably in this frame" in result.err
+    assert codes() == [code]
+    assert f"with {negated} negated" in refused(run, "--method", "ls")
 
 
 @pytest.mark.parametrize(

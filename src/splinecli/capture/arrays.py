@@ -82,7 +82,7 @@ def capture_from_arrays(
         positions = np.asarray(light_directions, np.float64)
         lamps = NearLamps.of(positions, pixel_size, (shape[0], shape[1]), equal=not known)
         warnings = (*capture.warnings, *check_distances(lamps, inside, None))
-        capture, known = replace(capture, lamps=lamps, warnings=warnings), True
+        capture = replace(capture, lamps=lamps, warnings=warnings)
     stored = StoredCapture(capture, found.saturation, intensities_known=known)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 

@@ -37,6 +37,7 @@ ENCODED_VALUES = "encoded_values"
 ESTIMATED_INTENSITIES = "estimated_intensities"
 EXIF_ORIENTATION = "exif_orientation"
 FEW_LIGHTS = "few_lights"
+GROUND_TRUTH_FRAME = "ground_truth_frame"
 GROUND_TRUTH_Z = "ground_truth_z"
 GROUND_TRUTH_UPSIDE_DOWN = "ground_truth_upside_down"
 HIGH_LIGHTS = "high_lights"
@@ -45,6 +46,7 @@ IMAGES_LEFT_OUT = "images_left_out"
 IMAGES_SHIFTED = "images_shifted"
 LIGHTS_CROWDED = "lights_crowded"
 KEPT_LIGHTS = "kept_lights"
+LAMPS_NEAR = "lamps_near"
 LAMP_DISTANCE = "lamp_distance"
 LIGHTS_MATCHED = "lights_matched"
 LIGHTS_UNCHECKED = "lights_unchecked"
@@ -53,6 +55,7 @@ LIGHT_ORDER = "light_order"
 NEAR_LAMPS = "near_lamps"
 LOW_CONFIDENCE = "low_confidence"
 NOT_DISTILLED = "not_distilled"
+NO_MASK = "no_mask"
 REPEATED_IMAGES = "repeated_images"
 REFINED_LIGHTS = "refined_lights"
 ROUGH_LIGHTS = "rough_lights"
@@ -63,6 +66,7 @@ WHITE_LEVEL = "white_level"
 PROBABLY_WRONG = frozenset(
     {
         ENCODED_VALUES,
+        GROUND_TRUTH_FRAME,
         GROUND_TRUTH_Z,
         IMAGE_ODD,
         IMAGES_SHIFTED,
@@ -161,30 +165,12 @@ def display_encoded() -> CaptureWarning:
     )
 
 
-def encoded_values(ratio: float) -> CaptureWarning:
-    """Warn of images whose decoding leaves only a share of what the lights cannot explain."""
-    return CaptureWarning(
-        ENCODED_VALUES,
-        "The images fit the lights much better if their values are decoded: they look display-encoded, but are read as"
-        f" linear (what the lights cannot explain falls to {100 * ratio:.0f} %). Add --transfer srgb or"
-        " --transfer gamma:2.2.",
-    )
-
-
 def exif_orientation(orientation: int) -> CaptureWarning:
     """Warn of images that viewers turn."""
     return CaptureWarning(
         EXIF_ORIENTATION,
         f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
         " results are in the frame of the stored pixels.",
-    )
-
-
-def ground_truth_z() -> CaptureWarning:
-    return CaptureWarning(
-        GROUND_TRUTH_Z,
-        "The normals of the ground truth point away from the camera (z < 0): its z is probably negated, so the errors"
-        " mean nothing.",
     )
 
 
@@ -278,12 +264,21 @@ def rough_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureWar
     )
 
 
+def no_mask(share: float) -> CaptureWarning:
+    """Warn of a capture without a mask, a large share of whose pixels is dark background."""
+    return CaptureWarning(
+        NO_MASK,
+        f"There is no mask, and {100 * share:.0f} % of the pixels are near black: the normals of this background mean"
+        " nothing. Add --auto-mask, or give a mask.",
+    )
+
+
 def kept_lights(reason: str) -> CaptureWarning:
     return CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {reason}.")
 
 
-def few_lights(n_lights: int) -> CaptureWarning:
-    return CaptureWarning(FEW_LIGHTS, f"There are {n_lights} lights; use ten or more, well spread.")
+def few_lights(n_lights: int, enough: int) -> CaptureWarning:
+    return CaptureWarning(FEW_LIGHTS, f"There are {n_lights} lights; use {enough} or more, well spread.")
 
 
 def high_lights(limit_deg: float) -> CaptureWarning:

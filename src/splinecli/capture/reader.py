@@ -176,9 +176,7 @@ def _read_lights(
         intensities = None
     elif files.light_intensities is not None:
         intensities = _read_intensities(files.light_intensities, files.images, in_folder)
-    near = lamps is not None and lamps.used
-    # Geometry gives the intensities of near lamps that are equally strong.
-    known = equal or near or intensities is not None
+    known = equal or intensities is not None
     measured = intensities is not None
     if intensities is None:
         check_exposures(files.images)

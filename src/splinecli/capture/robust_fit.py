@@ -33,7 +33,11 @@ def predict(observations: Array, weights: Array, light_directions: Array) -> Arr
         observations, weights: (P, F).
         light_directions: (F, 3) or (P, F, 3), of any length.
     """
-    scaled_normals = fit_scaled_normals(observations, weights, light_directions)
+    return shade(fit_scaled_normals(observations, weights, light_directions), light_directions)
+
+
+def shade(scaled_normals: Array, light_directions: Array) -> Array:
+    """Return I = l . b (P, F) of scaled normals (P, 3) under lights (F, 3) or (P, F, 3)."""
     if light_directions.ndim == 2:
         return np.asarray(scaled_normals @ light_directions.T)
     return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
@@ -73,14 +77,14 @@ def fit_robustly(
     Args:
         values: (P, F), each pixel scaled to a largest value of 1.
         lit: (P, F), weights that do not depend on the fit, such as those of shadow_weights.
-        lights: (F, 3), of any length.
+        lights: (F, 3) or (P, F, 3), of any length.
         fits: number of weighted fits, at least 1.
         weights: of the first fit; None for `lit`.
     """
     weights = lit if weights is None else weights
     for _ in range(fits):
         normals = fit_scaled_normals(values, weights, lights)
-        weights = lit * absolute_weights(values - normals @ lights.T)
+        weights = lit * absolute_weights(values - shade(normals, lights))
     return np.asarray(normals, np.float64), np.asarray(weights, np.float64)
 
 

@@ -7,11 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.restore.auto_mask import find_object
+from splinecli.errors import InputError
+
 MAX_PIXELS = 20_000
 """Of larger captures, every second or third row and column is taken, and so on."""
 
 CLOSEUP_SIDE = 192
 """The side of a closeup in pixels."""
+
+BLACK = 0.15
+"""A background is dark if its median brightness is below this share of the object's."""
+
+_SMALLEST_SIDE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +66,20 @@ def take_closeup(observations: NDArray[np.floating], mask: NDArray[np.bool_]) ->
     chosen = np.zeros_like(mask)
     chosen[window] = True
     return Sample(observations[chosen[mask]], mask[window], 1)
+
+
+def leave_out_background(sample: Sample) -> tuple[Sample, float]:
+    """Return a sample of a capture without a mask, without its dark background, and the share of that background.
+
+    A sample that has a mask, or no dark background, is returned as it is.
+    """
+    if not sample.mask.all() or min(sample.mask.shape) < _SMALLEST_SIDE:
+        return sample, 0.0
+    brightness = sample.observations.mean(axis=1).reshape(sample.mask.shape).astype(np.float32)
+    try:
+        inside = find_object(brightness)
+    except InputError:
+        return sample, 0.0
+    if np.median(brightness[~inside]) > BLACK * np.median(brightness[inside]):
+        return sample, 0.0
+    return Sample(sample.observations[inside.ravel()], inside, sample.step), float(1 - inside.mean())

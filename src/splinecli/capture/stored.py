@@ -63,7 +63,9 @@ class StoredCapture:
         if self.intensities_known:
             return None
         return estimate_light_intensities(
-            self.capture.observations, self.saturation.flags, self.capture.light_directions
+            self.capture.observations,
+            self.saturation.flags,
+            self.capture.light_directions if self.capture.lamps is None else self._lights_of,
         )
 
     def restore(self, intensities: NDArray[np.float64] | None) -> Capture:

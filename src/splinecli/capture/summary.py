@@ -93,7 +93,9 @@ class CaptureSummary:
             if worst is None
             else capture_warnings.saturated_images(len(saturated), worst.path.name, worst.saturated),
             capture_warnings.dark_images(len(dark), dark[0].path.name, DARK) if dark else None,
-            capture_warnings.few_lights(len(self.images)) if len(self.images) < FEW_LIGHTS else None,
+            capture_warnings.few_lights(len(self.images), FEW_LIGHTS)
+            if len(self.images) < FEW_LIGHTS
+            else None,
             capture_warnings.high_lights(NARROW_DEG) if self.axis_angles_deg.max() < NARROW_DEG else None,
         ]
         given = (warning for warning in found if warning is not None)

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 SMALLEST_SPREAD = 0.1
 """Lights that determine normals worse than this carry a warning; see light_spread."""
 
+MOST_BACKGROUND = 0.5
+"""Share of near black pixels above which a capture without a mask carries a warning."""
+
 LEAST_EXPECTED = 0.1
 """Smallest expected share of normals within 5 degrees without a warning."""
 
@@ -128,11 +131,14 @@ def check_sample(
         strict: also warn of what the images do not tell.
     """
     from splinecli.capture import capture_warnings, image_checks
+    from splinecli.capture.explanations import explain
     from splinecli.capture.image_shifts import find_shifts, shift_warning
     from splinecli.capture.lights.light_advice import light_warnings
     from splinecli.capture.lights.light_check import check_lights, light_spread
     from splinecli.capture.lights.light_fit import find_factors
+    from splinecli.capture.sample import leave_out_background
 
+    (sample, background), (closeup, _) = leave_out_background(sample), leave_out_background(closeup)
     names, observations = lights.names, sample.observations
     chosen = lights.directions[list(lights.indices)]
     if lights.lamps is not None:
@@ -140,6 +146,8 @@ def check_sample(
     factors = find_factors(observations, intensities_known=lights.intensities_measured)
     check = check_lights(observations, sample.mask, lights.directions, lights.indices, names, factors)
     warnings = light_warnings(check, lights.frame, lights.origin, strict=strict)
+    if background > MOST_BACKGROUND:
+        warnings.append(capture_warnings.no_mask(background))
     shifts = find_shifts(closeup) or (find_shifts(sample) if sample.step > 1 else [])
     odd = check.odd_image
     if odd is not None and odd.place not in [shift.place for shift in shifts]:
@@ -156,10 +164,13 @@ def check_sample(
     doubted = check.order is not None or odd is not None or spread < SMALLEST_SPREAD or bool(shifts)
     if doubted:
         return check, warnings  # the other checks rely on the lights
-    if lights.linear:
-        ratio = image_checks.decoding_ratio(observations, factors, chosen)
-        if ratio is not None and ratio < image_checks.DISPLAY_RATIO:
-            return check, [*warnings, capture_warnings.encoded_values(ratio)]
+    if factors is not None and not lights.intensities_measured:
+        # Intensities that nobody measured are not the fault of directions and values.
+        observations = observations / factors.intensities(chosen[None])[0]
+    seen = replace(sample, observations=observations)
+    found = explain(seen, chosen, linear=lights.linear, has_positions=lights.has_positions)
+    if found:
+        return check, [*warnings, *found]
     if check.best is None and not lights.has_positions:
         warnings += _rough_lights(observations, factors, chosen)
     return check, warnings

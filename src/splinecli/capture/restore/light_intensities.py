@@ -7,28 +7,33 @@ D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric ster
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import fit_robustly, lit_rows, shadow_weights
+from splinecli.capture.robust_fit import fit_robustly, lit_rows, shade, shadow_weights
 from splinecli.normals import unit
 
 Array = NDArray[np.float64]
+Lights = Array | Callable[[NDArray[np.integer]], Array]
 
 MIN_LIGHTS = 6
 """Each light adds an unknown. Four observations fit any intensities, and with five lights half of the estimates are
 wrong."""
 
-MIN_NORMAL_SPREAD = 0.25
-"""Smallest accepted spread of the normals (their second largest standard deviation). Where all normals are alike, as
-on a coin or a painting, an error of the intensities looks like one of the normals."""
+FLAT_SPREAD = 0.35
+"""Normals with a smaller spread (their second largest standard deviation) belong to a flat object, as a coin or a
+painting. There, a tilt of all normals together looks like other intensities, so the tilt is the likeliest one."""
+
+TILT = 0.09
+"""Standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees."""
 
 MAX_ERROR_RATIO = 0.35
 """Largest accepted residual, as a share of the residual under equal intensities."""
 
-MAX_ERROR = 0.018
-"""Largest accepted residual: the median, as a share of a pixel's brightest observation. Flat shiny objects also fit
-some intensities, but not so well."""
+MAX_ERROR = 0.035
+"""Largest accepted residual: the median, as a share of a pixel's brightest observation. Metals have more."""
 
 MIN_EQUAL_ERROR = 0.02
 """Smallest residual under equal intensities for which others are estimated, in the unit of MAX_ERROR.
@@ -44,60 +49,65 @@ _MAX_OBSERVATIONS, _MIN_PIXELS, _MAX_PIXELS = 100_000, 100, 2000
 _MIN_PIXELS_PER_LIGHT = 10
 _DARK_SHARE = 0.1  # of the brightest hundredth of the pixels
 _LIT_SHARE = 0.3  # of a pixel's brightest prediction; darker observations may be shadows
+_TILT_FITS, _LOWEST_COSINE, _LEAST_VARIANCE = 5, 0.05, 1e-4
 _STEP = 1.5  # exponent of each round's change; beyond 1 it saves a third of the rounds
 _CONVERGED = 1e-4  # change of the logarithms
 
 
 def estimate_light_intensities(
-    observations: NDArray[np.float32], missing: NDArray[np.bool_] | None, light_directions: Array
+    observations: NDArray[np.float32], missing: NDArray[np.bool_] | None, lights: Lights
 ) -> Array | None:
     """Return light intensities (F,) with a mean of 1, or None where equal ones fit or the images do not determine them.
 
     Args:
         observations: (P, F), not divided by intensities.
         missing: (P, F), observations that do not count, such as saturated ones.
-        light_directions: (F, 3), unit.
+        lights: (F, 3), or a function from rows (p,) to (p, F, 3), as under near lamps.
     """
     chosen = _choose_pixels(observations, missing)
     if chosen is None:
         return None
-    values, known = chosen
-    equal = np.ones(len(light_directions))
-    equal_error = _error(values, _fit(values, known, equal, light_directions) @ light_directions.T, known)
+    rows, values, known = chosen
+    light_vectors = lights(rows) if callable(lights) else lights
+    equal = np.ones(values.shape[1])
+    equal_error = _error(values, shade(_fit(values, known, equal, light_vectors), light_vectors), known)
     if equal_error <= MIN_EQUAL_ERROR:
         return None
-    intensities = _alternate(values, known, light_directions)
+    intensities = _alternate(values, known, light_vectors)
     if intensities is None:
         return None
-    scaled_normals = _fit(values, known, intensities, light_directions)
-    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(unit(scaled_normals).T))[1]))
-    error = _error(values / intensities, scaled_normals @ light_directions.T, known)
-    fits = error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR)
-    return intensities if fits and spread >= MIN_NORMAL_SPREAD else None
+    predicted = shade(_fit(values, known, intensities, light_vectors), light_vectors)
+    error = _error(values / intensities, predicted, known)
+    return intensities if error < min(MAX_ERROR_RATIO * equal_error, MAX_ERROR) else None
 
 
 def _choose_pixels(
     observations: NDArray[np.float32], missing: NDArray[np.bool_] | None
-) -> tuple[Array, NDArray[np.bool_]] | None:
-    """Return observations (p, F) of lit pixels, each scaled to 1, and which of them count; None for too few."""
+) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]] | None:
+    """Return the rows (p,) of lit pixels, their observations (p, F), each scaled to 1, and which of them count.
+
+    Returns None for too few.
+    """
     n_lights = observations.shape[1]
     if n_lights < MIN_LIGHTS:
         return None
     chosen = lit_rows(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
     known = np.ones((len(chosen), n_lights), np.bool_) if missing is None else ~missing[chosen]
     enough = known.sum(axis=1) >= MIN_LIGHTS
-    known, values = known[enough], observations[chosen[enough]].astype(np.float64)
+    known, chosen = known[enough], chosen[enough]
+    values = observations[chosen].astype(np.float64)
     if len(values) < _MIN_PIXELS:
         return None
     values /= values.max(axis=1, keepdims=True)
-    return values, known
+    return chosen, values, known
 
 
-def _alternate(values: Array, known: NDArray[np.bool_], light_directions: Array) -> Array | None:
+def _alternate(values: Array, known: NDArray[np.bool_], lights: Array) -> Array | None:
     """Return the intensities (F,) at which fits and medians agree; None where a light reaches too few pixels."""
-    intensities = np.ones(len(light_directions))
+    intensities = np.ones(values.shape[1])
     for _ in range(_MAX_ROUNDS):
-        predicted = _fit(values, known, intensities, light_directions) @ light_directions.T
+        scaled_normals = _fit(values, known, intensities, lights)
+        predicted = shade(scaled_normals, lights)
         counts = known & (predicted > _LIT_SHARE * predicted.max(axis=1, keepdims=True))
         if (counts.sum(axis=0) < _MIN_PIXELS_PER_LIGHT).any():
             return None
@@ -105,16 +115,39 @@ def _alternate(values: Array, known: NDArray[np.bool_], light_directions: Array)
         medians: Array = np.nanmedian(ratios, axis=0)
         if not (medians > 0).all():
             return None
-        change = medians / intensities
-        intensities = intensities * change**_STEP
+        before, intensities = intensities, intensities * (medians / intensities) ** _STEP
+        intensities = _likeliest_tilt(intensities, unit(scaled_normals), lights)
         intensities /= intensities.mean()
-        if np.abs(np.log(change)).max() < _CONVERGED:
+        if np.abs(np.log(intensities / before)).max() < _CONVERGED:
             break
     return intensities
 
 
+def _likeliest_tilt(intensities: Array, normals: Array, lights: Array) -> Array:
+    """Return the intensities (F,) that explain the same images of a flat object with its likeliest tilt.
+
+    Under a tilt t, a plane that shows k_f needs intensities k_f / l_f . (t, 1). The likeliest tilt leaves intensities
+    that are nearly equal, and is small itself. Of other objects, the intensities are returned as they are.
+    """
+    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
+    if spread >= FLAT_SPREAD:
+        return intensities
+    directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
+    shown = intensities * np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
+    tilt = np.zeros(2)
+    for _ in range(_TILT_FITS):
+        cosines = np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE)
+        slopes, unequal = directions[:, :2] / cosines[:, None], np.log(shown / cosines)
+        slopes, unequal = slopes - slopes.mean(axis=0), unequal - unequal.mean()
+        certainty = TILT**2 / max(float(unequal.var()), _LEAST_VARIANCE)
+        tilt = tilt + np.linalg.solve(
+            certainty * slopes.T @ slopes + np.eye(2), certainty * slopes.T @ unequal - tilt
+        )
+    return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
+
+
 def _fit(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Array) -> Array:
-    """Return the scaled normals (p, 3) of matte pixels with these observations, for lights of intensity 1."""
+    """Return the scaled normals (p, 3) of matte pixels with these observations, for lights (F, 3) or (p, F, 3)."""
     observed = values / intensities
     largest = observed.max(axis=1, keepdims=True)
     observed = observed / largest
@@ -122,7 +155,7 @@ def _fit(values: Array, known: NDArray[np.bool_], intensities: Array, lights: Ar
     return np.asarray(normals * largest)
 
 
-def _error(observed: Array, predicted: Array, known: NDArray[np.bool_]) -> float:
+def _error(observed: Array, predicted: NDArray[np.floating], known: NDArray[np.bool_]) -> float:
     """Return the median of |observed - predicted|, as a share of each pixel's brightest prediction."""
     shares = np.abs(observed - predicted) / np.maximum(predicted.max(axis=1, keepdims=True), 1e-12)
     return float(np.median(shares[known]))

@@ -1,0 +1,162 @@
+"""How often faults of a capture are named, and how often right captures are doubted.
+
+    python benchmarks/capture_faults.py [CAPTURE...] [--scenes 72] [--draws 5]
+
+Renders scenes of all kinds of shapes in all classes of materials, under distant lights and under lamps at 2 to 6 widths
+of the object, and draws 8 to 40 lights. Prints for each fault the shares of captures that get each warning. Of real
+captures, draws of 10 and 20 lights and all lights are checked as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from near_lamps import height_field, sphere
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture, open_capture
+from splinecli.capture.lights.draws import draw_lights
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
+from splinecli.pipeline.input_checks import check_arrays, check_capture
+from splinecli.synthesis.camera import find_visible_surface
+from splinecli.synthesis.meshes import Mesh
+from splinecli.synthesis.point_lights import render_point_lights
+from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.rendering import render_direct, render_indirect
+from splinecli.synthesis.scenes import SceneConfig, draw_scene
+from splinecli.transfer import encode_srgb
+
+Array = NDArray[np.float64]
+WIDTHS = (2.0, 3.0, 4.0, 6.0)
+SIZE, N_LIGHTS, SEED = 48, 40, 91
+NOISE = 0.002  # of the brightest thousandth
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A scene in one material: observations (P, F) under distant and near lights (F, 3)."""
+
+    kind: str
+    shape: str
+    mask: NDArray[np.bool_]
+    lights: Array
+    distant: Array
+    near: Array
+    widths: float
+
+
+def render(index: int) -> Iterator[Rendered]:
+    rng = np.random.default_rng([SEED, index])
+    shape = ("", "", "relief", "", "", "plane", "", "", "sphere", "", "", "low relief")[index % 12]
+    mesh = sphere(count=150) if shape == "sphere" else None
+    if shape and mesh is None:
+        steepness = {"relief": rng.uniform(0.5, 1.2), "plane": 0.0, "low relief": rng.uniform(0.05, 0.4)}[
+            shape
+        ]
+        field = height_field("relief", 201)
+        normals = field.vertex_normals / field.vertex_normals[:, 2:] * (steepness, steepness, 1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        mesh = Mesh(field.vertices * np.float32((1, 1, steepness)), field.faces, normals.astype(np.float32))
+    config = SceneConfig(size=SIZE, lights=4)
+    scene = draw_scene(SEED, index, config, mesh)
+    z, azimuth = rng.uniform(0.5, 0.99, N_LIGHTS), rng.uniform(0, 2 * np.pi, N_LIGHTS)
+    across = np.sqrt(1 - z * z)
+    lights = np.stack((across * np.cos(azimuth), across * np.sin(azimuth), z), axis=1)
+    tracer = Tracer(scene.mesh)
+    visible = find_visible_surface(tracer, SIZE, 2)
+    surface = scene.materials, scene.patch_of_face
+    middle = np.array((0, 0, visible.samples.position[:, 2].mean(dtype=np.float64)))
+    widths = WIDTHS[index // 3 % len(WIDTHS)]
+    positions = lights * widths * np.ptp(np.flatnonzero(visible.mask.any(axis=0))) * 2 / SIZE
+    unit = np.sum((positions + middle) ** 2, axis=1) / np.sum(positions**2, axis=1)
+    with torch.inference_mode():
+        distant = render_direct(tracer, visible, lights.astype(np.float32), *surface)
+        near = render_point_lights(tracer, visible, positions + middle, *surface)
+        generator = torch.Generator().manual_seed(index)
+        indirect = render_indirect(
+            tracer, visible, lights.astype(np.float32), *surface,
+            directions=32, bounces=2, generator=generator,
+        )  # fmt: skip
+    for kind, bounced in indirect.items():
+        images = (distant[kind] + bounced).numpy(), near[kind].numpy() / unit + bounced.numpy()
+        yield Rendered(kind, shape or scene.shape, visible.mask, lights, *images, widths)
+
+
+def codes(observations: Array, mask: NDArray[np.bool_], lights: Array, *, measured: bool = True) -> list[str]:
+    capture = Capture("rendered", observations.astype(np.float32), lights, tuple(range(len(lights))), mask)
+    found = [warning.code for warning in check_arrays(capture, intensities_measured=measured)]
+    if not measured and estimate_light_intensities(capture.observations, None, lights) is not None:
+        found.append("estimated_intensities")
+    return found
+
+
+def faults(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, list[str]]]:
+    """Yield each fault and the codes of the warnings that it gets."""
+    chosen = rng.choice(N_LIGHTS, int(rng.choice((8, 10, 16, 25, 40))), replace=False)
+    lights, mask = scene.lights[chosen], scene.mask
+    full = np.quantile(scene.distant, 0.999)
+
+    def seen(images: Array) -> Array:
+        values = images[:, chosen] / full
+        return np.asarray((values + rng.normal(0, NOISE, values.shape)).clip(0, 1))
+
+    right = seen(scene.distant)
+    unequal = right * np.exp(rng.normal(0, 0.3, len(lights)))
+    yield "right", codes(right, mask, lights)
+    yield "right, intensities unknown", codes(right, mask, lights, measured=False)
+    yield f"lamps at {scene.widths:g} widths", codes(seen(scene.near), mask, lights)
+    yield "sRGB as linear", codes(encode_srgb(right) / 255.0, mask, lights)
+    yield "intensities off by 30 %, unknown", codes(unequal, mask, lights, measured=False)
+    yield "intensities off by 30 %, stated as right", codes(unequal, mask, lights)
+    yield "x negated", codes(right, mask, lights * (-1, 1, 1))
+    picture = np.abs(rng.normal(0, NOISE, (2 * SIZE, 2 * SIZE, len(lights))))
+    inner = picture[SIZE // 2 : 3 * SIZE // 2, SIZE // 2 : 3 * SIZE // 2]
+    inner[mask] = right
+    everything = np.ones(picture.shape[:2], np.bool_)
+    yield "x negated, no mask", codes(picture.reshape(-1, len(lights)), everything, lights * (-1, 1, 1))
+
+
+def real(folder: Path, draws: int) -> Iterator[tuple[str, list[str]]]:
+    source = open_capture(folder)
+    for count in (10, 20, None):
+        if count is not None and count >= source.n_lights:
+            continue
+        name = f"{folder.parent.name}/{folder.name}, {count or source.n_lights} lights"
+        for draw in draw_lights(source.light_directions, count, trials=draws, seed=SEED):
+            capture = source.read(draw)
+            yield name, [warning.code for warning in (*capture.warnings, *check_capture(source, capture))]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("captures", nargs="*", type=Path)
+    parser.add_argument("--scenes", type=int, default=72)
+    parser.add_argument("--draws", type=int, default=5)
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    total: Counter[tuple[str, str]] = Counter()
+    named: dict[tuple[str, str], Counter[str]] = {}
+    rows = [
+        (kind, "real", found) for folder in options.captures for kind, found in real(folder, options.draws)
+    ]
+    for index in range(options.scenes):
+        rng = np.random.default_rng([SEED, index, 1])
+        rows += [(kind, scene.kind, found) for scene in render(index) for kind, found in faults(scene, rng)]
+    for fault, kind, found in rows:
+        total[fault, kind] += 1
+        named.setdefault((fault, kind), Counter()).update(set(found))
+    for (fault, kind), count in sorted(total.items()):
+        cells = (f"{code} {times}" for code, times in named[fault, kind].most_common())
+        print(f"{fault:42} {kind:9} {count:3}: {', '.join(cells) or '-'}")
+
+
+if __name__ == "__main__":
+    main()

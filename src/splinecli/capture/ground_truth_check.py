@@ -1,0 +1,51 @@
+"""A check of the frame of a ground truth, by rough normals from the images."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.capture_warnings import GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, CaptureWarning
+from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
+from splinecli.capture.robust_fit import fit_robustly, lit_rows, shadow_weights
+from splinecli.normals import angle_between_deg
+
+MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
+"""A ground truth is in another frame if its median angle to the rough normals is above the first, and another frame
+leaves at most the second of it. On metals with interreflection, the angle reaches 30 degrees in the right frame."""
+
+_FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
+_MAX_PIXELS, _DARK_SHARE, _FITS = 1000, 0.1, 5
+
+
+def check_ground_truth(
+    observations: NDArray[np.floating], light_directions: NDArray[np.float64], truth: NDArray[np.floating]
+) -> list[CaptureWarning]:
+    """Return a warning if a ground truth (P, 3) fits observations (P, F) only in another frame, or an empty list.
+
+    Args:
+        light_directions: (F, 3).
+        truth: unit normals, or zero where there is no ground truth.
+    """
+    known = np.flatnonzero(truth.any(axis=1))
+    chosen = known[lit_rows(observations[known], _DARK_SHARE, _MAX_PIXELS)] if len(known) else known
+    values = observations[chosen].astype(np.float64)
+    chosen, values = chosen[values.any(axis=1)], values[values.any(axis=1)]
+    if not len(chosen):
+        return []
+    values /= values.max(axis=1, keepdims=True)
+    normals, _ = fit_robustly(values, shadow_weights(values), light_directions, _FITS)
+    angles = [
+        float(np.median(angle_between_deg(normals, truth[chosen] @ frame.matrix.T))) for frame in _FRAMES
+    ]
+    best = int(np.argmin(angles))
+    if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
+        return []
+    frame, lights = _FRAMES[best], ", or the light directions are in another frame than it"
+    code = GROUND_TRUTH_Z if frame.signs[2] < 0 else GROUND_TRUTH_FRAME
+    text = (
+        f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
+        f" with {frame.describe()}: it is probably in this frame{'' if code == GROUND_TRUTH_Z else lights}, so the"
+        " errors mean nothing."
+    )
+    return [CaptureWarning(code, text)]
