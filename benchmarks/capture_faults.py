@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from near_lamps import height_field, sphere
 from numpy.typing import NDArray
 
+from near_lamps import height_field, sphere
 from splinecli.capture import Capture, open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
