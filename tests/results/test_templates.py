@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+import zlib
 from importlib import resources
+from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
