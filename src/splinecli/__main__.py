@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 import warnings
@@ -14,7 +13,8 @@ def run() -> None:
     """Run the command of the arguments and exit. SIGTERM is treated like Ctrl-C."""
     try:
         end_on_signals()
-        _quieten_libraries()
+        if not sys.warnoptions:  # python -W
+            warnings.simplefilter("ignore")  # those of libraries, such as NumPy's
         # The imports take a second or more. A signal that comes meanwhile is handled, too.
         from splinecli.cli.main import main
 
@@ -29,13 +29,6 @@ def run() -> None:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
-
-
-def _quieten_libraries() -> None:
-    """Keep libraries from printing: their warnings and logs are no messages for users, who get errors and warnings."""
-    logging.lastResort = logging.NullHandler()
-    if not sys.warnoptions:  # python -W
-        warnings.simplefilter("ignore")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import sys
 import traceback
@@ -25,6 +26,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
     _repair_streams()
     _let_threads_sleep()
+    logging.lastResort = logging.NullHandler()  # logs of libraries are no messages for users
     out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         code = _run_command(args)

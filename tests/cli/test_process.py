@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at awkward moments."""
+"""The process: Ctrl-C and SIGTERM at awkward moments, and nothing on stderr but messages."""
 
 from __future__ import annotations
 
@@ -38,3 +38,19 @@ def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path,
         [sys.executable, "-c", COMMAND], cwd=tmp_path, capture_output=True, text=True, timeout=60
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "imported\n", "splinecli: interrupted.\n")
+
+
+def test_libraries_print_nothing(tmp_path: Path) -> None:
+    command = """
+import logging, sys, warnings
+from splinecli import __main__
+from splinecli.cli import app
+@app.app.command()
+def noisy():
+    logging.getLogger("library").error("a log")
+    warnings.warn("a warning", RuntimeWarning)
+sys.argv = ["splinecli", "noisy"]
+__main__.run()
+"""
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
