@@ -93,6 +93,14 @@ def test_two_balls_and_intensities(run):
     assert np.loadtxt("calibration/light_intensities.txt").shape == (4, 3)
 
 
+def test_the_file_of_intensities_is_named(run):
+    write_balls(Path("ball"))
+    write_gray(Path("gray"), [1.0, 0.5, 0.75, 1.25])
+    result = run("calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray")
+    assert result.out == "calibration/light_directions.txt\n"
+    assert "The light intensities are in calibration/light_intensities.txt\n" in result.err
+
+
 def test_the_normals_are_not_the_lights(run):
     write_balls(Path("ball"))
     half = LIGHTS + np.array((0, 0, 1))
@@ -170,6 +178,16 @@ def test_quiet_prints_nothing(run):
     assert Path("calibration/light_directions.txt").exists()
 
 
+def test_intensities_of_earlier_lights_are_removed(run):
+    write_balls(Path("ball"))
+    write_gray(Path("gray"), [1.0, 0.5, 0.75, 1.25])
+    arguments = ["calibrate", "ball", "--circle", "60,48,40", "--overwrite"]
+    assert run(*arguments, "--gray-ball", "gray").code == 0
+    assert Path("calibration/light_intensities.txt").exists()
+    assert run(*arguments).code == 0
+    assert not Path("calibration/light_intensities.txt").exists()
+
+
 def test_a_display_encoded_target_is_reported(run):
     write_balls(Path("ball"))
     write_gray(Path("gray"), [1.0, 1.0, 1.0, 1.0])
@@ -186,3 +204,13 @@ def test_a_display_encoded_target_is_reported(run):
     assert intensities[2] == intensities[1]
     assert "are read as sRGB. Add --transfer linear" in run(*arguments).err
     assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err
+
+
+def test_home_folder_in_paths(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    write_balls(tmp_path / "home" / "ball")
+    cv2.imwrite(str(tmp_path / "home" / "ball.png"), normals()[1].astype(np.uint8) * 255)
+    result = run("calibrate", "~/ball", "--mask=~/ball.png", "--output=~/out")
+    assert (result.code, result.out) == (0, f"{tmp_path}/home/out/light_directions.txt\n")
+    assert not Path("~").exists()
