@@ -31,8 +31,9 @@ def stamp_capture(source: CaptureSource) -> list[Any]:
         [_path_size_and_time(path) for path in files.images],
         [_path_size_and_time(path) for path in source.radiometry.flat_field],
     ]
-    if source.radiometry.automatic and source.radiometry.gamma is None:
-        stamp.append("sRGB")  # earlier versions read such images as linear
+    if source.radiometry.automatic and source.radiometry.curve != 1:
+        # Earlier versions read such images as linear, or those with a colour profile as sRGB.
+        stamp.append(source.radiometry.curve or "sRGB")
     # Left out where it is not given, so that earlier stamps stay valid.
     return stamp if source.white_level is None else [*stamp, source.white_level]
 

@@ -31,7 +31,7 @@ def tiff_size(path: Path) -> tuple[tuple[int, int, int], int]:
 
     Raises InputError for a damaged header.
     """
-    with _first_page(path) as page:
+    with first_page(path) as page:
         return (page.imagelength, page.imagewidth, page.samplesperpixel), -(-page.bitspersample // 8)
 
 
@@ -48,7 +48,7 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
     Raises:
         InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
     """
-    with _first_page(path) as page:
+    with first_page(path) as page:
         _check_complete(page, path)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
@@ -71,7 +71,7 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
 
 
 @contextmanager
-def _first_page(path: Path) -> Iterator[Any]:
+def first_page(path: Path) -> Iterator[Any]:
     """Yield the first page of a TIFF file. What tifffile raises for a damaged file becomes an InputError."""
     import tifffile
 
