@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.transfer import AUTOMATIC
+from splinecli.transfer import AUTOMATIC, TransferCurve
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,15 +26,6 @@ DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE = "light_positions.txt", "pixel_size.txt"
 PICTURE, REPORT = "calibration.png", "calibration.json"
 OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, PICTURE, REPORT)
-
-DISPLAY_ENCODED = (
-    "The images of the gray target look display-encoded (JPEG, or PNG that says so), but are read as linear."
-    " Add --transfer srgb if they are sRGB."
-)
-DISPLAY_DECODED = (
-    "The images of the gray target say that they are display-encoded (JPEG, or PNG that says so) and are read as sRGB."
-    " Add --transfer linear if their values are linear."
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +59,7 @@ class CalibrateOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.gamma != 1 and not (self.gray_ball or self.gray_card):
+        if self.curve != 1 and not (self.gray_ball or self.gray_card):
             raise UsageError(
                 "--transfer needs --gray-ball or --gray-card",
                 hint="Leave it out: the light directions do not depend on the curve",
@@ -91,7 +82,7 @@ class CalibrateOptions:
                 )
 
     @property
-    def gamma(self) -> float | None:
+    def curve(self) -> TransferCurve:
         """The transfer curve of the gray target's images, as in RadiometricCalibration."""
         from splinecli.transfer import parse_transfer
 
@@ -134,10 +125,13 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     warnings: list[str] = []
     if target_files is not None:
         from splinecli.calibration.gray import measure_light_intensities
+        from splinecli.capture.linearise import RadiometricCalibration
 
         kind: Target = "ball" if options.gray_ball is not None else "card"
-        gamma, warnings = _target_curve(options, target_files)
-        intensities = measure_light_intensities(target_files, lights.directions, kind, gamma=gamma)
+        radiometry = RadiometricCalibration(options.curve, automatic=options.transfer == AUTOMATIC)
+        radiometry, of_curve = radiometry.with_stated_curve(target_files.images)
+        warnings = [f"{target}: {warning}" for warning in of_curve]
+        intensities = measure_light_intensities(target_files, lights.directions, kind, radiometry=radiometry)
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
     report["warnings"] += warnings
@@ -163,16 +157,6 @@ def _calibrate_balls(
             calibrate_ball(ball, circle=circle, progress=lambda: advance(1))
             for ball, circle in zip(balls, circles, strict=True)
         ]
-
-
-def _target_curve(options: CalibrateOptions, files: BallFiles) -> tuple[float | None, list[str]]:
-    """Return the transfer curve of the gray target's images, and warnings about it."""
-    from splinecli.capture.formats.header import is_display_encoded
-
-    encoded = [is_display_encoded(image) for image in files.images] if options.gamma == 1 else []
-    if options.transfer == AUTOMATIC and encoded and all(encoded):
-        return None, [DISPLAY_DECODED]
-    return options.gamma, [DISPLAY_ENCODED] if any(encoded) else []
 
 
 def _write(

@@ -78,7 +78,7 @@ def _parametric(stored: NDArray[np.float64], given: list[float]) -> NDArray[np.f
     )
     with np.errstate(over="ignore", divide="ignore"):
         power = np.maximum(a * stored + b, 0) ** g + e
-    return np.where(stored >= d, power, c * stored + f)
+    return np.asarray(np.where(stored >= d, power, c * stored + f))
 
 
 def _checked_gamma(gamma: float) -> float:
