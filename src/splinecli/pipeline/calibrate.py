@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from splinecli.calibration.lamp_positions import LampPositions
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
-POSITIONS, PIXEL_SIZE = "light_positions.txt", "pixel_size.txt"
+POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
 PICTURE, REPORT = "calibration.png", "calibration.json"
-OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, PICTURE, REPORT)
+OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +37,7 @@ class CalibrateOptions:
         circles: the outline of each ball, or empty.
         masks: a mask of each ball, or empty.
         ball_diameter: of each ball, in any unit, which becomes that of the lamps' positions.
+        camera_matrix: a text file of 3 x 3 numbers. None takes the focal length from EXIF, or the camera as distant.
         gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
         transfer: the curve of the gray target's images: auto, linear, srgb or gamma:G.
         compare: a text file of light directions to compare the result with.
@@ -51,6 +52,7 @@ class CalibrateOptions:
     circles: tuple[Circle, ...] = ()
     masks: tuple[Path, ...] = ()
     ball_diameter: float | None = None
+    camera_matrix: Path | None = None
     gray_ball: Path | None = None
     gray_card: Path | None = None
     transfer: str = AUTOMATIC
@@ -120,7 +122,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     ]
     known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
     circles = options.circles or [None] * len(balls)
-    lights = combine_balls(_calibrate_balls(balls, circles, observer))
+    lights = combine_balls(_calibrate_balls(balls, circles, options.camera_matrix, observer))
     intensities = None
     warnings: list[str] = []
     if target_files is not None:
@@ -148,13 +150,16 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
 
 
 def _calibrate_balls(
-    balls: Sequence[BallFiles], circles: Sequence[Circle | None], observer: Observer
+    balls: Sequence[BallFiles],
+    circles: Sequence[Circle | None],
+    camera_matrix: Path | None,
+    observer: Observer,
 ) -> list[BallCalibration]:
     from splinecli.calibration.balls import calibrate_ball
 
     with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
         return [
-            calibrate_ball(ball, circle=circle, progress=lambda: advance(1))
+            calibrate_ball(ball, circle=circle, camera_matrix=camera_matrix, progress=lambda: advance(1))
             for ball, circle in zip(balls, circles, strict=True)
         ]
 
@@ -176,6 +181,7 @@ def _write(
         INTENSITIES: None if intensities is None else _text(intensities),
         POSITIONS: None if known is None else _text(known.positions),
         PIXEL_SIZE: None if known is None else f"{known.pixel_size:.9g}\n",
+        CAMERA_MATRIX: _text(known.view.matrix) if known is not None and known.view.known else None,
         REPORT: json.dumps(report, indent=2) + "\n",
     }
     # Files that are not written anew would belong to earlier lights. They are removed.
