@@ -1,4 +1,4 @@
-"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1) and gamma curves."""
+"""Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves and tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from splinecli.errors import UsageError
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
 AUTOMATIC = "auto"
-"""The curve that the images state: sRGB for JPEG and for PNG that says so, linear for others."""
+"""The curve that the images state: that of a colour profile, sRGB for JPEG and PNG that says so, linear for others."""
+
+TransferCurve = float | tuple[float, ...] | None
+"""An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored values, 0 to 1."""
+
+SRGB: TransferCurve = None
+
+GAMMAS = 0.1, 10.0
+"""The smallest and the largest exponent."""
 
 
 def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -39,18 +47,20 @@ def parse_transfer(text: str) -> float | None:
             gamma = float(match[1])
         except ValueError:
             gamma = 0.0
-        if 0.1 <= gamma <= 10:
+        if GAMMAS[0] <= gamma <= GAMMAS[1]:
             return gamma
     raise UsageError(
         f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"
     )
 
 
-def decode_transfer(stored: NDArray[np.float32], gamma: float | None) -> NDArray[np.float32]:
-    """Decode stored values, 0 to 1, to linear ones: stored^gamma, or the curve of sRGB where gamma is None."""
-    if gamma == 1:
+def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArray[np.float32]:
+    """Decode stored values, 0 to 1, to linear ones."""
+    if curve == 1:
         return stored
-    if gamma is not None:
-        return np.asarray(stored**gamma, np.float32)
+    if isinstance(curve, tuple):
+        return np.interp(stored, np.linspace(0, 1, len(curve)), curve).astype(np.float32)
+    if curve is not None:
+        return np.asarray(stored**curve, np.float32)
     power = ((stored + 0.055) / 1.055) ** 2.4
     return np.where(stored <= 12.92 * _LINEAR_BELOW, stored / 12.92, power).astype(np.float32)

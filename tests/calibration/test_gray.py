@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.circle import Circle
-from splinecli.calibration.gray import measure_light_intensities
+from splinecli.calibration.gray import Target, measure_light_intensities
+from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import InputError
 
 BALL = Circle(40.0, 42.0, 30.0)
@@ -52,7 +53,9 @@ def test_intensities_from_a_card(tmp_path: Path) -> None:
 def test_photographs_for_a_screen(tmp_path: Path) -> None:
     images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
     folder = write(tmp_path / "card", images ** (1 / 2.2), None)
-    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card", gamma=2.2)
+    found = measure_light_intensities(
+        find_ball_files(folder), LIGHTS, "card", radiometry=RadiometricCalibration(2.2)
+    )
     np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)
 
 
@@ -71,6 +74,27 @@ def test_saturated_pixels_do_not_count(tmp_path: Path) -> None:
     folder = write(tmp_path / "bright", cut, BALL.inside(cut.shape[1:3]))
     found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
     np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
+
+
+@pytest.mark.parametrize("target", ["card", "ball"])
+@pytest.mark.parametrize("brightest", [1.25, 3.0])
+def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest: float) -> None:
+    """One lamp is clipped at 4095, for a share of the target or for all of a card, and no tag says so."""
+    lights = np.tile((0.0, 0.0, 1.0), (4, 1))
+    intensities = np.array((1.0, 1.0, 1.0, brightest))
+    y, x = np.indices((84, 80)).astype(np.float64)
+    cosine = np.nan_to_num(BALL.normals(x, y))[..., 2] if target == "ball" else 1 + (x - 40) / 400
+    generator = np.random.default_rng(0)
+    light = 0.78 * cosine * intensities[:, None, None] * generator.normal(1, 0.01, (4, 84, 80))
+    mask = BALL.inside((84, 80)) if target == "ball" else None
+    folder = write(tmp_path / "gray", np.rint(4095 * light.clip(0, 1))[..., None].repeat(3, 3) / 65535, mask)
+    if (target, brightest) == ("card", 3.0):
+        with pytest.raises(InputError, match=r"3\.png: the target is dark or overexposed"):
+            measure_light_intensities(find_ball_files(folder), lights, target)
+    else:
+        found = measure_light_intensities(find_ball_files(folder), lights, target)
+        # Only the rim of the ball is left under the brightest lamp, where half a pixel counts most.
+        np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
 
 
 def test_refusals(tmp_path: Path) -> None:

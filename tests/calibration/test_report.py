@@ -13,6 +13,7 @@ from splinecli.calibration.balls import BallCalibration, BallFiles, CalibratedLi
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.mirror_ball import Highlight
 from splinecli.calibration.report import calibration_report, summary_lines
+from splinecli.calibration.view import View
 from splinecli.normals import unit
 
 
@@ -26,7 +27,14 @@ def ball(directions: NDArray[np.float64], circle: Circle | None = None) -> BallC
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
     highlights = tuple(Highlight(1.23456, 2.0, 9, 0.25) for _ in directions)
     return BallCalibration(
-        files, circle or Circle(50, 40, 30), "--circle", highlights, directions, (100, 100)
+        files,
+        circle or Circle(50, 40, 30),
+        "--circle",
+        highlights,
+        directions,
+        unit(directions + np.array((0, 0, 1))),
+        View(np.eye(3), "assumed distant", 1.0),
+        (100, 100),
     )
 
 

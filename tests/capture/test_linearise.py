@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
-from splinecli.capture.formats.header import is_display_encoded
+from splinecli.capture.formats.header import stated_curve
 from splinecli.errors import InputError
 from splinecli.results.albedo import albedo_map
 
@@ -64,7 +64,7 @@ def test_transfer_curves_are_undone(tmp_path: Path, light: NDArray[np.float64]) 
         ("gamma", light ** (1 / 2.2), 2.2),
     ):
         folder = store(tmp_path / name, stored)
-        np.testing.assert_allclose(observed(folder, gamma=gamma), expected(light), atol=3e-5)
+        np.testing.assert_allclose(observed(folder, curve=gamma), expected(light), atol=3e-5)
     assert np.abs(observed(tmp_path / "srgb") - expected(light)).max() > 0.1
 
 
@@ -137,7 +137,7 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     ):
         path = tmp_path / name
         path.write_bytes(content)
-        assert is_display_encoded(path) == encoded, name
+        assert (stated_curve(path).curve is None) == encoded, name
     folder = store(tmp_path / "capture", light)
     assert "display_encoded" not in codes(read_capture(folder).warnings)
     (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))
@@ -151,6 +151,6 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     np.testing.assert_array_equal(observed(folder), mixed)  # it is asked to be linear
     capture = read_capture(folder)
     assert "display_decoded" in codes(capture.warnings) and "display_encoded" not in codes(capture.warnings)
-    np.testing.assert_array_equal(capture.observations, observed(folder, gamma=None))
+    np.testing.assert_array_equal(capture.observations, observed(folder, curve=None))
     assert (capture.observations < mixed).all()
     assert open_capture(folder).stamp != srgb_source.stamp

@@ -93,6 +93,40 @@ def test_two_balls_and_intensities(run):
     assert np.loadtxt("calibration/light_intensities.txt").shape == (4, 3)
 
 
+def test_positions_need_the_camera(run):
+    """Two balls side by side show distant lamps alike."""
+    for name, pads in (("one", (0, 180)), ("two", (180, 0))):
+        for path in write_balls(Path(name)).iterdir():
+            picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(path), np.pad(picture, ((0, 0), pads), constant_values=13107))
+    circles = ["--circle", "60,48,40", "--circle", "240,48,40"]
+    result = run("calibrate", "one", "two", *circles)
+    assert "the lamps' distances are unknown: they count as distant" in result.err
+    assert "warning: The lamps' distances are unknown, because the camera is" in result.err
+    assert not Path("calibration/light_positions.txt").exists()
+    matrix = np.array(((1000, 0, 149.5), (0, 1000, 49.5), (0, 0, 1)))
+    np.savetxt("matrix.txt", matrix)
+    arguments = [
+        "calibrate",
+        "one",
+        "two",
+        *circles,
+        "--overwrite",
+        "--json",
+        "--camera-matrix",
+        "matrix.txt",
+    ]
+    report = json.loads(run(*arguments).out)
+    assert report["camera"] == {"from": "--camera-matrix", "matrix": matrix.tolist()}
+    known = report["lamp_positions"]["known"]
+    for name in ("light_positions.txt", "pixel_size.txt", "camera_matrix.txt"):
+        assert Path("calibration", name).exists() == known
+    Path("matrix.txt").write_text("900 0\n0 900\n")
+    result = run(*arguments)
+    assert (result.code, result.out) == (3, "")
+    assert "matrix.txt: found 2 x 2 numbers, expected 3 x 3" in result.err
+
+
 def test_the_file_of_intensities_is_named(run):
     write_balls(Path("ball"))
     write_gray(Path("gray"), [1.0, 0.5, 0.75, 1.25])

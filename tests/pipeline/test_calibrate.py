@@ -32,7 +32,7 @@ def test_options_that_contradict_each_other(options: dict[str, Any], message: st
 
 def test_options_are_frozen() -> None:
     options = CalibrateOptions(balls=BALLS, gray_card=Path("card"), transfer="gamma:2.2")
-    assert options.gamma == 2.2
+    assert options.curve == 2.2
     with pytest.raises(FrozenInstanceError):
         options.transfer = "linear"  # type: ignore[misc]
 

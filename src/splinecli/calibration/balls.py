@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
-from splinecli.calibration.mirror_ball import Highlight, find_highlight, light_direction
+from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
+from splinecli.calibration.view import View, find_view
 from splinecli.capture.formats.decoding import decode_image, stored_size
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask, to_linear
@@ -52,6 +53,8 @@ class BallCalibration:
         circle_from: the source of the outline: "--circle", "mask" or "picture".
         highlights: (F,), one for each image.
         directions: (F, 3) float64, unit vectors; x right, y up, z to the camera.
+        normals: (F, 3), of the ball at the highlights, half-way between the view and the lights.
+        view: the camera.
         shape: (H, W) of the images.
     """
 
@@ -60,12 +63,14 @@ class BallCalibration:
     circle_from: str
     highlights: tuple[Highlight, ...]
     directions: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    view: View
     shape: tuple[int, int]
 
     @property
-    def normals(self) -> NDArray[np.float64]:
-        """The normals (F, 3) of the ball at the highlights, half-way between the view and the lights."""
-        return unit(self.directions + np.array((0.0, 0.0, 1.0)))
+    def points(self) -> NDArray[np.float64]:
+        """The highlights (F, 2) in the image."""
+        return np.array([(highlight.x, highlight.y) for highlight in self.highlights])
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +112,11 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
 
 
 def calibrate_ball(
-    files: BallFiles, *, circle: Circle | None = None, progress: Callable[[], object] | None = None
+    files: BallFiles,
+    *,
+    circle: Circle | None = None,
+    camera_matrix: Path | None = None,
+    progress: Callable[[], object] | None = None,
 ) -> BallCalibration:
     """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
 
@@ -115,6 +124,7 @@ def calibrate_ball(
         files: the files of the ball.
         circle: the outline. None takes it from the mask, from the reference image, or from the mean of all images, in
             this order.
+        camera_matrix: a file; None takes the camera from EXIF, or as distant (see find_view).
         progress: called after each image.
 
     Raises:
@@ -124,7 +134,9 @@ def calibrate_ball(
     circle_from = "--circle"
     if circle is None:
         circle, circle_from = _find_outline(files)
-    highlights, directions = [], []
+    view = find_view(files.images[0], camera_matrix)
+    centre = ball_centre(circle.outline, view.matrix)
+    highlights, normals, directions = [], [], []
     expected: ExpectedSize | None = None
     for path in files.images:
         stored = decode_image(path, expected)
@@ -139,10 +151,14 @@ def calibrate_ball(
                 circle,
                 full_scale=1.0 if stored.dtype.kind == "u" else None,
             )
-            directions.append(light_direction(circle, highlight))
+            point = np.array([(highlight.x, highlight.y)])
+            normal, direction = reflect(centre, point, view.matrix)
+            check_in_front(direction[0], view.rays(point)[0])
         except InputError as error:
             raise InputError(error.problem, path=path, hint=error.hint) from None
         highlights.append(highlight)
+        normals.append(normal[0])
+        directions.append(direction[0])
         if progress is not None:
             progress()
     assert expected is not None  # a ball has images
@@ -152,6 +168,8 @@ def calibrate_ball(
         circle_from,
         tuple(highlights),
         np.array(directions),
+        np.array(normals),
+        view,
         (expected.shape[0], expected.shape[1]),
     )
 

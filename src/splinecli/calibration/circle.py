@@ -6,7 +6,7 @@ Coordinates are in pixels of the image: x right, y down, whole numbers at pixel 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -35,6 +35,7 @@ class Circle:
         x, y, radius: centre and radius, in pixels.
         spread: rms distance of the outline's points from the circle, in pixels. 0 for a circle that the user gives.
         visible: share of the outline that the image or mask shows, 0 to 1. 1 for a circle that the user gives.
+        points: (N, 2), the points of the outline; None for a circle that the user gives.
     """
 
     x: float
@@ -42,6 +43,17 @@ class Circle:
     radius: float
     spread: float = 0.0
     visible: float = 1.0
+    points: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def outline(self) -> NDArray[np.float64]:
+        """The points (N, 2) of the outline near the circle. A near camera sees an ellipse, which is no circle."""
+        if self.points is not None:
+            return self.points[
+                _distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius
+            ]
+        angle = np.arange(RAYS) * (2 * np.pi / RAYS)
+        return np.column_stack((self.x + self.radius * np.cos(angle), self.y + self.radius * np.sin(angle)))
 
     def normals(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the circle."""
@@ -79,7 +91,9 @@ def circle_from_mask(mask: NDArray[np.bool_]) -> Circle:
         raise InputError("the mask has no outline inside the image, expected a ball")
     circle = _fit(outline, outline_points=len(outline))
     # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel further.
-    circle = Circle(circle.x, circle.y, circle.radius + 0.5, circle.spread, circle.visible)
+    from_centre = outline - (circle.x, circle.y)
+    outline = outline + 0.5 * from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
+    circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < MIN_VISIBLE:
         raise InputError(
             f"only {100 * circle.visible:.0f} % of the mask's outline lies on a circle, expected a ball",
@@ -162,7 +176,7 @@ def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
         if clear.sum() < 0.2 * RAYS:
             return None
         points = np.stack((guess.x + np.cos(angle) * reach, guess.y + np.sin(angle) * reach), axis=1)[clear]
-        guess = _fit(points, outline_points=RAYS)
+        guess = replace(_fit(points, outline_points=RAYS), points=points)
         if guess.visible < MIN_VISIBLE:
             return None
     return guess

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
-from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.decoding import stored_size
 from splinecli.capture.formats.exposure import check_exposures
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask
-from splinecli.capture.layouts.capture_files import AMBIENT, find_named
-from splinecli.capture.linearise import Lineariser, RadiometricCalibration
-from splinecli.capture.restore.saturation import find_saturated
+from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
+from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
+from splinecli.capture.restore.white_level import SaturationFinder
+from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 
 Target = Literal["ball", "card"]
@@ -24,44 +25,71 @@ Target = Literal["ball", "card"]
 SMALLEST_COSINE = 0.35
 """Only pixels with n.l above this are used. Closer to grazing light, a matte ball is seldom Lambertian."""
 
-_MIN_PIXELS = 50
+_MIN_PIXELS, _MOST_PIXELS = 50, 1 << 16
 _USED_RADIUS = 0.97  # of a ball: pixels at the rim mix it with the background
 
 
 def measure_light_intensities(
-    files: BallFiles, light_directions: NDArray[np.float64], target: Target, *, gamma: float | None = 1.0
+    files: BallFiles,
+    light_directions: NDArray[np.float64],
+    target: Target,
+    *,
+    radiometry: RadiometricCalibration = AS_STORED,
 ) -> NDArray[np.float64]:
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
-    By Lambert's law, each is the median of I / (n.l) over the pixels of the target.
+    By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are read and saturated
+    pixels are found as in a capture.
 
     Args:
         files: one image of the target for each light, and a mask of the target. A card without a mask fills the image.
             An image called `ambient` in the folder is subtracted.
         light_directions: (F, 3), unit vectors.
         target: a matte ball, or a matte card that faces the camera, with the normal (0, 0, 1).
-        gamma: transfer curve of the images, as in RadiometricCalibration.
+        radiometry: how stored values become linear light.
 
     Raises:
         InputError: the numbers of images and lights differ, an image cannot be read or has another size, or the target
             is dark or saturated under a light.
     """
-    if len(files.images) != len(light_directions):
+    n_lights = len(light_directions)
+    if len(files.images) != n_lights:
         raise InputError(
-            f"found {len(files.images)} images, expected {len(light_directions)}, one for each light",
-            path=files.folder,
+            f"found {len(files.images)} images, expected {n_lights}, one for each light", path=files.folder
         )
-    shape = decode_image(files.images[0]).shape[:2]
-    mask, normals = _target_normals(files, shape, target)
+    mask, normals = _target_normals(files, stored_size(files.images[0])[0][:2], target)
     check_exposures(files.images)
-    radiometry = RadiometricCalibration(gamma, find_named(files.folder, AMBIENT))
-    linearise = Lineariser(radiometry, mask, len(files.images))
-    intensities = [
-        _intensity(path, linearise, index, normals @ light, files.images[0])
-        for index, (path, light) in enumerate(zip(files.images, light_directions, strict=True))
-    ]
-    relative: NDArray[np.float64] = np.array(intensities) / np.mean(intensities)
-    return relative
+    capture = CaptureSource(
+        CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
+        light_directions,
+        np.ones((n_lights, 3)),
+        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
+    )
+    finder = SaturationFinder(len(normals), n_lights, even=True)
+    rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.int64)
+    values = []
+    for position, image in enumerate(capture.stored_pixels(range(n_lights), mask)):
+        finder.add(position, image.values, image.path, stated=image.stated_white_level)
+        values.append(image.linear[rows].astype(np.float64))
+    saturated = finder.finish().choose_pixels(rows).flags
+    cosines = normals[rows] @ light_directions.T
+    intensities = np.empty((n_lights, 3))
+    for position, path in enumerate(files.images):
+        ratios = values[position] / np.maximum(cosines[:, position], SMALLEST_COSINE)[:, None]
+        if saturated is not None:
+            # A card is alike everywhere: saturated pixels are its brightest, and shift no median. On a ball, they lie
+            # where n.l is largest, and the others tell the same without them.
+            ratios[saturated[:, position]] = np.inf if target == "card" else np.nan
+        ratios = ratios[(cosines[:, position] > SMALLEST_COSINE) & ~np.isnan(ratios).any(axis=1)]
+        intensity = np.median(ratios, axis=0) if len(ratios) >= _MIN_PIXELS else np.zeros(1)
+        if not ((intensity > 0) & np.isfinite(intensity)).all():
+            raise InputError(
+                "the target is dark or overexposed under this light, so the light's intensity is unknown",
+                path=path,
+                hint="Every light needs an image of the target that is neither black nor saturated",
+            )
+        intensities[position] = intensity
+    return np.asarray(intensities / intensities.mean())
 
 
 def _target_normals(
@@ -83,21 +111,3 @@ def _target_normals(
     mask &= Circle(circle.x, circle.y, _USED_RADIUS * circle.radius).inside(shape)
     y, x = np.nonzero(mask)
     return mask, circle.normals(x.astype(np.float64), y.astype(np.float64))
-
-
-def _intensity(
-    path: Path, linearise: Lineariser, index: int, cosine: NDArray[np.float64], first: Path
-) -> NDArray[np.float64]:
-    """Return the intensity (3,) of the light of one image; cosine (P,) is n.l at the pixels of the mask."""
-    stored = decode_image(path, ExpectedSize(linearise.mask.shape, first.name))
-    pixels = stored[linearise.mask]
-    usable = (cosine > SMALLEST_COSINE) & ~find_saturated(pixels)
-    values = linearise(pixels, path, index)[usable]
-    ratio = np.median(values / cosine[usable, None], axis=0) if usable.sum() >= _MIN_PIXELS else np.zeros(1)
-    if not (ratio > 0).all():
-        raise InputError(
-            "the target is dark or overexposed under this light, so the light's intensity is unknown",
-            path=path,
-            hint="Every light needs an image of the target that is neither black nor saturated",
-        )
-    return np.broadcast_to(ratio, (3,)).astype(np.float64)

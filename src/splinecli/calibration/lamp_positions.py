@@ -1,7 +1,7 @@
 """Positions of near lamps from two or more mirror balls, by triangulation.
 
-Each ball gives a ray: from the highlight on its surface in the direction of the lamp. The centres of the balls lie on
-the plane z = 0, which the object's mean plane should be.
+Each ball gives a ray: from the highlight on its surface in the direction of the lamp. The balls' centres, which the
+size of their outlines tells, lie near a plane z = const, which the object's mean plane should be.
 """
 
 from __future__ import annotations
@@ -14,10 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallCalibration
+from splinecli.calibration.mirror_ball import ball_centre, reflect
+from splinecli.calibration.view import View
+from splinecli.surface.camera import focal_length, ray_basis
 
-LARGEST_SPREAD = 0.2
-"""Largest standard deviation of a position, as a share of the lamp's distance. Beyond it the rays are nearly parallel,
-and the lamp may be at any distance."""
+LARGEST_UNCERTAINTY = 0.4
+"""Largest uncertainty of a position, as a share of the lamp's distance. Beyond it the rays are nearly parallel, and the
+lamp may be at any distance."""
+
+PIXEL_ERROR = 0.3
+"""Standard deviation of highlights, and of the middle and the radius of outlines, in pixels."""
+
+HEIGHT_SPREAD = 0.5
+"""Usual difference between the heights of the balls' centres and their plane, in radii. It decides where the size of
+the outlines does not: under a distant camera."""
+
+CONFIDENCE = 0.95
+"""Share of positions that are within their uncertainty."""
+
+_DRAWS = 200
 
 Floats = NDArray[np.float64]
 
@@ -28,13 +43,15 @@ class LampPositions:
 
     Args:
         positions: (F, 3).
-        spread: (F,), the standard deviation of each position along its most uncertain direction.
-        pixel_size: the width of a pixel in the unit of the positions; 1 if that is a pixel.
+        uncertainty: (F,), the distance within which the true position is with CONFIDENCE.
+        pixel_size: the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel.
+        view: the camera.
     """
 
     positions: Floats
-    spread: Floats
+    uncertainty: Floats
     pixel_size: float
+    view: View
 
     @property
     def distances(self) -> Floats:
@@ -44,7 +61,8 @@ class LampPositions:
     def known(self) -> bool:
         """Whether every lamp has a position in front of the balls that the rays determine well."""
         return bool(
-            (self.positions[:, 2] > 0).all() and (self.spread <= LARGEST_SPREAD * self.distances).all()
+            (self.positions[:, 2] > 0).all()
+            and (self.uncertainty <= LARGEST_UNCERTAINTY * self.distances).all()
         )
 
 
@@ -52,6 +70,9 @@ def triangulate_lamps(
     balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
 ) -> LampPositions | None:
     """Return the positions of the lamps from balls that one camera photographed; None for balls at one place.
+
+    The uncertainty comes from repeating the computation with other pixels (PIXEL_ERROR), heights of the balls and
+    cameras (View.draw). It is larger if the rays miss each other by more than this explains.
 
     Args:
         balls: at least two balls, or one at two places.
@@ -61,43 +82,80 @@ def triangulate_lamps(
     apart = max(math.hypot(circle.x - circles[0].x, circle.y - circles[0].y) for circle in circles)
     if apart < circles[0].radius or len({ball.shape for ball in balls}) > 1:
         return None
+    view = balls[0].view
+    positions, pixel_size, miss = _positions(balls, view.matrix, ball_diameter)
+    generator = np.random.default_rng(0)
+    drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(_DRAWS)]
+    errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
+    errors[np.isnan(errors)] = np.inf
+    # Each draw adds as much to the misses as the pixels had added to those of the images, if PIXEL_ERROR is right.
+    added = float(np.nanmedian([other for _, _, other in drawn])) - miss
+    excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
+    uncertainty = excess * np.quantile(errors, CONFIDENCE, axis=0, method="higher")
+    return LampPositions(positions, uncertainty, pixel_size, view)
+
+
+def _positions(
+    balls: Sequence[BallCalibration],
+    matrix: Floats,
+    ball_diameter: float | None,
+    generator: np.random.Generator | None = None,
+) -> tuple[Floats, float, float]:
+    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each other.
+
+    Args:
+        generator: draws errors of the pixels; None for the pixels as they are.
+    """
+
+    def error(*shape: int) -> Floats:
+        return np.zeros(shape) if generator is None else generator.normal(size=shape)
+
+    centres = np.array([ball_centre(ball.circle.outline + PIXEL_ERROR * error(2), matrix) for ball in balls])
+    depths = -centres[:, 2]
+    shares = np.array([PIXEL_ERROR / ball.circle.radius for ball in balls])
+    plane = float(depths.mean() * (1 + (shares * error(len(balls))).mean()))
+    # The most probable depths, and their errors, given those from the outlines and HEIGHT_SPREAD.
+    weights = HEIGHT_SPREAD**2 / (HEIGHT_SPREAD**2 + (shares * depths) ** 2)
+    likely = (
+        plane + weights * (depths - depths.mean()) + np.sqrt(weights) * shares * depths * error(len(balls))
+    )
+    centres *= (likely / depths)[:, None]
     height, width = balls[0].shape
-    pixel_size = 1.0
-    if ball_diameter is not None:
-        pixel_size = ball_diameter / float(np.mean([2 * ball.circle.radius for ball in balls]))
-    middle = np.array(((width - 1) / 2, (height - 1) / 2))
-    starts = [
-        np.array((ball.circle.x - middle[0], middle[1] - ball.circle.y, 0.0))
-        + ball.circle.radius * ball.normals
-        for ball in balls
+    origin = np.array(((width - 1) / 2, (height - 1) / 2, 1.0)) @ ray_basis(matrix) * plane
+    found = [
+        reflect(centre, ball.points + PIXEL_ERROR * error(*ball.points.shape), matrix)
+        for centre, ball in zip(centres, balls, strict=True)
     ]
-    positions, spread = intersect_rays(np.array(starts), np.array([ball.directions for ball in balls]))
-    return LampPositions(positions * pixel_size, spread * pixel_size, pixel_size)
+    starts = np.array(
+        [centre - origin + normals for centre, (normals, _) in zip(centres, found, strict=True)]
+    )
+    points, miss = intersect_rays(starts, np.array([directions for _, directions in found]))
+    pixel = plane / focal_length(matrix)  # in radii of the balls
+    unit = 1 / pixel if ball_diameter is None else ball_diameter / 2
+    return points * unit, pixel * unit, miss
 
 
-def intersect_rays(starts: Floats, directions: Floats) -> tuple[Floats, Floats]:
-    """Return the points (F, 3) nearest to B rays each, and their standard deviations (F,).
+def intersect_rays(starts: Floats, directions: Floats) -> tuple[Floats, float]:
+    """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays miss them.
 
-    The directions are taken to have equal random errors. Their size is estimated from how far all rays miss the points,
-    so three lights or more are needed for a fair estimate.
+    The directions are taken to have equal random errors. A ray with NaN gives NaN.
 
     Args:
         starts, directions: (B, F, 3), unit directions, B at least 2.
     """
+    usable = np.isfinite(directions).all(axis=(0, 2))
+    points = np.full(starts.shape[1:], np.nan)
+    starts, directions = starts[:, usable], directions[:, usable]
     # Projections across each ray: their sum is singular for parallel rays.
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     weights = np.ones(starts.shape[:2])
-    for _ in range(
-        3
-    ):  # an error of direction counts in proportion to the distance, which is not known at first
+    # An error of direction counts in proportion to the distance, which is not known at first.
+    for _ in range(3):
         weighted = across * weights[..., None, None]
         right_side = np.einsum("bfij,bfj->fi", weighted, starts)
         inverse = np.linalg.pinv(weighted.sum(axis=0), hermitian=True)
-        points = np.einsum("fij,fj->fi", inverse, right_side)
-        misses = np.einsum("bfij,bfj->bfi", across, points - starts)
-        distances = np.maximum(np.linalg.norm(points - starts, axis=2), 1e-12)
-        weights = distances**-2.0
-    freedom = starts.shape[1] * (2 * len(starts) - 3)
-    variance = (weights * np.square(misses).sum(axis=2)).sum() / freedom
-    spread = np.sqrt(variance * np.linalg.eigvalsh(inverse)[:, -1])
-    return points, spread
+        nearest = np.einsum("fij,fj->fi", inverse, right_side)
+        misses = np.einsum("bfij,bfj->bfi", across, nearest - starts)
+        weights = np.maximum(np.linalg.norm(nearest - starts, axis=2), 1e-12) ** -2.0
+    points[usable] = nearest
+    return points, float((weights * np.square(misses).sum(axis=2)).mean()) if usable.any() else math.nan

@@ -1,7 +1,8 @@
 """The highlight of a lamp in a mirror ball, and the light direction that follows from it.
 
-The ball's normal n at the highlight halves the angle between the light direction l and the viewing direction
-v = (0, 0, 1), so l = 2 (n.v) n - v. A common mistake is to use n itself as the light direction.
+The ball's normal n at the highlight halves the angle between the light direction l and the direction v to the camera,
+so l = 2 (n.v) n - v. A common mistake is to use n itself as the light direction. The camera is at the origin, and the
+unit of length is the radius of the ball. x is right, y up, z towards the camera.
 """
 
 from __future__ import annotations
@@ -14,7 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle
+from splinecli.calibration.view import unit_rays
 from splinecli.errors import InputError
+from splinecli.surface.camera import ray_basis
+
+Floats = NDArray[np.float64]
 
 HIGHLIGHT_LEVEL = 0.7
 """A highlight is the patch above this share of its brightest value, after a slight blur."""
@@ -83,17 +88,46 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
     )
 
 
-def light_direction(circle: Circle, highlight: Highlight) -> NDArray[np.float64]:
-    """Return the unit vector (3,) towards the lamp: x right, y up, z to the camera.
+def ball_centre(outline: Floats, matrix: Floats) -> Floats:
+    """Return the centre (3,) of a ball whose outline a camera sees at image points (N, 2).
 
-    Raises:
-        InputError: the highlight is so near the rim that the lamp is level with the ball or behind it.
+    Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2 - 1), this is
+    linear. Written with m_z + 1, it is also exact for a camera that is far away.
     """
-    normal = circle.normals(np.array([highlight.x]), np.array([highlight.y]))[0]
-    if not np.isfinite(normal).all() or 2 * normal[2] ** 2 <= 1:
+    rays = np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)
+    x, y = rays[:, 0], rays[:, 1]
+    equations, right_side = (
+        np.column_stack((x, y, np.ones(len(x)))),
+        (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1)),
+    )
+    kept = np.ones(len(x), np.bool_)
+    for _ in range(4):
+        solution = np.linalg.lstsq(equations[kept], right_side[kept], rcond=None)[0]
+        misses = np.abs(equations @ solution - right_side)
+        kept = misses <= 4 * np.median(misses) + 1e-30
+    mx, my, beyond = solution
+    inverse = mx * mx + my * my + beyond * (2 + beyond)
+    return np.asarray(np.array((mx, my, -1 - beyond)) / np.sqrt(max(inverse, 1e-30)))
+
+
+def reflect(centre: Floats, highlights: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball.
+
+    Args:
+        centre: (3,), see ball_centre.
+        matrix: (3, 3), of the camera.
+    """
+    rays = unit_rays(highlights, matrix)
+    across = centre - (rays @ centre)[:, None] * rays
+    with np.errstate(invalid="ignore"):
+        normals = -across - np.sqrt(1 - np.square(across).sum(axis=1, keepdims=True)) * rays
+    return normals, rays - 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
+
+
+def check_in_front(direction: Floats, ray: Floats) -> None:
+    """Raise InputError for a light direction (3,) that is level with the ball or behind it, as the camera sees it."""
+    if not direction @ ray < 0:
         raise InputError(
             "the highlight is near the rim of the ball: the lamp is level with the ball or behind it",
             hint="Place all lights on the camera's side of the object",
         )
-    direction: NDArray[np.float64] = 2 * normal[2] * normal - (0.0, 0.0, 1.0)
-    return direction

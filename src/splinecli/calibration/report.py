@@ -41,9 +41,10 @@ def calibration_report(
         picture: the name of the picture to which warnings refer.
         lamps: the positions from several balls, or None.
     """
-    single = len(lights.balls) == 1
+    single, view = len(lights.balls) == 1, lights.balls[0].view
     return {
         "n_lights": len(lights.directions),
+        "camera": {"from": view.source, "matrix": _rows(view.matrix) if view.known else None},
         "balls": [_ball(ball) for ball in lights.balls],
         "light_directions": _rows(lights.directions),
         "light_intensities": None if intensities is None else _rows(intensities),
@@ -56,6 +57,7 @@ def calibration_report(
         ),
         "warnings": [
             *_outline_warnings(lights, picture),
+            *_distance_warnings(lamps),
             *([] if lamps is not None and lamps.known else _disagreement_warnings(lights, picture)),
             *_comparison_warnings(lights, known_directions),
         ],
@@ -92,25 +94,38 @@ def _positions(lamps: LampPositions) -> dict[str, Any]:
     return {
         "known": lamps.known,
         "positions": _rows(lamps.positions),
-        "spread": [_round(value) for value in lamps.spread],
+        # Infinite where a lamp may be at any distance.
+        "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
         "pixel_size": _round(lamps.pixel_size, 6),
     }
 
 
 def _lamp_line(lamps: dict[str, Any]) -> str:
     """Return the line on triangulated lamps, from the report."""
-    distances = np.linalg.norm(lamps["positions"], axis=1)
-    shares = 100 * np.array(lamps["spread"]) / distances
     if not lamps["known"]:
-        return (
-            "the rays from the balls are too parallel to tell the lamps' distances: they count as distant"
-            " (balls farther apart would tell more)"
-        )
+        return "the lamps' distances are unknown: they count as distant"
+    distances = np.linalg.norm(lamps["positions"], axis=1)
+    shares = 100 * np.array(lamps["uncertainty"]) / distances
     return (
         f"the lamps are {distances.min():.4g} to {distances.max():.4g} away"
         f" ({'pixels' if lamps['pixel_size'] == 1 else 'in the unit of --ball-diameter'}),"
         f" uncertain by {shares.mean():.0f} % on average, at most {shares.max():.0f} %"
     )
+
+
+def _distance_warnings(lamps: LampPositions | None) -> list[str]:
+    """Warn of lamps whose distances the balls do not tell."""
+    if lamps is None or lamps.known:
+        return []
+    if lamps.view.known:
+        return [
+            "The rays from the balls are too parallel to tell the lamps' distances. If the lamps are near, put the"
+            " balls farther apart."
+        ]
+    return [
+        "The lamps' distances are unknown, because the camera is: it counts as distant, and a near camera makes the"
+        " rays from the balls too parallel. If the lamps are near, add --camera-matrix."
+    ]
 
 
 def _ball(ball: BallCalibration) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splinecli.capture.formats.decoding import stored_size
 from splinecli.capture.formats.image_size import ExpectedSize, check_memory, check_stored_size, image_bytes
-from splinecli.capture.formats.raw import RAW_SUFFIXES
+from splinecli.capture.formats.raw import is_raw
 
 _BYTES_OF_RESULTS = 52
 """Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
@@ -36,7 +36,7 @@ def common_size(images: Sequence[Path]) -> StoredSize:
     expected = ExpectedSize(first[0], images[0].name)
     for path in images[1:]:
         # Opening a RAW file takes long. Its size is compared when it is decoded.
-        if path.suffix.lower() not in RAW_SUFFIXES:
+        if not is_raw(path):
             size = stored_size(path)
             expected.check(size[0], path)
             largest = max(largest, size, key=lambda size: image_bytes(*size))

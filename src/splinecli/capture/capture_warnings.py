@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.restore.white_level import WhiteLevel
+from splinecli.transfer import TransferCurve
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ NEAR_LAMPS = "near_lamps"
 LOW_CONFIDENCE = "low_confidence"
 NOT_DISTILLED = "not_distilled"
 NO_MASK = "no_mask"
+PROFILE_UNREAD = "profile_unread"
 REPEATED_IMAGES = "repeated_images"
 REFINED_LIGHTS = "refined_lights"
 ROUGH_LIGHTS = "rough_lights"
@@ -149,20 +151,21 @@ def ambient_subtracted(ambient: str) -> CaptureWarning:
     return CaptureWarning(AMBIENT_SUBTRACTED, f"{ambient} was subtracted from all images as ambient light.")
 
 
-def display_decoded() -> CaptureWarning:
-    return CaptureWarning(
-        DISPLAY_DECODED,
-        "The images say that they are display-encoded (JPEG, or PNG that says so) and are read as sRGB. Add --transfer"
-        " linear if their values are linear.",
-    )
+def display_decoded(by: str, curve: TransferCurve) -> CaptureWarning:
+    """Warn of images whose values are decoded with the curve that they state."""
+    how = "sRGB" if curve is None else "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}"
+    text = f"The images say that they are display-encoded ({by}) and are read as {how}."
+    return CaptureWarning(DISPLAY_DECODED, f"{text} Add --transfer linear if their values are linear.")
 
 
-def display_encoded() -> CaptureWarning:
-    return CaptureWarning(
-        DISPLAY_ENCODED,
-        "The images look display-encoded (JPEG, or PNG that says so) but are read as linear."
-        " Add --transfer srgb if they are sRGB.",
-    )
+def display_encoded(by: str) -> CaptureWarning:
+    text = f"The images look display-encoded ({by}) but are read as linear."
+    return CaptureWarning(DISPLAY_ENCODED, f"{text} Add --transfer srgb if they are sRGB.")
+
+
+def profile_unread(image: str) -> CaptureWarning:
+    text = f"The colour profile of {image} has no curve that can be read, so it does not count."
+    return CaptureWarning(PROFILE_UNREAD, f"{text} Add --transfer linear, srgb or gamma:G.")
 
 
 def exif_orientation(orientation: int) -> CaptureWarning:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.header import stated_curve
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.masks import take_pixels
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
-from splinecli.transfer import decode_transfer
+from splinecli.transfer import TransferCurve, decode_transfer
 
 _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 
@@ -25,16 +29,38 @@ class RadiometricCalibration:
     """How stored values become linear light.
 
     Args:
-        gamma: exponent of the images' transfer curve; 1 for linear images, None for sRGB.
-        automatic: whether images are sRGB if all of them say that they are display-encoded.
+        curve: the images' transfer curve.
+        automatic: whether the curve that all images state is used in its place.
         ambient: an image under ambient light alone, which is subtracted from all others.
         flat_field: images of an evenly white surface, one for each light or one for all. Images are divided by them.
     """
 
-    gamma: float | None = 1.0
+    curve: TransferCurve = 1.0
     ambient: Path | None = None
     flat_field: tuple[Path, ...] = ()
     automatic: bool = False
+
+    def with_stated_curve(
+        self, images: Sequence[Path]
+    ) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
+        """Return this calibration with the curve that all images state, if it is automatic, and warnings.
+
+        Raises:
+            InputError: an image cannot be read.
+        """
+        if self.curve != 1:
+            return self, []
+        stated = {path: stated_curve(path) for path in images}
+        curves = {found.curve for found in stated.values()}
+        by = ", ".join(sorted({found.by for found in stated.values() if found.curve != 1}))
+        unread = [path for path, found in stated.items() if found.unread]
+        warnings = [capture_warnings.profile_unread(unread[0].name)] if unread and self.automatic else []
+        if self.automatic and len(curves) == 1:
+            (curve,) = curves
+            if curve != 1:
+                warnings.append(capture_warnings.display_decoded(by, curve))
+            return replace(self, curve=curve), warnings
+        return self, [*warnings, capture_warnings.display_encoded(by)] if by else warnings
 
 
 AUTOMATIC = RadiometricCalibration(automatic=True)
@@ -68,7 +94,7 @@ class Lineariser:
 
     def __call__(self, pixels: NDArray[Any], path: Path, index: int) -> NDArray[np.float32]:
         """Return linear light (P, C) from the mask's pixels (P, C), as stored in image `index`. Raises InputError."""
-        linear = decode_transfer(to_linear(pixels, path), self.radiometry.gamma)
+        linear = decode_transfer(to_linear(pixels, path), self.radiometry.curve)
         if self._ambient is not None:
             linear = np.maximum(linear - self._ambient, 0)
         if len(self.radiometry.flat_field) > 1:
@@ -89,4 +115,4 @@ class Lineariser:
     def _linear(self, path: Path) -> NDArray[np.float32]:
         expected = ExpectedSize(self._window.shape or self.mask.shape, "the other images")
         stored = self._window.of(decode_image(path, expected))
-        return decode_transfer(to_linear(take_pixels(stored, self.mask), path), self.radiometry.gamma)
+        return decode_transfer(to_linear(take_pixels(stored, self.mask), path), self.radiometry.curve)

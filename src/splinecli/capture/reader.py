@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.exposure import check_exposures
-from splinecli.capture.formats.header import is_display_encoded
 from splinecli.capture.formats.orientation import UPRIGHT, common_orientation
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
@@ -96,13 +95,10 @@ def open_capture(
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
         warnings.append(capture_warnings.ambient_subtracted(files.ambient.name))
-    encoded = [is_display_encoded(image) for image in files.images] if radiometry.gamma == 1 else []
-    if radiometry.automatic and encoded and all(encoded):
-        radiometry = replace(radiometry, gamma=None)
-        warnings.append(capture_warnings.display_decoded())
-    elif any(encoded):
-        warnings.append(capture_warnings.display_encoded())
-    decoded = ("sRGB",) if radiometry.automatic and radiometry.gamma is None else ()
+    radiometry, of_curve = radiometry.with_stated_curve(files.images)
+    warnings += of_curve
+    # Earlier versions read such images as linear, or those with a colour profile as sRGB.
+    decoded = (radiometry.curve or "sRGB",) if radiometry.automatic and radiometry.curve != 1 else ()
     orientation = common_orientation(files.images)
     if orientation != UPRIGHT:
         warnings.append(capture_warnings.exif_orientation(orientation))

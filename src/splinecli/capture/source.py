@@ -120,7 +120,7 @@ class CaptureSource:
                 self.files.ground_truth, (whole.shape[0], whole.shape[1]), whole
             )
             ground_truth = self.window.of(ground_truth)
-        images = self._stored_pixels(indices, mask)
+        images = self.stored_pixels(indices, mask)
         saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
         found = collect_observations(images, saturation, progress)
         warnings = [*self.warnings, *found.warnings()]
@@ -232,8 +232,8 @@ class CaptureSource:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)
 
-    def _stored_pixels(self, indices: Sequence[int], mask: NDArray[np.bool_]) -> Iterator[StoredPixels]:
-        """Yield the mask's pixels under these lights."""
+    def stored_pixels(self, indices: Sequence[int], mask: NDArray[np.bool_]) -> Iterator[StoredPixels]:
+        """Yield the pixels of a mask (H, W) under these lights. Raises InputError for an image that cannot be read."""
         linearise = Lineariser(self.radiometry, mask, len(self.files.images), self.window)
         expected = self._expected(mask, indices[0])
 

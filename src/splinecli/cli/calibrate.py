@@ -16,6 +16,7 @@ def calibrate(
     circle: list[str] | None = inputs.CIRCLES,
     mask: list[Path] | None = inputs.BALL_MASKS,
     ball_diameter: float | None = inputs.BALL_DIAMETER,
+    camera_matrix: Path | None = inputs.BALL_CAMERA_MATRIX,
     gray_ball: Path | None = inputs.GRAY_BALL,
     gray_card: Path | None = inputs.GRAY_CARD,
     transfer: str = inputs.GRAY_TRANSFER,
@@ -34,8 +35,8 @@ def calibrate(
 
     Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the result by eye, and
     calibration.json. With a gray ball or card, it also writes light_intensities.txt, the relative light intensities.
-    With two balls or more, or one ball at two places, and lamps that are near, it also writes light_positions.txt and
-    pixel_size.txt for --light-positions of infer.
+    With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
+    light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
     limit_reading(max_pixels_per_image)
     options = CalibrateOptions(
@@ -43,6 +44,7 @@ def calibrate(
         circles=tuple(parse_circle(text) for text in circle or ()),
         masks=tuple(mask or ()),
         ball_diameter=ball_diameter,
+        camera_matrix=camera_matrix,
         gray_ball=gray_ball,
         gray_card=gray_card,
         transfer=transfer,

@@ -57,7 +57,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Output": ("--plot", "--strict", *REPEAT),
     },
     "calibrate": {
-        "Input": ("--circle", "--mask", "--ball-diameter", "--max-pixels-per-image"),
+        "Input": ("--circle", "--mask", "--ball-diameter", "--camera-matrix", "--max-pixels-per-image"),
         "Light intensities": ("--gray-ball", "--gray-card", "--transfer"),
         "Output": ("--output", "--compare", *REPEAT),
     },

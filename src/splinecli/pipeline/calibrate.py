@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.transfer import AUTOMATIC
+from splinecli.transfer import AUTOMATIC, TransferCurve
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,18 +23,9 @@ if TYPE_CHECKING:
     from splinecli.calibration.lamp_positions import LampPositions
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
-POSITIONS, PIXEL_SIZE = "light_positions.txt", "pixel_size.txt"
+POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
 PICTURE, REPORT = "calibration.png", "calibration.json"
-OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, PICTURE, REPORT)
-
-DISPLAY_ENCODED = (
-    "The images of the gray target look display-encoded (JPEG, or PNG that says so), but are read as linear."
-    " Add --transfer srgb if they are sRGB."
-)
-DISPLAY_DECODED = (
-    "The images of the gray target say that they are display-encoded (JPEG, or PNG that says so) and are read as sRGB."
-    " Add --transfer linear if their values are linear."
-)
+OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +37,7 @@ class CalibrateOptions:
         circles: the outline of each ball, or empty.
         masks: a mask of each ball, or empty.
         ball_diameter: of each ball, in any unit, which becomes that of the lamps' positions.
+        camera_matrix: a text file of 3 x 3 numbers. None takes the focal length from EXIF, or the camera as distant.
         gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
         transfer: the curve of the gray target's images: auto, linear, srgb or gamma:G.
         compare: a text file of light directions to compare the result with.
@@ -60,6 +52,7 @@ class CalibrateOptions:
     circles: tuple[Circle, ...] = ()
     masks: tuple[Path, ...] = ()
     ball_diameter: float | None = None
+    camera_matrix: Path | None = None
     gray_ball: Path | None = None
     gray_card: Path | None = None
     transfer: str = AUTOMATIC
@@ -68,7 +61,7 @@ class CalibrateOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.gamma != 1 and not (self.gray_ball or self.gray_card):
+        if self.curve != 1 and not (self.gray_ball or self.gray_card):
             raise UsageError(
                 "--transfer needs --gray-ball or --gray-card",
                 hint="Leave it out: the light directions do not depend on the curve",
@@ -91,7 +84,7 @@ class CalibrateOptions:
                 )
 
     @property
-    def gamma(self) -> float | None:
+    def curve(self) -> TransferCurve:
         """The transfer curve of the gray target's images, as in RadiometricCalibration."""
         from splinecli.transfer import parse_transfer
 
@@ -129,15 +122,18 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     ]
     known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
     circles = options.circles or [None] * len(balls)
-    lights = combine_balls(_calibrate_balls(balls, circles, observer))
+    lights = combine_balls(_calibrate_balls(balls, circles, options.camera_matrix, observer))
     intensities = None
     warnings: list[str] = []
     if target_files is not None:
         from splinecli.calibration.gray import measure_light_intensities
+        from splinecli.capture.linearise import RadiometricCalibration
 
         kind: Target = "ball" if options.gray_ball is not None else "card"
-        gamma, warnings = _target_curve(options, target_files)
-        intensities = measure_light_intensities(target_files, lights.directions, kind, gamma=gamma)
+        radiometry = RadiometricCalibration(options.curve, automatic=options.transfer == AUTOMATIC)
+        radiometry, of_curve = radiometry.with_stated_curve(target_files.images)
+        warnings = [f"{target}: {warning}" for warning in of_curve]
+        intensities = measure_light_intensities(target_files, lights.directions, kind, radiometry=radiometry)
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
     report["warnings"] += warnings
@@ -154,25 +150,18 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
 
 
 def _calibrate_balls(
-    balls: Sequence[BallFiles], circles: Sequence[Circle | None], observer: Observer
+    balls: Sequence[BallFiles],
+    circles: Sequence[Circle | None],
+    camera_matrix: Path | None,
+    observer: Observer,
 ) -> list[BallCalibration]:
     from splinecli.calibration.balls import calibrate_ball
 
     with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
         return [
-            calibrate_ball(ball, circle=circle, progress=lambda: advance(1))
+            calibrate_ball(ball, circle=circle, camera_matrix=camera_matrix, progress=lambda: advance(1))
             for ball, circle in zip(balls, circles, strict=True)
         ]
-
-
-def _target_curve(options: CalibrateOptions, files: BallFiles) -> tuple[float | None, list[str]]:
-    """Return the transfer curve of the gray target's images, and warnings about it."""
-    from splinecli.capture.formats.header import is_display_encoded
-
-    encoded = [is_display_encoded(image) for image in files.images] if options.gamma == 1 else []
-    if options.transfer == AUTOMATIC and encoded and all(encoded):
-        return None, [DISPLAY_DECODED]
-    return options.gamma, [DISPLAY_ENCODED] if any(encoded) else []
 
 
 def _write(
@@ -192,6 +181,7 @@ def _write(
         INTENSITIES: None if intensities is None else _text(intensities),
         POSITIONS: None if known is None else _text(known.positions),
         PIXEL_SIZE: None if known is None else f"{known.pixel_size:.9g}\n",
+        CAMERA_MATRIX: _text(known.view.matrix) if known is not None and known.view.known else None,
         REPORT: json.dumps(report, indent=2) + "\n",
     }
     # Files that are not written anew would belong to earlier lights. They are removed.

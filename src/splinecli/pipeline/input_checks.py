@@ -69,7 +69,7 @@ class StatedLights:
             origin=source.files.light_directions,
             frame=source.light_frame,
             intensities_measured=source.intensities_measured,
-            linear=source.radiometry.gamma == 1,
+            linear=source.radiometry.curve == 1,
             lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
             has_positions=source.lamps is not None,
         )

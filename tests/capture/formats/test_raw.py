@@ -17,7 +17,7 @@ from splinecli.calibration.balls import find_ball_files
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.exposure import Exposure, read_exposure
-from splinecli.capture.formats.header import is_display_encoded
+from splinecli.capture.formats.header import stated_curve, stated_white_level
 from splinecli.capture.formats.raw import _full_scale
 from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
 from splinecli.capture.layouts.image_lists import list_images
@@ -299,7 +299,7 @@ def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
     assert read_exposure(write_dng(tmp_path / "b.dng", mosaic(ramp()))) is None
     # The header of Olympus.
     assert read_exposure(write_dng(tmp_path / "c.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")) is None
-    assert not is_display_encoded(stated)
+    assert stated_curve(stated).curve == 1
 
 
 @pytest.mark.usefixtures("needs_rawpy")
@@ -318,3 +318,24 @@ def test_mixed_exposures_are_refused(tmp_path: Path) -> None:
     message = r"2\.nef: found an exposure of 1/32 s, f/8, ISO 100, expected 1/64 s, f/8, ISO 100 as in 0\.nef"
     with pytest.raises(InputError, match=message):
         open_capture(tmp_path)
+
+
+@pytest.mark.usefixtures("needs_rawpy")
+@pytest.mark.parametrize("thumbnail", [False, True])
+def test_the_white_level_is_that_of_the_developed_values(tmp_path: Path, thumbnail: bool) -> None:
+    """The tags say 4095 of the sensor's values, or 8 bits of a thumbnail; the values read end at 65535."""
+    light = np.broadcast_to(np.linspace(0.02, 0.6, 80), (30, 80))  # up to 39321, far above 4095
+    for number in range(3):
+        path = write_dng(tmp_path / f"{number}.dng", mosaic(light, white=4095), white=4095)
+        if thumbnail:  # one value for the first picture, as cameras store; LibRaw reads the others
+            path.write_bytes(
+                path.read_bytes().replace(
+                    struct.pack("<HHIHH", 258, 3, 1, 16, 0), struct.pack("<HHIHH", 258, 3, 1, 8, 0)
+                )
+            )
+        assert stated_white_level(path) == 65535
+    (tmp_path / "lights.txt").write_text(LIGHTS)
+    if not thumbnail:
+        capture = read_capture(tmp_path)
+        assert capture.white_level is not None and capture.white_level.value == 65535
+        assert capture.restored is None and "saturated" not in {warning.code for warning in capture.warnings}

@@ -19,7 +19,7 @@ from scipy.io import savemat
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.capture import open_capture
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.header import is_display_encoded, stated_white_level
+from splinecli.capture.formats.header import stated_curve, stated_white_level
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, limit_pixels
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
@@ -218,7 +218,7 @@ def test_headers_without_end(tmp_path: Path) -> None:
     png.write_bytes(plain[:33])
     with png.open("ab") as file:
         file.truncate(3 << 30)
-    assert not is_display_encoded(png)
+    assert stated_curve(png).curve == 1
     mat.write_bytes(bytes(126) + b"IM")
     with mat.open("ab") as file:
         file.truncate(3 << 30)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.header import JPEG, PNG, TIFF, stated_size
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
-from splinecli.capture.formats.raw import RAW_SUFFIXES, decode_raw, raw_size
+from splinecli.capture.formats.raw import decode_raw, is_raw, raw_size
 from splinecli.capture.formats.tiff import decode_tiff, tiff_size
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
@@ -124,7 +124,7 @@ def _kind(path: Path) -> Literal["RAW", "TIFF", "PNG", "JPEG"]:
             start = file.read(len(PNG))
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    if start and path.suffix.lower() in RAW_SUFFIXES:
+    if start and is_raw(path):
         return "RAW"
     if start.startswith(TIFF):
         return "TIFF"

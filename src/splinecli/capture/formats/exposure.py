@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture.formats.decoding import native_stderr
-from splinecli.capture.formats.raw import RAW_SUFFIXES, read_shot
+from splinecli.capture.formats.raw import is_raw, read_shot
 from splinecli.errors import InputError
 
 _EXIF, _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x8769, 0x829A, 0x829D, 0x8827
@@ -43,9 +43,7 @@ def read_exposure(path: Path) -> Exposure | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            seconds, f_number, iso = (
-                _read_raw(path) if path.suffix.lower() in RAW_SUFFIXES else _read_tags(path)
-            )
+            seconds, f_number, iso = _read_raw(path) if is_raw(path) else _read_tags(path)
             exposure = Exposure(
                 float(seconds), float(f_number), float(iso[0] if isinstance(iso, tuple) else iso)
             )

@@ -1,13 +1,18 @@
-"""What the headers of image files state about their values: display encoding, and the white level."""
+"""What the headers of image files state about their values: the transfer curve, and the white level."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from splinecli.capture.formats.colour_profile import LARGEST_PROFILE, profile_curve
+from splinecli.capture.formats.raw import is_raw
 from splinecli.capture.formats.tiff import first_page
 from splinecli.errors import InputError
+from splinecli.transfer import SRGB, TransferCurve
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -16,7 +21,10 @@ TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MOST_PARTS = 10_000
 """Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
 
-_MAX_SAMPLE_VALUE, _WHITE_LEVEL = 281, 50717  # tags of TIFF and DNG
+_MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF and DNG
+
+_RAW_WHITE = 65_535
+"""The white level of developed RAW files; see decode_raw."""
 
 
 def is_image(content: bytes) -> bool:
@@ -51,26 +59,52 @@ def _png_size(file: BinaryIO) -> tuple[tuple[int, int, int], int] | None:
 
 
 def _jpeg_size(file: BinaryIO) -> tuple[tuple[int, int, int], int] | None:
-    """Return the size in the header of a JPEG's frame, which stands behind segments of any length."""
-    file.seek(2)
-    for _ in range(_MOST_PARTS):
-        if len(start := file.read(2)) < 2 or start[0] != 0xFF:
-            return None
-        if start[1] == 0xFF:  # fill
-            file.seek(-1, 1)
-            continue
-        segment = file.read(8)
-        if len(segment) < 8:
-            return None
-        if 0xC0 <= start[1] <= 0xCF and start[1] not in (0xC4, 0xC8, 0xCC):
-            height, width = (int.from_bytes(segment[place : place + 2], "big") for place in (3, 5))
-            return (height, width, segment[7]), 1
-        file.seek(int.from_bytes(segment[:2], "big") - 8, 1)
+    """Return the size in the header of a JPEG's frame."""
+    for marker, _ in _jpeg_segments(file):
+        if _is_frame(marker):
+            frame = file.read(6)
+            height, width = (int.from_bytes(frame[place : place + 2], "big") for place in (1, 3))
+            return ((height, width, frame[5]), 1) if len(frame) == 6 else None
     return None
 
 
-def is_display_encoded(path: Path) -> bool:
-    """Return whether the file says that its values are display-encoded: JPEG, or PNG with a chunk sRGB or gAMA.
+def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
+    """Yield marker and length of the segments up to a JPEG's frame, with the file at each one's content."""
+    start, marker = 2, 0
+    for _ in range(_MOST_PARTS):
+        file.seek(start)
+        header = file.read(4)
+        if len(header) < 4 or header[0] != 0xFF or _is_frame(marker):
+            return
+        if header[1] == 0xFF:  # fill
+            start += 1
+            continue
+        marker, length = header[1], int.from_bytes(header[2:], "big")
+        yield marker, length - 2
+        start += 2 + length
+
+
+def _is_frame(marker: int) -> bool:
+    return 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
+
+
+@dataclass(frozen=True)
+class StatedCurve:
+    """What a file says of its transfer curve.
+
+    Args:
+        curve: see TransferCurve; linear where the file says nothing.
+        by: what says so, for people; empty for nothing.
+        unread: whether there is a colour profile whose curve cannot be read.
+    """
+
+    curve: TransferCurve = 1.0
+    by: str = ""
+    unread: bool = False
+
+
+def stated_curve(path: Path) -> StatedCurve:
+    """Return the curve that a file states: that of a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
 
     Raises:
         InputError: the file cannot be read.
@@ -78,29 +112,77 @@ def is_display_encoded(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             start = file.read(len(PNG))
-            if start.startswith(JPEG):
-                return True
-            for kind, content in _png_chunks(file) if start == PNG else ():
-                if kind == b"sRGB":
-                    return True
-                if kind == b"gAMA":
-                    # 100000 times the exponent of the encoding: 1 means linear.
-                    return int.from_bytes(content[:4], "big") != 100_000
+            if is_raw(path):
+                return StatedCurve()
+            if start.startswith(TIFF):
+                stated, profile = StatedCurve(), _tiff_profile(path)
+            elif start.startswith(JPEG):
+                stated, profile = StatedCurve(SRGB, "JPEG"), _jpeg_profile(file)
+            else:
+                stated, profile = _stated_by_chunks(file) if start == PNG else (StatedCurve(), None)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    return False
+    if profile is None:
+        return stated
+    found = profile_curve(profile)
+    if found is None:
+        return StatedCurve(stated.curve, stated.by, unread=True)
+    name, curve = found
+    return StatedCurve(curve, f'colour profile "{name}"')
+
+
+def _stated_by_chunks(file: BinaryIO) -> tuple[StatedCurve, bytes | None]:
+    """Return what a PNG's chunks sRGB and gAMA say, and its profile; b"" for a damaged one."""
+    stated, profile = StatedCurve(), None
+    for kind, content in _png_chunks(file):
+        # 100000 times the exponent of the encoding: 1 means linear.
+        if kind == b"sRGB" or (kind == b"gAMA" and int.from_bytes(content[:4], "big") != 100_000):
+            stated = StatedCurve(SRGB, "PNG that says so")
+        if kind == b"iCCP":
+            _, _, compressed = content.partition(b"\0")
+            try:
+                profile = zlib.decompressobj().decompress(compressed[1:], LARGEST_PROFILE)
+            except zlib.error:
+                profile = b""
+    return stated, profile
+
+
+def _jpeg_profile(file: BinaryIO) -> bytes | None:
+    """Return the profile from a JPEG's segments; b"" for one that is too long, None without one."""
+    parts: dict[int, bytes] = {}
+    for marker, length in _jpeg_segments(file):
+        if marker == 0xE2 and length > 14 and file.read(12) == b"ICC_PROFILE\0":
+            number = file.read(2)[0]
+            parts[number] = file.read(length - 14)
+            if sum(map(len, parts.values())) > LARGEST_PROFILE:
+                return b""
+    return b"".join(parts[number] for number in sorted(parts)) if parts else None
+
+
+def _tiff_profile(path: Path) -> bytes | None:
+    try:
+        with first_page(path) as page:
+            tag = page.tags.get(_PROFILE)
+            if tag is None:
+                return None
+            return bytes(tag.value) if tag.count <= LARGEST_PROFILE else b""
+    except InputError:  # decoding names the damage
+        return None
 
 
 def stated_white_level(path: Path) -> int | None:
     """Return the white level that a 16-bit image states, 2^bits - 1 where it states bits; None without one.
 
-    It comes from a PNG's chunk sBIT, or from a TIFF's BitsPerSample, WhiteLevel (DNG) or MaxSampleValue. The last one
-    may also be the largest value of an image, so it counts only if it is 2^bits - 1.
+    It is in the unit of the decoded values: full scale for a RAW file, whatever its tags say. Otherwise it comes from a
+    PNG's chunk sBIT, or from a TIFF's BitsPerSample, WhiteLevel (DNG) or MaxSampleValue. The last one may also be the
+    largest value of an image, so it counts only if it is 2^bits - 1.
 
     Raises:
         InputError: the file cannot be read.
     """
     try:
+        if is_raw(path):
+            return _RAW_WHITE
         with path.open("rb") as file:
             start = file.read(len(PNG))
             if start == PNG:
@@ -116,8 +198,8 @@ def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
         if len(header := file.read(8)) < 8 or header[4:] in (b"IDAT", b"IEND"):
             return
         length = int.from_bytes(header[:4], "big")
-        # Those of interest are short; others, such as profiles, may be long.
-        content = file.read(min(length, 16))
+        # Those of interest are short, except profiles.
+        content = file.read(min(length, LARGEST_PROFILE if header[4:] == b"iCCP" else 16))
         file.seek(length - len(content) + 4, 1)
         yield header[4:], content
 

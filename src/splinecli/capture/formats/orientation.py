@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from splinecli.capture.formats.raw import RAW_SUFFIXES
+from splinecli.capture.formats.raw import is_raw
 from splinecli.errors import InputError
 
 UPRIGHT = 1
@@ -23,7 +23,7 @@ def common_orientation(images: Sequence[Path]) -> int:
     Raises:
         InputError: two images state different orientations, so that their pixels do not fit on each other.
     """
-    stated = [(path, _orientation(path)) for path in images if path.suffix.lower() not in RAW_SUFFIXES]
+    stated = [(path, _orientation(path)) for path in images if not is_raw(path)]
     if not stated:
         return UPRIGHT
     first, orientation = stated[0]

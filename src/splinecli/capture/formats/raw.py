@@ -22,7 +22,11 @@ RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
     ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
 )  # fmt: skip
-"""RAW files are recognised by name, because the content of many looks like TIFF."""
+
+
+def is_raw(path: Path) -> bool:
+    """Return whether a file counts as RAW: by its name, because the content of many looks like TIFF."""
+    return path.suffix.lower() in RAW_SUFFIXES
 
 
 Quiet = Callable[[], AbstractContextManager[object]]

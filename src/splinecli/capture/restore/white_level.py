@@ -102,12 +102,14 @@ class Saturation:
         images: what is known of each of the F images.
         given: the white level that the user gave; None to find it.
         rows: the pixels whose observations are wanted; None for all. The level is decided from all pixels.
+        even: whether the images show an even target, of which one image may be clipped, and all of it.
     """
 
     n_pixels: int
     images: tuple[_ImageValues, ...]
     given: float | None = None
     rows: NDArray[np.integer] | None = None
+    even: bool = False
 
     @property
     def white_level(self) -> WhiteLevel | None:
@@ -178,20 +180,22 @@ class Saturation:
     def _is_clipped(self, maximum: int) -> bool:
         """Return whether 16-bit images look clipped at their common maximum."""
         images = [image for image in self.images if image.maximum == maximum]
-        fewest = max(FEWEST_PIXELS, SMALLEST_SHARE * self.n_pixels)
-        reaching = [image.at_maximum for image in images if len(image.at_maximum) >= fewest]
-        if len(reaching) < (FEWEST_IMAGES_AT_BITS if _is_bits(maximum) else FEWEST_IMAGES):
+        fewest_pixels = max(FEWEST_PIXELS, SMALLEST_SHARE * self.n_pixels)
+        reaching = [image.at_maximum for image in images if len(image.at_maximum) >= fewest_pixels]
+        even_at_bits = self.even and _is_bits(maximum)
+        fewest = 1 if even_at_bits else FEWEST_IMAGES_AT_BITS if _is_bits(maximum) else FEWEST_IMAGES
+        if len(reaching) < fewest:
             return False
         # A flat background has one value under all lights. Clipped pixels are bright under some lights only.
         images_at_maximum = np.bincount(np.concatenate(reaching), minlength=self.n_pixels)
-        number = int(images_at_maximum[images_at_maximum < len(reaching)].sum())
+        number = int(images_at_maximum[images_at_maximum < max(len(reaching), 2)].sum())
         # Each image has its largest values, so the largest of all are among them, with all of their counts.
         below, places = np.unique(np.concatenate([image.below for image in images]), return_inverse=True)
-        if len(below) < COMPARED_VALUES:
+        if len(below) < COMPARED_VALUES and not even_at_bits:
             return False
         counts = np.zeros(len(below), np.int64)
         np.add.at(counts, places, np.concatenate([image.counts for image in images]))
-        return number >= SPIKE * int(counts[-COMPARED_VALUES:].max())
+        return number >= SPIKE * int(counts[-COMPARED_VALUES:].max(initial=0))
 
 
 class SaturationFinder:
@@ -201,11 +205,14 @@ class SaturationFinder:
         n_pixels: P, the number of the mask's pixels.
         n_images: F.
         given: the white level that the user gave; None to find it.
+        even: see Saturation.
     """
 
-    def __init__(self, n_pixels: int, n_images: int, *, given: float | None = None) -> None:
+    def __init__(
+        self, n_pixels: int, n_images: int, *, given: float | None = None, even: bool = False
+    ) -> None:
         self.shape = n_pixels, n_images
-        self.given = given
+        self.given, self.even = given, even
         self._images = [_NOT_ADDED] * n_images
 
     def add(self, position: int, pixels: NDArray[Any], path: Path, *, stated: int | None = None) -> None:
@@ -242,7 +249,7 @@ class SaturationFinder:
     def finish(self) -> Saturation:
         """Return the white level and the saturated observations. Images that were not added have none."""
         n_pixels, _ = self.shape
-        return Saturation(n_pixels, tuple(self._images), self.given)
+        return Saturation(n_pixels, tuple(self._images), self.given, even=self.even)
 
 
 def _indices(flags: NDArray[np.bool_]) -> NDArray[np.integer]:

@@ -95,7 +95,7 @@ GROUND_TRUTH = Option(
 TRANSFER = Option(
     "auto",
     metavar="CURVE",
-    help="Transfer curve of the images: auto, linear, srgb or gamma:G. auto reads JPEG, and PNG that says so, as sRGB.",
+    help="Transfer curve of the images: auto, linear, srgb or gamma:G. auto reads files as they say; JPEG as sRGB.",
     autocompletion=complete_curves,
 )
 AMBIENT = Option(
@@ -175,6 +175,12 @@ BALL_DIAMETER = Option(
     None,
     metavar="D",
     help="Diameter of each ball in any unit, such as millimeters: the unit of the lamps' positions. [default: pixels]",
+)
+BALL_CAMERA_MATRIX = Option(
+    None,
+    "--camera-matrix",
+    metavar="FILE",
+    help="Text file of the 3 x 3 camera matrix in pixels. [default: focal length from EXIF, or a distant camera]",
 )
 GRAY_BALL = Option(None, metavar="DIR", help="Images of a matte gray ball under the same lights.")
 GRAY_CARD = Option(None, metavar="DIR", help="Images of a matte gray card that faces the camera.")

@@ -1,0 +1,112 @@
+"""The camera of a calibration: its matrix, where it is known from, and how uncertain it is."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.decoding import stored_size
+from splinecli.capture.lights.lamp_files import read_camera_matrix
+from splinecli.normals import unit
+from splinecli.surface.camera import ray_basis
+
+Floats = NDArray[np.float64]
+
+DISTANT = 1e6
+"""Focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel."""
+
+SHORTEST_LENS = 0.7
+"""Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
+
+EXIF_ERROR = 0.05
+"""Standard deviation of a focal length in EXIF, as a share: numbers are rounded, and focusing changes it."""
+
+_EXIF, _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x8769, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
+_MILLIMETRES = {2: 25.4, 3: 10.0}
+_FILM_DIAGONAL = math.hypot(36, 24)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The camera of a calibration.
+
+    Args:
+        matrix: (3, 3) in pixels.
+        source: "--camera-matrix", "EXIF" or "assumed distant".
+        shortest: the focal length of the shortest usual lens, in pixels.
+    """
+
+    matrix: Floats
+    source: str
+    shortest: float
+
+    @property
+    def known(self) -> bool:
+        return self.source != "assumed distant"
+
+    def draw(self, generator: np.random.Generator) -> Floats:
+        """Return a matrix (3, 3) that may be the true one."""
+        factor = 1.0
+        if not self.known:
+            # All rays of sight from parallel to those of the shortest lens, evenly.
+            nearest = self.shortest / float(self.matrix[0, 0])
+            factor = nearest / generator.uniform(nearest, 1)
+        elif self.source == "EXIF":
+            factor = math.exp(EXIF_ERROR * generator.normal())
+        matrix = self.matrix.copy()
+        matrix[:2, :2] *= factor
+        return matrix
+
+    def rays(self, points: Floats) -> Floats:
+        """Return the unit vectors (N, 3) from the camera through image points (N, 2)."""
+        return unit_rays(points, self.matrix)
+
+
+def unit_rays(points: Floats, matrix: Floats) -> Floats:
+    """Return the unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""
+    return unit(np.column_stack((points, np.ones(len(points)))) @ ray_basis(matrix))
+
+
+def find_view(image: Path, matrix: Path | None) -> View:
+    """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
+
+    Raises:
+        InputError: the file or the image cannot be read, or the file has no camera matrix.
+    """
+    height, width = stored_size(image)[0][:2]
+    shortest = SHORTEST_LENS * max(width, height)
+    if matrix is not None:
+        given = read_camera_matrix(matrix)
+        ray_basis(given)  # refuses other numbers
+        return View(given, "--camera-matrix", shortest)
+    focal = _exif_focal_length(image, width, height)
+    middle = (width - 1) / 2, (height - 1) / 2
+    source = "assumed distant" if focal is None else "EXIF"
+    focal = focal or DISTANT
+    return View(np.array(((focal, 0, middle[0]), (0, focal, middle[1]), (0, 0, 1.0))), source, shortest)
+
+
+def _exif_focal_length(image: Path, width: int, height: int) -> float | None:
+    """Return the focal length in pixels from EXIF tags; None where they do not tell it."""
+    from PIL import Image
+
+    with warnings.catch_warnings():  # Pillow warns of tags that it does not expect
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(image) as file:
+                tags = Image.Image.getexif(file).get_ifd(_EXIF)
+            if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
+                pixels = (
+                    float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
+                )
+                pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
+            else:
+                pixels = float(tags[_FILM]) / _FILM_DIAGONAL * math.hypot(width, height)
+        except Exception:  # damaged tags cause a dozen types of errors
+            return None
+    return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None
