@@ -132,8 +132,10 @@ def disturb_lights(lights: Floats, rng: np.random.Generator) -> Floats:
 
 def bend_values(values: Floats, rng: np.random.Generator) -> Floats:
     """Return linear values, about 0 to 1, as a wrong curve gives them: encoded, or decoded a second time."""
+    if rng.random() < 0.5:
+        values = values / np.quantile(values, 0.999)  # well exposed
     values = values.clip(0, 1)
-    if rng.random() < 0.4:
+    if rng.random() < 0.5:
         return encode_srgb(values) / 255
     gamma = rng.uniform(1.5, 2.6) if rng.random() < 0.5 else rng.uniform(1.05, 2.4)
     return values ** (1 / gamma if rng.random() < 0.65 else gamma)

@@ -33,10 +33,13 @@ from splinecli.networks.weights import HEAD_FORMAT, SHIPPED, manifest, serialise
 Floats = NDArray[np.floating]
 
 PIXELS, STEPS = 80, 500
-FEATURE_NOISE = 0.3
+HEADS, HIDDEN = 4, 6
+"""The mean of so many heads, of so many hidden units each, is one head of all their units."""
+
+FEATURE_NOISE = 0.2
 """Standard deviation of the noise on the features of captures in the fit, in their spread. It keeps the fit smooth."""
 
-RIGHT_WEIGHT = 3.0
+RIGHT_WEIGHT = 2.0
 """Weight of right captures in the fit. Most captures are right."""
 
 
@@ -79,10 +82,25 @@ def read_examples(folder: Path) -> Iterator[Example]:
 
 
 def fit_head(examples: Sequence[Example]) -> CaptureHead:
+    """Fit some heads, and return their mean."""
+    heads = [fit_one(examples, seed) for seed in range(HEADS)]
+    mean = CaptureHead(HEADS * HIDDEN).requires_grad_(False)
+    for name, target in mean.state_dict().items():
+        values = [head.state_dict()[name] for head in heads]
+        if name == "last.weight":
+            target.copy_(torch.cat(values, dim=1) / HEADS)
+        elif name.startswith("hidden."):
+            target.copy_(torch.cat(values))
+        else:
+            target.copy_(torch.stack(values).mean(dim=0))
+    return mean
+
+
+def fit_one(examples: Sequence[Example], seed: int) -> CaptureHead:
     """Fit by maximum likelihood of the errors, and of being within CONFIDENT_DEG."""
-    generator = torch.Generator().manual_seed(0)
-    torch.manual_seed(0)
-    head = CaptureHead()
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    head = CaptureHead(HIDDEN)
     number = torch.cat([torch.full((len(e.errors),), place) for place, e in enumerate(examples)])
     errors, pixels, errors_deg = (
         torch.cat([getattr(e, name) for e in examples]) for name in ("errors", "pixels", "errors_deg")

@@ -52,9 +52,10 @@ class CaptureFeatures:
     nearness: of lamps as near as the images look: the width of the object over their distance.
     near_share: the share of the residual that it explains.
     near_turn: log of the median angle in degrees by which it turns the normals.
-    bend, bend_share, bend_turn: the same for an exponent of the values; `bend` is its logarithm.
+    bend, bend_share, bend_turn: the same for an exponent of the values; `bend` is its logarithm, and only exponents
+        below 1 turn normals, as encoded values have: gloss looks like others.
     curl: log of the curl of the normals over their derivatives.
-    rim: cosine between normals and the outward direction at a steep outline.
+    rim: |cosine| between normals and the outward direction at a steep outline, which is 1 for a ball and for a bowl.
     lights: log of their number. spread: how well they determine a normal.
     difference: log of the median angle in degrees between the estimated normals and those that fit best.
     expected: mean logarithm of the expected errors.
@@ -153,14 +154,17 @@ def capture_features(
     best = unit(scaled)
     difference = angle_between_deg(own, best)
 
-    def explain(terms: Doubles) -> tuple[float, float, float]:
-        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its turn."""
+    def explain(terms: Doubles, sign: int) -> tuple[float, float, float]:
+        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its turn.
+
+        An amount of the other sign is no such fault, and turns nothing.
+        """
         scaled_terms = fit_scaled_normals(terms, weights, lights)
         terms = terms - scaled_terms @ lights.T
         power = (weights * terms**2).sum()
         amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-_MOST, _MOST))
         share = amount**2 * power / max((weights * residuals**2).sum(), 1e-12)
-        turn = angle_between_deg(best, unit(scaled - amount * scaled_terms))
+        turn = angle_between_deg(best, unit(scaled - sign * max(sign * amount, 0.0) * scaled_terms))
         return amount, float(share), _log_median(turn, _LEAST_DEG)
 
     places = PixelPlaces(mask)
@@ -170,8 +174,8 @@ def capture_features(
     )
     at = scale.places(row, column)
     # To first order in width over distance, observations under near lamps are n.l (1 + 3 l.x) - n.x.
-    near = explain(3 * fitted * (at @ lights[:, :2].T) - (scaled[:, :2] * at).sum(axis=1, keepdims=True))
-    bend = explain(values * np.log(values.clip(min=0.01)))
+    near = explain(3 * fitted * (at @ lights[:, :2].T) - (scaled[:, :2] * at).sum(axis=1, keepdims=True), 1)
+    bend = explain(values * np.log(values.clip(min=0.01)), -1)
     rank, known, free, decoding = _of_factors(values, lights)
     curl, rim = _of_shape(mask, places, normals)
     features = CaptureFeatures(
@@ -255,4 +259,4 @@ def _of_shape(mask: NDArray[np.bool_], places: PixelPlaces, normals: Floats) -> 
         for total, column in zip(sums, normals[rows].T, strict=True):
             total += np.bincount(number, column, len(total))
     smooth = smooth_normals(sums.T, blocks.mask)
-    return float(np.log(smooth.curl() + 0.01)), smooth.rim()
+    return float(np.log(smooth.curl() + 0.01)), abs(smooth.rim())

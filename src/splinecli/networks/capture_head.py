@@ -8,7 +8,7 @@ from torch import Tensor, nn
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20
 """Numbers of features of methods/capture_features.py."""
 
-_HIDDEN = 6
+_HIDDEN = 24
 _MOST = 4.0  # standard deviations of a feature from its mean
 _INPUTS = 2 + PIXEL_FEATURES + CAPTURE_FEATURES
 _NO_ERROR = -3.5  # logarithm of the median error, in radians, that is added before training
@@ -24,12 +24,12 @@ class CaptureHead(nn.Module):
     mean: Tensor
     spread: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, hidden: int = _HIDDEN) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(_INPUTS))
         self.register_buffer("spread", torch.ones(_INPUTS))
-        self.hidden = nn.Linear(_INPUTS, _HIDDEN)
-        self.last = nn.Linear(_HIDDEN, 3)
+        self.hidden = nn.Linear(_INPUTS, hidden)
+        self.last = nn.Linear(hidden, 3)
         self.linear = nn.Linear(_INPUTS, 3)
         for layer in (self.last, self.linear):
             nn.init.zeros_(layer.weight)
