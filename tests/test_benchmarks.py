@@ -68,6 +68,16 @@ def test_photographs(run: Run) -> None:
     assert len(numbers(intensities.splitlines()[1])) == 7
 
 
+def test_faulty_captures(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "24")
+    assert int(printed.split()[0]) > 5
+    rows = run("fit_capture_confidence", str(tmp_path)).splitlines()
+    assert rows[0].startswith("| capture | number | claimed before")
+    assert "right" in rows[2] + rows[-1] + rows[-2]
+    assert all(len(numbers(row)) == 8 for row in rows[2:])
+
+
 def test_render_accuracy(run: Run) -> None:
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
     pytest.importorskip("embreex", reason="needs the extra 'render'")

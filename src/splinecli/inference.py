@@ -21,6 +21,7 @@ from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.memory import return_freed_memory
 from splinecli.methods import Estimator
+from splinecli.methods.capture_confidence import correct_errors
 from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
 from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
 from splinecli.methods.lamp_light import LampLight, Rows, parts_of_rows
@@ -42,6 +43,7 @@ class NormalEstimate:
     errors: summary of error_map_deg, or None.
     confidence_map: (H, W) float32, the probability that the normal is off by at most CONFIDENT_DEG; zero outside the
         mask. None if the method has no confidence.
+    capture_judged: whether the confidence also says how well the whole capture fits its lights and its values.
     """
 
     capture: Capture
@@ -50,6 +52,7 @@ class NormalEstimate:
     error_map_deg: NDArray[np.float32] | None = None
     errors: AngularErrors | None = None
     confidence_map: NDArray[np.float32] | None = None
+    capture_judged: bool = False
 
     @property
     def expected_under_5(self) -> float | None:
@@ -82,7 +85,7 @@ def estimate_normals(
     """
     started = time.perf_counter()
     capture = find_surface(capture)
-    normals, errors = _estimate(capture, estimator, tile_pixels, progress, stage)
+    normals, errors, judged = _estimate(capture, estimator, tile_pixels, progress, stage)
     return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
@@ -95,10 +98,12 @@ def estimate_normals(
     normal_map[capture.mask] = normals
     del normals
     if capture.ground_truth is None:
-        return NormalEstimate(capture, normal_map, seconds, confidence_map=confidence_map)
+        return NormalEstimate(
+            capture, normal_map, seconds, confidence_map=confidence_map, capture_judged=judged
+        )
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
     return NormalEstimate(
-        capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map
+        capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map, judged
     )
 
 
@@ -108,8 +113,11 @@ def _estimate(
     tile_pixels: int | None,
     progress: Progress | None,
     stage: Stage | None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return the normals (P, 3) and, from a method with confidence, the distributions (P, 2) of their errors."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
+    """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether they judge the whole capture.
+
+    Methods without confidence have no distributions.
+    """
     if tile_pixels is None:
         tile_pixels = int(getattr(estimator, "tile_pixels", TILE_PIXELS))
     normals = np.empty((capture.n_pixels, 3), np.float32)
@@ -141,7 +149,8 @@ def _estimate(
                     advance(len(rows))
         with begin("refining") as advance:
             refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
-    return normals, errors
+    judged = errors is not None and correct_errors(capture, estimator, light_of, normals, errors)
+    return normals, errors, judged
 
 
 def _light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:

@@ -34,6 +34,7 @@ REPORT: dict[str, Any] = {
     "peak_memory_mib": 86,
     "warnings": [],
     "expected_under_5": 0.8123,
+    "capture_judged": True,
     "angular_error_deg": {"mean": 9.063, "median": 6.24, "p90": 18.1, "under_5": 0.3725, "under_10": 0.75},
     "version": "0.1.0",
 }

@@ -230,6 +230,7 @@ def _summary(report: dict[str, Any], output: Path) -> str:
     if errors is not None:
         scored = f", MAE {errors['mean']:.2f} deg (median {errors['median']:.2f})"
     elif expected is not None:
-        scored = f", {expected:.0%} of them likely within 5 deg"
+        condition = "" if report["capture_judged"] else " if the lights and the images are right"
+        scored = f", {expected:.0%} of them likely within 5 deg{condition}"
     counts = f"{report['n_pixels']} pixels, {report['n_lights']} lights"
     return f"{output / report['capture']}: {counts}, {report['method']}{scored}, {report['seconds']['total']:.1f} s"

@@ -54,7 +54,7 @@ _LEAST_Z = 0.15  # of a block's normal, for its area
 _LEAST_LEFT = 0.02  # of an observation; what is gathered is never exact
 
 
-class _PixelPlaces:
+class PixelPlaces:
     """Rows and columns of the pixels of a mask. Two bytes a pixel, as captures may have many."""
 
     def __init__(self, mask: NDArray[np.bool_]) -> None:
@@ -81,7 +81,7 @@ class IndirectLight:
     blocks: Blocks
     arriving: Floats
     albedo: NDArray[np.floating]
-    pixels: _PixelPlaces
+    pixels: PixelPlaces
 
     def at(self, rows: Rows) -> Floats:
         """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
@@ -111,7 +111,7 @@ def find_indirect_light(
         light_of: gives the observations of some pixels without the falloff of near lamps, and the light directions.
         normals: (P, 3) unit, in the capture's frame.
     """
-    pixels = _PixelPlaces(mask)
+    pixels = PixelPlaces(mask)
     albedo = np.empty(len(normals), np.float32)
     for rows in parts_of_rows(len(normals)):
         albedo[rows] = _albedo(light_of(rows), normals[rows])

@@ -12,14 +12,16 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
 from splinecli.errors import ModelError
 from splinecli.files import file_sha256, is_special, parse_json, write_bytes
+from splinecli.networks.capture_head import CaptureHead
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 
 FORMAT = "splinecli-weights-1"
+HEAD_FORMAT = "splinecli-capture-head-1"
 LONGEST = 500_000_000
 """Bytes of the longest file of tensors that is read; a checkpoint of the paper's networks has 170 MB."""
 
@@ -135,7 +137,7 @@ def read_json_entry(metadata: dict[str, str], key: str, path: Path) -> dict[str,
     return values
 
 
-def load_strictly(network: SplineNet, tensors: dict[str, Tensor], path: Path) -> None:
+def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     """Load the tensors into the network. Raises ModelError for a missing, unknown or misshapen tensor."""
     try:
         network.load_state_dict(tensors, strict=True)
@@ -178,7 +180,8 @@ def shipped_names() -> list[str]:
 def manifest() -> dict[str, dict[str, Any]]:
     """Return what assets/weights.json says of the shipped weights, by name.
 
-    Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most lights in training.
+    Each entry has `file`, `sha256`, `method`, `description`, and `lights`, the fewest and most lights in training. Some
+    have `capture_head`, the `file` and `sha256` of what corrects the confidence of these weights by the whole capture.
     """
     entries: dict[str, dict[str, Any]] = json.loads((SHIPPED / "weights.json").read_text("utf-8"))
     return entries
@@ -213,10 +216,25 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
             )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:
-        loaded = load_weights(path, name=name_or_file)
-    if loaded.sha256 != entry["sha256"]:
+        _check_shipped(path, entry["sha256"], name_or_file)
+        return load_weights(path, name=name_or_file)
+
+
+def capture_head(sha256: str) -> CaptureHead | None:
+    """Load what corrects the confidence of weights with this checksum, or None. Raises ModelError."""
+    for entry in manifest().values():
+        if entry["sha256"] == sha256 and "capture_head" in entry:
+            with resources.as_file(SHIPPED / entry["capture_head"]["file"]) as path:
+                _check_shipped(path, entry["capture_head"]["sha256"], path.stem)
+                head = CaptureHead()
+                load_strictly(head, read_tensors(path, HEAD_FORMAT, "Reinstall splinecli")[0], path)
+                return head
+    return None
+
+
+def _check_shipped(path: Path, sha256: str, name: str) -> None:
+    if file_sha256(path) != sha256:
         raise ModelError(
-            f"the shipped weights {name_or_file!r} were changed: their SHA-256 does not match weights.json",
+            f"the shipped weights {name!r} were changed: their SHA-256 does not match weights.json",
             hint="Reinstall splinecli",
         )
-    return loaded

@@ -151,13 +151,14 @@ def _reduce(
 def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> list[tuple[str, str]]:
     """Return terms and values; `reduced` is the width and height of the page's maps if they were reduced."""
     weights, expected = report["weights"], report["expected_under_5"]
+    condition = "" if report["capture_judged"] else ", if the lights and the images are right"
     return [
         ("Method", report["method"]),
         *([] if weights is None else [("Weights", weights["name"])]),
         ("Lights", str(report["n_lights"])),
         ("Pixels", f"{report['n_pixels']:,}"),
         ("Size", _TIMES.join(map(str, report["image_size"]))),
-        *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels")]),
+        *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
         *([] if reduced is None else [("Size on this page", _TIMES.join(map(str, reduced)))]),
         ("Seconds", ", ".join(_seconds(report["seconds"]))),
         ("Device", f"{report['device']}, {report['precision']}"),

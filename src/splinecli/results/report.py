@@ -65,6 +65,7 @@ def report_of(
         if errors is None
         else {name: round(value, 4) for name, value in asdict(errors).items()},
         "expected_under_5": None if expected is None else round(expected, 4),
+        "capture_judged": None if expected is None else estimate.capture_judged,
         "options": options,
         "inputs_sha256": inputs,
         "version": __version__,

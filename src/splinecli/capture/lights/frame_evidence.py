@@ -88,12 +88,17 @@ def rough_normals(
     Args:
         observations: (P, F). light_directions: (F, 3). mask: (H, W) with P pixels.
     """
-    from scipy.ndimage import gaussian_filter
-
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    return smooth_normals(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask)
+
+
+def smooth_normals(vectors: NDArray[np.floating], mask: NDArray[np.bool_]) -> RoughNormals:
+    """Return smoothed normals in the directions of vectors (P, 3), at the pixels of a mask (H, W)."""
+    from scipy.ndimage import gaussian_filter
+
     normals = np.zeros((*mask.shape, 3))
-    normals[mask] = unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
+    normals[mask] = unit(vectors)
     smooth = np.stack([gaussian_filter(normals[..., axis], SMOOTHING) for axis in range(3)], axis=2)
     smooth = np.where(mask[..., None], unit(smooth), 0.0)
     return RoughNormals(smooth, mask, _outward(mask))

@@ -1,0 +1,262 @@
+"""What the images of a capture, all together, say against its lights, its values, and the normals that were found.
+
+A pixel cannot tell wrong lights or values from an unusual reflectance. Many pixels can: errors of calibration follow
+the lights, the place in the image, or the brightness in the same way everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.image_checks import decoding_ratio
+from splinecli.capture.lights.frame_evidence import smooth_normals
+from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
+from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
+from splinecli.methods.indirect_light import PixelPlaces
+from splinecli.methods.lamp_light import LightOf, parts_of_rows
+from splinecli.normals import angle_between_deg, unit
+from splinecli.surface.blocks import Blocks
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Places = NDArray[np.integer]
+
+FEWEST_LIGHTS = 5
+"""With fewer, a fit leaves too little to judge a capture by."""
+
+FEWEST_PIXELS = 50
+
+_SAMPLE = 1500  # pixels
+_FACTOR_SAMPLE = 1000
+_BLOCKS = 2500  # over which normals are averaged for their curl
+_BRIGHT_QUANTILE = 0.95
+_DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
+_FITS = 4
+_MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
+_GRAZING = 0.05  # cosine of the light, below which a prediction is too uncertain
+_LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
+
+
+@dataclass(frozen=True)
+class CaptureFeatures:
+    """Numbers that describe how well a capture fits what is assumed. NaN is unknown.
+
+    misfit, free_misfit: log of the median over pixels of what a matte surface leaves of the images, with the estimated
+        normals and with those that fit best, as a share of the brightness.
+    rank_residual: log of what three free images, the best for this capture, leave of all.
+    light_misfit, free_light_misfit: log of how far the lights are from those three; with any intensities.
+    decoding: log of what decoding the values once more leaves of the misfit.
+    nearness: of lamps as near as the images look: the width of the object over their distance.
+    near_share: the share of the residual that it explains.
+    near_turn: log of the median angle in degrees by which it turns the normals.
+    bend, bend_share, bend_turn: the same for an exponent of the values; `bend` is its logarithm, and only exponents
+        below 1 turn normals, as encoded values have: gloss looks like others.
+    curl: log of the curl of the normals over their derivatives.
+    rim: |cosine| between normals and the outward direction at a steep outline, which is 1 for a ball and for a bowl.
+    lights: log of their number. spread: how well they determine a normal.
+    difference: log of the median angle in degrees between the estimated normals and those that fit best.
+    expected: mean logarithm of the expected errors.
+    shadow, dark: shares of shadowed observations and of dark pixels.
+    """
+
+    misfit: float
+    free_misfit: float
+    rank_residual: float
+    light_misfit: float
+    free_light_misfit: float
+    decoding: float
+    nearness: float
+    near_share: float
+    near_turn: float
+    bend: float
+    bend_share: float
+    bend_turn: float
+    curl: float
+    rim: float
+    lights: float
+    spread: float
+    difference: float
+    expected: float
+    shadow: float
+    dark: float
+
+
+@dataclass(frozen=True)
+class PixelScale:
+    """What relates pixels to their capture.
+
+    Args:
+        bright: brightness of a bright pixel.
+        middle: row and column of the middle of the object. width: of the object, in pixels.
+        turning: (3, 3, 2), the turn of a normal by near lamps, over the normal and the place.
+    """
+
+    bright: float
+    middle: tuple[float, float]
+    width: float
+    turning: Doubles
+
+    def features(self, brightness: Floats, normals: Floats, rows: Places, columns: Places) -> Doubles:
+        """Return for pixels (n, 2): log of their relative brightness, and of their turn by near lamps in degrees."""
+        places = self.places(rows, columns)
+        turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
+        turn -= np.einsum("pk,pk->p", turn, normals)[:, None] * normals
+        turn_deg = np.degrees(np.arctan(np.linalg.norm(turn, axis=1)))
+        return np.stack((np.log(brightness / self.bright + 1e-3), np.log(turn_deg + 0.3)), axis=1)
+
+    def places(self, rows: Places, columns: Places) -> Doubles:
+        """Return places (n, 2) from the middle of the object, x right and y up, in its widths."""
+        return np.stack((columns - self.middle[1], self.middle[0] - rows), axis=1) / self.width
+
+
+def capture_features(
+    mask: NDArray[np.bool_],
+    light_of: LightOf,
+    normals: NDArray[np.float32],
+    errors: NDArray[np.float32],
+    lights: Doubles,
+) -> tuple[CaptureFeatures, PixelScale] | None:
+    """Return the features of a capture, and what relates its pixels to it; None where too little can be told.
+
+    Args:
+        mask: (H, W), with P true pixels.
+        light_of: gives the observations and the light directions of some pixels.
+        normals, errors: (P, 3) and (P, 2), the estimate. See networks/error_head.py.
+        lights: (F, 3), unit; of near lamps, at the origin.
+    """
+    n_lights = len(lights)
+    if n_lights < FEWEST_LIGHTS:
+        return None
+    rows = np.arange(
+        0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2))
+    )
+    light = light_of(rows)
+    brightness = light.observations.mean(axis=1, dtype=np.float64)
+    bright = float(np.quantile(brightness, _BRIGHT_QUANTILE))
+    kept = brightness > _DARK_SHARE * bright
+    if np.count_nonzero(kept) < FEWEST_PIXELS:
+        return None
+    values = light.observations[kept].astype(np.float64)
+    values /= values.max(axis=1, keepdims=True)
+    own = light.in_frame_of_pixels(normals[rows])[kept].astype(np.float64)
+    if light.directions.ndim == 3:
+        values = _as_distant(values, light.directions[kept], lights)
+    lit = (values > LIT_SHARE).astype(np.float64)
+    shaded = (lit * values).sum(axis=1).clip(min=LIT_SHARE)
+
+    left = _residuals_under(own, values, lit, lights)
+    scaled, weights = fit_robustly(values, lit, lights, _FITS)
+    fitted = scaled @ lights.T
+    residuals = values - fitted
+    best = unit(scaled)
+    difference = angle_between_deg(own, best)
+
+    def explain(terms: Doubles, sign: int) -> tuple[float, float, float]:
+        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of its turn.
+
+        An amount of the other sign is no such fault, and turns nothing.
+        """
+        scaled_terms = fit_scaled_normals(terms, weights, lights)
+        terms = terms - scaled_terms @ lights.T
+        power = (weights * terms**2).sum()
+        amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-_MOST, _MOST))
+        share = amount**2 * power / max((weights * residuals**2).sum(), 1e-12)
+        turn = angle_between_deg(best, unit(scaled - sign * max(sign * amount, 0.0) * scaled_terms))
+        return amount, float(share), _log_median(turn, _LEAST_DEG)
+
+    places = PixelPlaces(mask)
+    row, column = places.places(rows[kept])
+    scale = PixelScale(
+        bright, (float(row.mean()), float(column.mean())), float(np.sqrt(len(normals))), np.zeros((3, 3, 2))
+    )
+    at = scale.places(row, column)
+    # To first order in width over distance, observations under near lamps are n.l (1 + 3 l.x) - n.x.
+    near = explain(3 * fitted * (at @ lights[:, :2].T) - (scaled[:, :2] * at).sum(axis=1, keepdims=True), 1)
+    bend = explain(values * np.log(values.clip(min=0.01)), -1)
+    rank, known, free, decoding = _of_factors(values, lights)
+    curl, rim = _of_shape(mask, places, normals)
+    features = CaptureFeatures(
+        misfit=_log_median((np.abs(left) * lit).sum(axis=1) / shaded),
+        free_misfit=_log_median((np.abs(residuals) * lit).sum(axis=1) / shaded),
+        rank_residual=rank,
+        light_misfit=known,
+        free_light_misfit=free,
+        decoding=decoding,
+        nearness=near[0],
+        near_share=near[1],
+        near_turn=near[2],
+        bend=bend[0],
+        bend_share=bend[1],
+        bend_turn=bend[2],
+        curl=curl,
+        rim=rim,
+        lights=float(np.log(n_lights)),
+        spread=float(np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(n_lights)),
+        difference=_log_median(difference, _LEAST_DEG),
+        expected=float(errors[rows[kept], 0].mean()),
+        shadow=float(1 - lit.mean()),
+        dark=float(1 - kept.mean()),
+    )
+    turning = max(near[0], 0.0) * _turning(lights)
+    return features, PixelScale(bright, scale.middle, scale.width, turning)
+
+
+def _log_median(values: Doubles, least: float = _LEAST_SHARE) -> float:
+    return float(np.log(np.median(values) + least))
+
+
+def _as_distant(values: Doubles, directions: Floats, lights: Doubles) -> Doubles:
+    """Return values (p, F) under directions (p, F, 3) as matte pixels would show them under lights (F, 3)."""
+    lit = (values > LIT_SHARE).astype(np.float64)
+    scaled = fit_scaled_normals(values, lit, directions.astype(np.float64))
+    values = (values + np.einsum("pfc,pc->pf", lights - directions, scaled)).clip(min=0)
+    return np.asarray(values / values.max(axis=1, keepdims=True).clip(min=1e-12))
+
+
+def _residuals_under(normals: Doubles, values: Doubles, lit: Doubles, lights: Doubles) -> Doubles:
+    """Return what matte pixels with these normals (p, 3) and any albedo leave of values (p, F)."""
+    cosines = (normals @ lights.T).clip(min=0)
+    seen = lit * (cosines > _GRAZING)
+    weights = seen
+    for _ in range(_FITS):
+        albedo = (weights * values * cosines).sum(axis=1) / (weights * cosines**2).sum(axis=1).clip(min=1e-6)
+        left = values - albedo[:, None] * cosines
+        weights = seen * absolute_weights(left)
+    return np.asarray(left)
+
+
+def _turning(lights: Doubles) -> Doubles:
+    """Return by how much lamps at a distance of one width change a normal (3,), over the normal (3,) and place (2,)."""
+    solve = np.linalg.pinv(lights)
+    turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
+    for axis in range(2):
+        turning[:, axis, axis] -= solve.sum(axis=1)
+    return np.asarray(turning)
+
+
+def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, float]:
+    """Return rank_residual, light_misfit, free_light_misfit and decoding; see CaptureFeatures."""
+    few = values[:: max(1, len(values) // max(_FACTOR_SAMPLE, (MIN_PIXELS_PER_LIGHT + 1) * len(lights)))]
+    factors = find_factors(few)
+    if factors is None:
+        return (np.nan,) * 4
+    ratio = decoding_ratio(few, factors, lights)
+    misfits = (each.misfits(lights[None])[0] for each in (factors, factors.with_free_intensities()))
+    known, free = (float(np.log(misfit + _LEAST_SHARE)) for misfit in misfits)
+    rank = float(np.log(factors.residual + _LEAST_SHARE))
+    return rank, known, free, np.nan if ratio is None else float(np.log(ratio))
+
+
+def _of_shape(mask: NDArray[np.bool_], places: PixelPlaces, normals: Floats) -> tuple[float, float]:
+    """Return curl and rim of the normals (P, 3), averaged over blocks; see CaptureFeatures."""
+    blocks = Blocks.over(mask, _BLOCKS)
+    sums = np.zeros((3, np.count_nonzero(blocks.mask)))
+    for rows in parts_of_rows(len(normals)):
+        number = blocks.numbers_at(*places.places(rows))
+        for total, column in zip(sums, normals[rows].T, strict=True):
+            total += np.bincount(number, column, len(total))
+    smooth = smooth_normals(sums.T, blocks.mask)
+    return float(np.log(smooth.curl() + 0.01)), abs(smooth.rim())
