@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.image_checks import decoding_ratio
 from splinecli.capture.lights.frame_evidence import smooth_normals
 from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
 from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
@@ -35,6 +34,7 @@ _BLOCKS = 2500  # over which normals are averaged for their curl
 _BRIGHT_QUANTILE = 0.95
 _DARK_SHARE = 0.1  # of the bright pixels' brightness; darker pixels say nothing of the capture
 _FITS = 4
+_DECODING = 2.2  # an exponent close to the curve of sRGB
 _MOST = 1.5  # width over distance, or change of the exponent; the terms hold to first order
 _GRAZING = 0.05  # cosine of the light, below which a prediction is too uncertain
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
@@ -243,11 +243,14 @@ def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, 
     factors = find_factors(few)
     if factors is None:
         return (np.nan,) * 4
-    ratio = decoding_ratio(few, factors, lights)
+    decoded = find_factors(np.maximum(few, 0) ** _DECODING)
     misfits = (each.misfits(lights[None])[0] for each in (factors, factors.with_free_intensities()))
     known, free = (float(np.log(misfit + _LEAST_SHARE)) for misfit in misfits)
     rank = float(np.log(factors.residual + _LEAST_SHARE))
-    return rank, known, free, np.nan if ratio is None else float(np.log(ratio))
+    if decoded is None:
+        return rank, known, free, np.nan
+    before, after = (np.hypot(each.misfits(lights[None])[0], each.residual) for each in (factors, decoded))
+    return rank, known, free, float(np.log(after / max(before, _LEAST_SHARE)))
 
 
 def _of_shape(mask: NDArray[np.bool_], places: PixelPlaces, normals: Floats) -> tuple[float, float]:
