@@ -57,6 +57,13 @@ class Window:
         self.of(whole)[...] = mask
         return whole
 
+    def filled(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the mask of whole images from a mask of what is read. A pixel stands for those left out beside it."""
+        whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
+        part = replace(self, step=1).of(whole)
+        part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
+        return whole
+
     def on(self, image: Path) -> Window:
         """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
         if self.is_whole:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from splinecli.capture.capture_warnings import CaptureWarning
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
+    from splinecli.publishing import NewFiles
 
 
 def infer_capture(
@@ -29,8 +30,8 @@ def infer_capture(
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
-    The results go to `options.output`/<capture name>/, where they replace earlier ones, all or none. Meanwhile no other
-    process may write there.
+    The results go to `options.output`/<capture name>/, where they replace earlier ones (see new_files). Meanwhile no
+    other process may write there.
 
     Args:
         folder: the capture.
@@ -45,11 +46,20 @@ def infer_capture(
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
     """
     from splinecli.capture import capture_name
-    from splinecli.publishing import held_folder
 
-    target = Path(options.output) / capture_name(folder)
-    with held_folder(target, observer.warn):
+    with held_results(capture_name(folder), options, observer) as target:
         return _infer_into(folder, target, options, observer, estimator)
+
+
+@contextmanager
+def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
+    """Hold the folder of results of a capture (see held_folder) and yield it. Raises OutputError."""
+    from splinecli.publishing import held_folder, refuse_link
+
+    target = Path(options.output) / name
+    refuse_link(target)
+    with held_folder(target, observer.warn):
+        yield target
 
 
 def _infer_into(
@@ -198,12 +208,12 @@ def _further_files(
     report: dict[str, Any],
     options: InferOptions,
     observer: Observer,
-) -> list[Callable[[Path], None]]:
-    """Compute what else the options ask for. Each function that is returned writes some files into a folder."""
+) -> list[Callable[[NewFiles], None]]:
+    """Compute what else the options ask for. Each function that is returned writes some files."""
     from splinecli.results import files
 
     capture = estimate.capture
-    writers: list[Callable[[Path], None]] = []
+    writers: list[Callable[[NewFiles], None]] = []
     albedo = colours = None
     if "albedo" in options.maps or options.html:
         from splinecli.pictures.maps import albedo_picture
@@ -219,7 +229,7 @@ def _further_files(
     if "preview" in options.maps:
         writers.append(partial(files.write_preview, estimate))
     if source.automatic_mask is not None:
-        writers.append(partial(files.write_mask, capture.mask))
+        writers.append(partial(files.write_mask, source.window.filled(capture.mask)))
     if options.surface:
         writers.append(_surface(estimate, colours, report, options, observer))
     if options.html:
@@ -233,11 +243,11 @@ def _surface(
     report: dict[str, Any],
     options: InferOptions,
     observer: Observer,
-) -> Callable[[Path], None]:
+) -> Callable[[NewFiles], None]:
     """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
     from splinecli.capture.window import parse_window
     from splinecli.pipeline.surface import make_surface, share_of_iterations
-    from splinecli.surface.surface_files import DEPTH_FORMATS, write_surface
+    from splinecli.surface.surface_files import DEPTH_FORMATS, encode_surface
 
     lamps = estimate.capture.lamps
     pixel_size = options.pixel_size
@@ -255,13 +265,17 @@ def _surface(
         )
     exr = ("exr",) if "exr" in options.formats else ()
     formats = (*options.mesh_formats, *DEPTH_FORMATS, *exr)
-    return partial(write_surface, surface=surface, formats=formats)
+
+    def write(new: NewFiles) -> None:
+        for name, content in encode_surface(surface, formats):
+            new.write(name, content)
+
+    return write
 
 
 def _page(
     estimate: NormalEstimate, albedo: NDArray[np.float32] | None, report: dict[str, Any]
-) -> Callable[[Path], None]:
-    from splinecli.files import write_text
+) -> Callable[[NewFiles], None]:
     from splinecli.results.files import PAGE
     from splinecli.results.page import result_page
 
@@ -273,4 +287,4 @@ def _page(
         confidence_map=estimate.confidence_map,
         error_map_deg=estimate.error_map_deg,
     )
-    return lambda folder: write_text(folder / PAGE, page)
+    return lambda new: new.write(PAGE, page)

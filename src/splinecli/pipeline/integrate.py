@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import InputError, UsageError
 from splinecli.exr import check_exr
-from splinecli.files import is_unfinished, read_json
+from splinecli.files import read_json
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
     STIFFNESS,
@@ -23,8 +23,8 @@ from splinecli.surface.surface_files import (
     DEFAULT_FORMATS,
     SURFACE_FILES,
     SURFACE_REPORT,
+    encode_surface,
     file_names,
-    write_surface,
 )
 
 if TYPE_CHECKING:
@@ -153,13 +153,12 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         **found,
         "seconds": round(time.perf_counter() - started, 3),
     }
-    with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as stage:
-        write_surface(stage, surface, options.formats)
+    with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as new:
+        for name, content in encode_surface(surface, options.formats):
+            new.write(name, content)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [
-            name for name in options.files if (stage / name).exists() or name == SURFACE_REPORT
-        ]
-        (stage / SURFACE_REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+        report["files"] = [*new.sizes, SURFACE_REPORT]
+        new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     return report
 
 
@@ -195,22 +194,18 @@ def _read_normal_map(options: IntegrateOptions) -> NDArray[np.float32]:
 
 
 def _find_normal_map(folder: Path) -> Path:
-    from splinecli.results.files import NORMALS
+    from splinecli.results.files import NORMALS, read_report
 
-    if is_unfinished(folder):
-        raise InputError(
-            "holds new files of an interrupted run, which are not all in their places",
-            path=folder,
-            hint="Run the same 'splinecli infer' again, which finishes this",
-        )
     names = [NORMALS[name] for name in INPUT_FORMATS]
-    for name in names:
-        if (folder / name).is_file():
-            return folder / name
+    try:
+        files = read_report(folder)["files"]
+        return folder / next(name for name in names if name in files)
+    except StopIteration:
+        problem = f"the folder has no normal map ({', '.join(names)})"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        problem = f"the folder has no whole results of infer: it {error}"
     raise InputError(
-        f"the folder has no normal map ({', '.join(names)})",
-        path=folder,
-        hint="Give a folder that 'splinecli infer' wrote",
+        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
     )
 
 
