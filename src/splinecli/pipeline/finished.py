@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import SplinecliError
+from splinecli.locks import RefusedFolderError
 from splinecli.pipeline.infer_options import InferOptions
 
 if TYPE_CHECKING:
@@ -33,8 +34,14 @@ class EarlierResults:
 
 
 def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierResults:
-    """Compare the results in `target` with the capture in `folder` and the options. Raises InputError."""
-    from splinecli.results.files import OWN_FILES, UnfinishedError, read_report
+    """Compare the results in `target` with the capture in `folder` and the options.
+
+    Raises:
+        InputError: the capture cannot be read.
+        RefusedFolderError: both are one folder, which may have files of the user with the names of results.
+    """
+    from splinecli.publishing import is_plain
+    from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
     from splinecli.results.index import Entry
 
     try:
@@ -43,8 +50,14 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
         version, stamp = report["version"], report["inputs_sha256"]
         Entry.of(report)  # raises if the report is not whole
     except UnfinishedError as error:
-        found = any((target / name).exists() for name in OWN_FILES)
-        return EarlierResults(unfinished=str(error) if found else "")
+        found = next((name for name in OWN_FILES if (target / name).exists()), None)
+        if found is not None and not is_plain(target / REPORT) and target.samefile(folder):
+            raise RefusedFolderError(
+                f"contains {found}, but no {REPORT}, and is the folder of the capture",
+                path=target,
+                hint="Add --overwrite, or choose another place with -o",
+            ) from None
+        return EarlierResults(unfinished="" if found is None else str(error))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         return EarlierResults(changed="contains results made by another version")
     if version != __version__:
