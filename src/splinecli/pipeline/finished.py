@@ -48,7 +48,8 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
         report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
         version, stamp = report["version"], report["inputs_sha256"]
-        Entry.of(report)  # raises if the report is not whole
+        if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
+            raise ValueError
     except UnfinishedError as error:
         found = next((name for name in OWN_FILES if (target / name).exists()), None)
         if found is not None and not is_plain(target / REPORT) and target.samefile(folder):
