@@ -6,22 +6,16 @@ import errno
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from splinecli.errors import OutputError
 
 UNFINISHED = ".splinecli-unfinished"
-"""The ending of hidden files and folders that are being written. What a killed process left is removed later."""
-
-DRAFT = f".new{UNFINISHED}"
-"""The hidden folder of new files while they are written; see publishing."""
-
-COMPLETE = ".new.splinecli-complete"
-"""A hidden folder of complete new files that are being moved to their places; see publishing."""
+"""The ending of hidden files that are being written. What a killed process left is removed later."""
 
 _MOST_JSON = 1 << 24  # bytes of a file
 _MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
@@ -33,10 +27,18 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that it appears complete or not at all.
+def create_hidden(folder: Path) -> IO[bytes]:
+    """Return a new hidden file of a random name in the folder, open for writing. Raises OSError."""
+    # Mode x neither opens what is there nor follows a link.
+    return (folder / f".{secrets.token_hex(8)}{UNFINISHED}").open("xb")
 
-    The content goes to a temporary file in the same folder, which is then renamed. Folders are made as needed.
+
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a new file that takes the place of `path` after the block, so that it appears complete or not at all.
+
+    It is written beside its place and renamed. The rename replaces a link, it does not follow it. Folders are made as
+    needed.
 
     Raises:
         OutputError: the file cannot be written.
@@ -47,11 +49,9 @@ def write_bytes(path: Path, content: bytes) -> None:
         try:
             made = [place for place in path.parents if not place.exists()]
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=UNFINISHED, dir=path.parent)
-            temporary = Path(name)
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            temporary.chmod(0o666 & ~current_umask())
+            with create_hidden(path.parent) as file:
+                temporary = Path(file.name)
+                yield file
             sync(temporary)
             temporary.replace(path)
             sync_names(path.parent, *made)
@@ -62,6 +62,12 @@ def write_bytes(path: Path, content: bytes) -> None:
             with suppress(OSError):
                 for place in made:
                     place.rmdir()
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file as `replacing` does. Raises OutputError."""
+    with replacing(path) as file:
+        file.write(content)
 
 
 def sync(path: Path) -> None:
@@ -83,14 +89,6 @@ def sync_names(folder: Path, *made: Path) -> None:
     """Wait until the names in a folder, and those of folders that were made, are on the disk. Raises OSError."""
     for place in dict.fromkeys((folder, *(new.parent for new in made))):
         sync(place)
-
-
-def is_unfinished(folder: Path) -> bool:
-    """Return whether new files are being moved to their places in a folder, or a killed process left this unfinished.
-
-    Until that is done, the folder may have files of two runs.
-    """
-    return (folder / COMPLETE).is_dir()
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -127,23 +125,15 @@ def _whole_number(digits: str) -> int:
 
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError inside the context into an OutputError that names the path, or the one that a draft is for."""
+    """Turn an OSError inside the context into an OutputError that names the path."""
     try:
         yield
     except OSError as error:
         # NumPy tells only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
         raise OutputError(
-            f"cannot be written ({reason})", path=_final_place(path), hint="Choose another place with -o"
+            f"cannot be written ({reason})", path=path, hint="Choose another place with -o"
         ) from error
-
-
-def _final_place(path: Path) -> Path:
-    """Return where a file of a draft belongs (see publishing); any other path as it is."""
-    if DRAFT not in path.parts:
-        return path
-    place = path.parts.index(DRAFT)
-    return Path(*path.parts[:place], *path.parts[place + 2 :])
 
 
 def check_writable(folder: Path) -> None:
@@ -187,10 +177,3 @@ def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
 def write_text(path: Path, content: str) -> None:
     """Write UTF-8 text as write_bytes does. Characters of file names that are not valid text become escapes."""
     write_bytes(path, content.encode(errors="backslashreplace"))
-
-
-def current_umask() -> int:
-    """Return the file mode creation mask of this process."""
-    current = os.umask(0)
-    os.umask(current)
-    return current

@@ -19,7 +19,11 @@ LOCK = ".lock"
 _SECONDS_BETWEEN_TRIES = 0.02
 
 
-class BusyError(OutputError):
+class RefusedFolderError(OutputError):
+    """One folder is refused. Others may be fine, so a batch goes on."""
+
+
+class BusyError(RefusedFolderError):
     """Another process writes into the folder."""
 
 
@@ -33,7 +37,7 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
     Raises:
         BusyError: another process has locked the folder.
-        OutputError: another user left a lock file, which this process may not open.
+        RefusedFolderError: another user left a lock file, which this process may not open.
         OSError: the folder cannot be made or written.
     """
     file = _locked_file(folder, wait=wait)
@@ -59,7 +63,7 @@ def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
         except PermissionError:
             if not (folder / LOCK).exists():
                 raise
-            raise OutputError(
+            raise RefusedFolderError(
                 "this lock file belongs to another user, who may be writing into the folder",
                 path=folder / LOCK,
                 hint="If no splinecli process of that user runs, remove the file. Otherwise choose another -o",
@@ -88,7 +92,7 @@ def _open_lock(path: Path) -> IO[str]:
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise OutputError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+        raise RefusedFolderError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
     return os.fdopen(descriptor, "r+")
 
 

@@ -1,37 +1,28 @@
-"""Sets of output files that replace earlier ones as a whole, in folders that one process at a time writes into.
+"""Sets of output files, in folders that one process at a time writes into.
 
-New files are first written into a hidden folder inside the output folder and synced to disk. One rename then marks them
-as complete. After that they are moved to their places, the report last. A process that is killed before this rename
-leaves the earlier files as they were. If it is killed later, the next process that holds the folder moves the rest. In
-between the folder has no report while it has files of both runs, so nothing describes a mixture. No reader of splinecli
-takes a file from such a folder (see is_unfinished).
+Each new file is written under a random hidden name and synced. When all are complete, the earlier report is removed,
+then the earlier files, the new ones are renamed to their places, and the new report comes last. So a folder with a
+report is whole. One without is unfinished, and its work is done again. Nothing in a folder tells a later process to do
+anything, and no link in it is followed.
 """
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+from typing import IO
 
-from splinecli.errors import OutputError
 from splinecli.files import (
-    COMPLETE,
-    DRAFT,
     UNFINISHED,
     check_writable,
-    is_unfinished,
-    read_json,
+    create_hidden,
     refusals_as_output_errors,
     sync,
     sync_names,
 )
-from splinecli.locks import locked
+from splinecli.locks import RefusedFolderError, locked
 
-_FILES, _PLAN = "files", "plan.json"
-
-FINISHED = "an interrupted run left new files that were not yet in their places; they are now"
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
 
@@ -39,13 +30,13 @@ UNDONE = "an interrupted run left unfinished files, which are removed"
 def held_folder(
     folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False
 ) -> Iterator[None]:
-    """Make a folder, lock it, and finish or undo what a killed process left in it.
+    """Make a folder, lock it, and remove the unfinished files that a killed process left directly in it.
 
     A folder that was made here and is empty at the end is removed, as are its parents.
 
     Args:
         folder: the folder.
-        warn: receives a sentence about what a killed process had left and what became of it.
+        warn: receives a sentence about what a killed process had left.
         wait: wait for another process that has locked the folder, instead of raising BusyError.
 
     Raises:
@@ -60,8 +51,11 @@ def held_folder(
                 made = [place for place in (folder, *folder.parents) if not place.exists()]
                 stack.enter_context(locked(folder, wait=wait))
                 sync_names(folder, *made)
-                for found in _put_in_order(folder):
-                    warn(f"{folder}: {found}")
+                left = [path for path in folder.glob(f".*{UNFINISHED}") if is_plain(path)]
+                for path in left:
+                    path.unlink()
+                if left:
+                    warn(f"{folder}: {UNDONE}")
             yield
     finally:
         with suppress(OSError):
@@ -69,130 +63,108 @@ def held_folder(
                 place.rmdir()
 
 
-@contextmanager
-def new_files(folder: Path, *, report: str, stale: Iterable[str] = ()) -> Iterator[Path]:
-    """Yield an empty folder for new files. After the block they replace those of the same names, all or none.
+class NewFiles:
+    """New files of a folder that have hidden names until all are complete; see new_files."""
 
-    The caller must hold the folder (see held_folder).
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._hidden: dict[str, Path] = {}
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The bytes of each complete file by its name."""
+        return {name: path.stat().st_size for name, path in sorted(self._hidden.items())}
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[IO[bytes]]:
+        """Yield a new file to write. Its name may be that of a file in a subfolder. Raises OutputError."""
+        _check_place(self._folder / name, self._folder)
+        with refusals_as_output_errors(self._folder / name):
+            with create_hidden(self._folder) as file:
+                self._hidden[name] = Path(file.name)
+                yield file
+            sync(self._hidden[name])
+
+    def write(self, name: str, content: bytes | str) -> None:
+        """Write a new file. Text becomes UTF-8, and what is not valid text becomes escapes. Raises OutputError."""
+        with self.open(name) as file:
+            file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
+
+    def publish(self, report: str | None, stale: Iterable[str]) -> None:
+        """Remove the earlier files, and rename the new ones to their places, the report last. Raises OSError."""
+        if report is not None:
+            _remove(self._folder / report, self._folder)
+            sync(self._folder)
+        for name in (*self._hidden, *stale):
+            _remove(self._folder / name, self._folder)
+        for name in sorted(self._hidden, key=lambda name: name == report):
+            place = self._folder / name
+            if name == report:
+                sync(self._folder)
+            place.parent.mkdir(exist_ok=True)
+            self._hidden[name].replace(place)
+            if place.parent != self._folder:
+                sync(place.parent)
+        sync(self._folder)
+
+    def discard(self) -> None:
+        """Remove the files that are not in their places."""
+        for path in self._hidden.values():
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) -> Iterator[NewFiles]:
+    """Yield a collector of new files. After the block, they replace the earlier ones.
+
+    The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as they are. A process
+    that ends during the replacement leaves a folder without a report.
 
     Args:
-        folder: where the files belong. A file in a subfolder goes to the subfolder of that name.
-        report: the name of the new file that describes the others.
+        folder: where the files belong.
+        report: the name of the file that describes the others: removed first, written last. None where the caller takes
+            care that no report names a file that changes.
         stale: names of earlier files that are removed if no new file replaces them.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    draft = folder / DRAFT
-    with refusals_as_output_errors(folder):
-        try:
-            (draft / _FILES).mkdir(parents=True)
-            try:
-                yield draft / _FILES
-            except OSError:
-                # The error of a write has no name of a file.
-                with refusals_as_output_errors(_last_written(draft / _FILES)):
-                    raise
-            names = [path.relative_to(draft / _FILES).as_posix() for path in _files_in(draft / _FILES)]
-            for name in names:
-                _check_place(folder / name)
-            plan = {"report": report, "remove": [name for name in stale if name not in names]}
-            (draft / _PLAN).write_text(json.dumps(plan), "utf-8")
-            for path in (*draft.rglob("*"), draft):
-                sync(path)
-            draft.rename(folder / COMPLETE)
-        except BaseException:
-            shutil.rmtree(draft, ignore_errors=True)
-            raise
-        try:
-            _install(folder)
-        except KeyboardInterrupt:
-            _install(folder)
-            raise
-        except OSError as error:
-            raise OutputError(
-                f"the new files are complete, but are not all in their places ({error.strerror or error})",
-                path=folder,
-                hint="Run the command again, which finishes this",
-            ) from error
-
-
-def _put_in_order(folder: Path) -> list[str]:
-    """Finish or undo what a killed process left in the folder, and say so."""
-    done = []
-    if (folder / DRAFT).is_dir():
-        shutil.rmtree(folder / DRAFT)
-        done = [UNDONE]
-    for path in folder.glob(f".*{UNFINISHED}"):
-        if path.is_file():
-            path.unlink()
-            done = [UNDONE]
-    if is_unfinished(folder):
-        _install(folder)
-        done = [FINISHED]
-    return done
-
-
-def _install(folder: Path) -> None:
-    """Move complete new files to their places. Whatever part of this was done before, the result is the same."""
-    sync(folder)  # before an earlier file goes
-    files = folder / COMPLETE / _FILES
-    remove, report = _read_plan(folder)
-    # Without its report, everything is in its place.
-    if (files / report).is_file():
-        for name in (report, *remove):
-            (folder / name).unlink(missing_ok=True)
-        for path in sorted(_files_in(files), key=lambda path: path == files / report):
-            place = folder / path.relative_to(files)
-            made = [parent for parent in place.parents if not parent.exists()]
-            place.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(place)
-            if place.parent != folder:
-                sync_names(place.parent, *made)
-        sync(folder)
-    shutil.rmtree(folder / COMPLETE)
-    sync(folder)
-
-
-def _read_plan(folder: Path) -> tuple[list[str], str]:
-    """Return the names to remove and the report's name. The folder may come from somebody else: check the names."""
-    path = folder / COMPLETE / _PLAN
+    new = NewFiles(folder)
     try:
-        plan = read_json(path)
-        remove, report = list(plan["remove"]), plan["report"]
-        if all(_is_inside(name) for name in (*remove, report)):
-            return remove, report
-    except FileNotFoundError:
-        if not _files_in(folder / COMPLETE / _FILES):
-            return [], "."
-    except (ValueError, KeyError, TypeError):
-        pass
-    raise OutputError(
-        "holds new files of an interrupted run, but its plan.json is damaged",
-        path=folder / COMPLETE,
-        hint="Remove this hidden folder",
-    )
+        yield new
+        with refusals_as_output_errors(folder):
+            new.publish(report, stale)
+    finally:
+        new.discard()
 
 
-def _is_inside(name: object) -> bool:
-    """Return whether this is the name of a file inside a folder."""
-    if not isinstance(name, str) or "\0" in name:
-        return False
-    path = PurePosixPath(name)
-    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
+def refuse_link(folder: Path) -> None:
+    """Raise OutputError if a link stands in the place of a folder: it may lead anywhere."""
+    if folder.is_symlink():
+        raise RefusedFolderError(
+            "found a link, expected a folder", path=folder, hint="Remove it, or choose another -o"
+        )
 
 
-def _check_place(path: Path) -> None:
-    if path.is_dir():
-        raise OutputError("found a folder, expected a file", path=path)
+def is_plain(path: Path) -> bool:
+    """Return whether there is a file, and no link to one."""
+    return path.is_file() and not path.is_symlink()
+
+
+def _check_place(path: Path, folder: Path) -> None:
+    """Raise OutputError if no file can be renamed to a path in a folder or in a subfolder of it."""
+    if path.is_dir() and not path.is_symlink():
+        raise RefusedFolderError("found a folder, expected a file", path=path)
+    if path.parent == folder:
+        return
+    refuse_link(path.parent)
     if path.parent.exists() and not path.parent.is_dir():
-        raise OutputError("found a file, expected a folder", path=path.parent)
+        raise RefusedFolderError("found a file, expected a folder", path=path.parent)
 
 
-def _last_written(folder: Path) -> Path:
-    """Return the file that changed last; the folder where there is none."""
-    return max(_files_in(folder), key=lambda path: path.stat().st_mtime_ns, default=folder)
-
-
-def _files_in(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.rglob("*")) if not path.is_dir()]
+def _remove(path: Path, folder: Path) -> None:
+    """Remove a file or a link. A folder of that name stays. Raises OutputError as _check_place does, or OSError."""
+    if path.parent != folder:
+        refuse_link(path.parent)
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import subprocess
@@ -122,10 +121,12 @@ def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path
 
 
 def test_cells_are_no_formulas(make_capture, run):
-    make_capture("=1+1")
-    assert run("evaluate", "=1+1", "--method", "ls", "--n-lights", 4, "--trials", 1).code == 0
-    with Path("evaluation/results.csv").open(newline="") as file:
-        assert [row["capture"] for row in csv.DictReader(file)] == ["'=1+1"]
+    for name, cell in {"=1+1": "'=1+1", "\r=1": "\\r=1", " \n=1": " \\n=1"}.items():
+        make_capture(name)
+        result = run("evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite")
+        assert result.code == 0
+        header, row = Path("evaluation/results.csv").read_bytes().decode().splitlines()  # also splits at \r
+        assert dict(zip(header.split(","), row.split(","), strict=True))["capture"] == cell
 
 
 def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):

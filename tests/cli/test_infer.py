@@ -183,6 +183,27 @@ def test_a_mended_mask_stays(capture, run):
     np.testing.assert_array_equal(cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted)
 
 
+@pytest.mark.parametrize(
+    "part", [("--crop", "2,3,19,18"), ("--scale", "1/2"), ("--crop", "1,1,21,20", "--scale", "1/3")]
+)
+def test_a_found_mask_of_a_part_is_a_mask_of_the_capture(capture, run, part):
+    mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    for path in capture.glob("image*.png"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.where(mask > 0, picture, 300).astype(np.uint16))
+    (capture / "mask.png").unlink()
+    assert run("infer", capture, "--method", "ls", "--auto-mask", *part).code == 0
+    found = cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_GRAYSCALE)
+    assert found.shape == mask.shape
+    given = ("--mask", "out/sphere/found_mask.png", "-o", "again")
+    assert run("infer", capture, "--method", "ls", *given, *part).code == 0
+    np.testing.assert_array_equal(np.load("again/sphere/normals.npy"), np.load("out/sphere/normals.npy"))
+    # It is a mask of whole images, too, without gaps between the rows that were read.
+    assert run("infer", capture, "--method", "ls", *given, "--overwrite").code == 0
+    assert read_report(Path("again/sphere"))["n_pixels"] == np.count_nonzero(found)
+    assert cv2.connectedComponents(found)[0] == 2
+
+
 def test_photographs_with_a_curve_and_ambient_light(capture, run):
     light = 9_000 / 65_535
     for path in capture.glob("image*.png"):

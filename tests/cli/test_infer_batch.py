@@ -8,6 +8,7 @@ import json
 import os
 import pickle
 import re
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -103,11 +104,6 @@ def change_light_file(capture: Path) -> tuple[str, ...]:
     return ()
 
 
-def remove_a_result(capture: Path) -> tuple[str, ...]:
-    (Path("out") / capture / "normals.png").unlink()
-    return ()
-
-
 def change_the_version(capture: Path) -> tuple[str, ...]:
     path = Path("out") / capture / "report.json"
     path.write_text(path.read_text().replace('"version": "', '"version": "0.0.'))
@@ -117,7 +113,6 @@ def change_the_version(capture: Path) -> tuple[str, ...]:
 CHANGES = {
     "made with another --n-lights": lambda _: ("--n-lights", "4"),
     "other input files": change_light_file,
-    "but normals.png is missing": remove_a_result,
     "made by version 0.0.": change_the_version,
 }
 
@@ -147,13 +142,117 @@ def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason,
     assert run(*call, *extra).code == 0
 
 
-def test_update_keeps_files_of_others(capture, run):
-    Path("out/sphere").mkdir(parents=True)
-    Path("out/sphere/normals.png").write_text("drawn by hand")
-    result = run("infer", capture, "--method", "ls", "--update")
-    assert result.code == 5
-    assert "out/sphere: contains normals.png, but no report.json. Add --overwrite" in result.err
-    assert Path("out/sphere/normals.png").read_text() == "drawn by hand"
+def link_elsewhere(path: Path) -> None:
+    path.rename("elsewhere")
+    path.symlink_to(Path("elsewhere").absolute())
+
+
+def surrogate_among_files(path: Path) -> None:
+    report = json.loads(path.read_text())
+    path.write_text(json.dumps({**report, "files": ["\ud800"]}))
+
+
+UNFINISHED_FOLDERS: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "no report": ("report.json", Path.unlink, "has no report.json"),
+    "linked report": ("report.json", link_elsewhere, "has no report.json"),
+    "missing": ("normals.png", Path.unlink, "normals.png is missing"),
+    "linked": ("normals.npy", link_elsewhere, "normals.npy is missing"),
+    "cut short": ("normals.npy", lambda path: os.truncate(path, 100), "normals.npy has another size than"),
+    "no such name": ("report.json", surrogate_among_files, "\\ud800 is missing"),
+}
+
+
+@pytest.mark.parametrize("name", UNFINISHED_FOLDERS)
+def test_an_unfinished_folder_is_computed_again(capture, run, name):
+    call = ("infer", capture, "--method", "ls")
+    assert run(*call).code == 0
+    whole = {path.name: path.stat().st_size for path in Path("out/sphere").iterdir()}
+    file, damage, reason = UNFINISHED_FOLDERS[name]
+    damage(Path("out/sphere", file))
+    elsewhere = Path("elsewhere").read_bytes() if Path("elsewhere").exists() else None
+    again = run(*call)
+    assert (again.code, again.out[:11]) == (0, "out/sphere:")
+    assert reason in again.err
+    assert "so it is computed again" in again.err
+    assert {path.name: path.stat().st_size for path in Path("out/sphere").iterdir()}.keys() == whole.keys()
+    assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
+    assert elsewhere in (None, Path("elsewhere").read_bytes() if elsewhere else b"")
+    report = read_report(Path("out/sphere"))
+    sizes = {
+        path.name: path.stat().st_size for path in Path("out/sphere").iterdir() if path.suffix != ".json"
+    }
+    assert report["file_sizes"] == sizes
+    assert "already done, skipped" in run(*call).err
+
+
+def test_an_edited_mask_and_an_integrated_surface_stay(capture, run):
+    (capture / "mask.png").unlink()
+    call = ("infer", capture, "--method", "ls", "--auto-mask", "--surface", "--mesh-format", "ply")
+    assert run(*call, "--overwrite").code == 0
+    assert run("integrate", "out/sphere", "--format", "ply", "--stiffness", 0, "--overwrite").code == 0
+    assert run("integrate", "out/sphere", "--format", "ply", "--overwrite").code == 0
+    with Path("out/sphere/found_mask.png").open("ab") as file:
+        file.write(b"edited")
+    assert "already done, skipped" in run(*call).err
+
+
+def test_files_of_the_user_in_the_capture_are_kept(capture, run):
+    (capture / "normals.png").write_text("drawn by hand")
+    for update in ((), ("--update",)):
+        result = run("infer", capture, "--method", "ls", "-o", capture.parent, *update)
+        assert result.code == 5
+        assert "sphere: contains normals.png, but no report.json" in result.err
+        assert "Add --overwrite" in result.err
+    assert (capture / "normals.png").read_text() == "drawn by hand"
+
+
+def test_a_link_in_the_place_of_a_result_folder_fails_its_capture_only(capture, make_capture, run):
+    make_capture("second")
+    Path("elsewhere").mkdir()
+    Path("out").mkdir()
+    Path("out/sphere").symlink_to(Path("elsewhere").absolute())
+    for overwrite in ((), ("--overwrite",)):
+        result = run("infer", capture, "second", "--method", "ls", *overwrite)
+        assert (result.code, "out/sphere: found a link, expected a folder" in result.err) == (5, True)
+        assert Path("out/second/report.json").is_file()
+        assert not list(Path("elsewhere").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("files", [1, 2]),
+        ("files", ["\ud800"]),
+        ("files", ["../../kept"]),
+        ("files", {"a": 1}),
+        ("file_sizes", 5),
+        ("file_sizes", None),
+        ("warnings", [1]),
+        ("warnings", [{"text": ["\ud800"]}]),
+        ("seconds", {"read": "x"}),
+        ("n_pixels", "\ud800"),
+        ("angular_error_deg", {"mean": []}),
+        ("capture", "\ud800"),
+        ("error", ["\ud800"]),
+    ],
+)
+def test_a_bad_report_of_another_capture_is_no_matter(capture, make_capture, run, key, value):
+    make_capture("second")
+    assert run("infer", "second", "--method", "ls").code == 0
+    path = Path("out/second/report.json")
+    Path("kept").touch()
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    make_capture("third")
+    result = run("infer", capture, "third", "--method", "ls")
+    assert (result.code, "Traceback" in result.err) == (0, False)
+    page = Path("out/index.html").read_text("utf-8")
+    assert "sphere" in page and "third" in page
+    # The same where the capture itself comes next.
+    assert run("infer", "second", "--method", "ls", "--update").code == 0
+    assert json.loads(path.read_text())["capture"] == "second"
+
+
+def test_contradicting_options(capture, run):
     both = run("infer", capture, "--method", "ls", "--update", "--overwrite")
     assert (both.code, "contradict each other" in both.err) == (2, True)
 

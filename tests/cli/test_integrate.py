@@ -14,7 +14,6 @@ from PIL import Image
 from bump_capture import POSITIONS, write_bump
 from splinecli.capture.capture_size import results_bytes
 from splinecli.capture.formats import image_size
-from splinecli.files import COMPLETE
 from splinecli.normals import encode_picture
 
 SHAPE = (40, 50)
@@ -56,7 +55,7 @@ def test_heights_and_mesh_of_a_sphere(run):
     assert f"out: {inside.sum()} pixels, from " in result.out
 
 
-@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"], ["."]])
+@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"]])
 def test_formats_of_normal_maps(run, arguments):
     assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
     _, heights, inside = sphere()
@@ -315,13 +314,13 @@ def test_refusals(run, golden):
     assert not Path("out").exists()
 
 
-def test_normals_in_an_unfinished_folder_are_refused(run):
-    Path("results", COMPLETE, "files").mkdir(parents=True)
+def test_normals_in_a_folder_without_report_are_refused(run):
+    Path("results").mkdir()
     Path("normals.npy").rename("results/normals.npy")
-    for given in ("results", "results/normals.npy"):
-        result = run("integrate", given, "-o", "out")
-        assert result.code == 3
-        assert "new files of an interrupted run, which are not all in their places" in result.err
+    result = run("integrate", "results", "-o", "out")
+    assert result.code == 3
+    assert "results: the folder has no whole results of infer: it has no report.json" in result.err
+    assert run("integrate", "results/normals.npy", "-o", "out", "--format", "npy").code == 0
 
 
 def test_quiet_prints_nothing(run):

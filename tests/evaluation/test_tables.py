@@ -70,6 +70,13 @@ def test_a_bar_in_a_name_does_not_end_the_cell() -> None:
     assert markdown([odd]).startswith("| method | a\\|b | average |\n")
 
 
+def test_a_link_in_a_name_is_no_link() -> None:
+    name = "![a](javascript:alert(1)) &lt; ~~b~~"
+    odd = replace(TEN, results=(replace(TEN.results[0], capture=name),))
+    shown = r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"
+    assert markdown([odd]).startswith(f"| method | {shown} | average |\n")
+
+
 def test_rows_for_a_terminal() -> None:
     rows = table_rows(TEN)
     assert rows == [

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest.mock import patch
 
-from splinecli.files import COMPLETE
-
 Call = tuple[str, Path, Path]
 """What was called: "sync", "rename" or "remove"; the path, and for "rename" the new one."""
 
@@ -41,10 +39,11 @@ def record_calls(work: Callable[[], object]) -> list[Call]:
     return calls
 
 
-def missing_syncs(calls: list[Call]) -> Iterator[str]:
-    """Yield what was renamed or removed too early, and the folders whose names may not be on the disk at the end.
+def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
+    """Yield what was changed too early, and the folders whose names may not be on the disk at the end.
 
-    Hidden files are no results, so they may be renamed and removed at any time.
+    A file must be synced before it is renamed. The removal of a report must be on the disk before any file gets its
+    place, and the names of all these files before the report gets its own. Hidden files are no results.
     """
     synced: set[Path] = set()
     changed: dict[Path, Path] = {}  # folders with a name that is not synced: that name
@@ -52,24 +51,16 @@ def missing_syncs(calls: list[Call]) -> Iterator[str]:
         if kind == "sync":
             synced.add(path)
             changed.pop(path, None)
-            continue
-        marked = next((name for name in changed.values() if name.name == COMPLETE), None)
-        if marked is not None and path.parent == marked.parent:
-            yield f"{path.name} changes before {COMPLETE} is on the disk"
-        if kind == "rename":
-            if path.name == place.name or not place.name.startswith("."):
-                if path not in synced:
-                    yield f"{place.name} is renamed before its content is on the disk"
-                changed[place.parent] = place
-            elif place.name == COMPLETE:
-                if path not in synced:
-                    yield f"{path.name} is renamed before its names are on the disk"
-                changed[place.parent] = place
-            synced = {_moved(name, path, place) for name in synced}
+        elif not place.name.startswith("."):
+            if kind == "rename" and path not in synced:
+                yield f"{place.name} is renamed before its content is on the disk"
+            unsynced = (
+                changed.values()
+                if place.name == report
+                else [n for n in changed.values() if n.name == report]
+            )
+            for name in unsynced:
+                yield f"{place.name} changes before {name.name} is on the disk"
+            changed[place.parent] = place
     for name in changed.values():
         yield f"the new name {name.name} is not on the disk"
-
-
-def _moved(path: Path, folder: Path, place: Path) -> Path:
-    """Return a path after a rename of a folder, or of the file itself."""
-    return place / path.relative_to(folder) if path.is_relative_to(folder) else path

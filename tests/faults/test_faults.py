@@ -77,7 +77,7 @@ def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
     assert (folder / "code").read_text() == "5\n"
     assert done.stderr.count("\n") == 1
     assert "No space left on device" in done.stderr or "the disk may be full" in done.stderr
-    assert done.stderr.startswith("splinecli: disk/a") and "/.new" not in done.stderr
+    assert done.stderr.startswith("splinecli: disk/a") and "unfinished" not in done.stderr
     left = content(folder / "left")
     if disk_kb == 16:
         assert set(left) == {"kept"}

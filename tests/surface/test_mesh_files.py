@@ -12,10 +12,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from glb_file import read_glb
-from splinecli.errors import InputError, OutputError
+from splinecli.errors import InputError
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 from splinecli.surface.mesh_files import GRAY, encode_glb, encode_obj, encode_ply, encode_stl
-from splinecli.surface.surface_files import Surface, write_surface
 
 SHAPE = (15, 20)
 DEPTH = 3 * np.sin(np.arange(20) / 4) + np.arange(15)[:, None] / 5
@@ -101,9 +100,3 @@ def test_a_mesh_without_triangles() -> None:
     assert len(encode_stl(mesh)) == 84
     with pytest.raises(InputError, match="the mesh has no triangles: nowhere do three pixels"):
         encode_glb(mesh, metres=1)
-
-
-def test_place_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError):
-        write_surface(tmp_path / "file", Surface(DEPTH, wave(), "pixel", 1), ["ply"])

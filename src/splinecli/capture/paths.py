@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from splinecli.errors import InputError
-from splinecli.files import is_unfinished
 
 _OPEN_FILES = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
@@ -41,9 +40,7 @@ def find_mode(path: Path) -> int | None:
 
 
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
-    """Raise InputError unless there is a whole file. Anything else, such as a device, might never end or never begin.
-
-    A file in a folder that is unfinished (see is_unfinished) may belong to another run than the files beside it.
+    """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
 
     Args:
         path: the path.
@@ -56,12 +53,6 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
         kind = next(words for matches, words in _KINDS if matches(mode))
         raise InputError(f"found {kind}, expected {expected}", path=path)
-    if is_unfinished(path.parent):
-        raise InputError(
-            "lies in a folder with new files of an interrupted run, which are not all in their places",
-            path=path,
-            hint="Run the command that writes into that folder again, which finishes this",
-        )
 
 
 def is_found_file(path: Path) -> bool:

@@ -63,6 +63,13 @@ class Window:
         to_window = np.array([[1, 0, -left], [0, 1, -top], [0, 0, self.step]]) / self.step
         return np.asarray(to_window @ matrix, np.float64)
 
+    def filled(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the mask of whole images from a mask of what is read. A pixel stands for those left out beside it."""
+        whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
+        part = replace(self, step=1).of(whole)
+        part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
+        return whole
+
     def on(self, image: Path) -> Window:
         """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
         if self.is_whole:

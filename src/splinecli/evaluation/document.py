@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from splinecli import __version__
+from splinecli.errors import printable
 from splinecli.evaluation.outcome import Evaluation, all_notes, all_skipped
 from splinecli.evaluation.protocol import Protocol, lights_value
 from splinecli.evaluation.statistics import compare
@@ -20,7 +21,7 @@ SCHEMA = 1
 
 _DEGREE_DIGITS, _SECOND_DIGITS = 4, 4
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA = ("=", "+", "-", "@")
 _COLUMNS = (
     "method", "capture", "n_lights", "light_noise_deg", "mae_deg", "std_deg", "trials", "seconds", "as_stored",
 )  # fmt: skip
@@ -88,8 +89,11 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _as_text_cell(value: Any) -> Any:
-    """Return a value as a cell that no spreadsheet takes for a formula: an apostrophe marks it as text."""
-    return f"'{value}" if isinstance(value, str) and value.lstrip(" \n").startswith(_FORMULA) else value
+    """Return a value as a cell of one line that no spreadsheet takes for a formula: an apostrophe marks it as text."""
+    if not isinstance(value, str):
+        return value
+    text = printable(value)
+    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
 
 
 def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:

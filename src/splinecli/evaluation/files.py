@@ -13,7 +13,6 @@ from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.tables import latex, markdown
-from splinecli.files import write_bytes, write_text
 from splinecli.publishing import new_files
 
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
@@ -38,7 +37,7 @@ def make_plots(evaluations: Sequence[Evaluation]) -> Plots:
 def write_results(
     output: Path, evaluations: Sequence[Evaluation], plots: Plots, figures: Sequence[CaptureFigure] | None
 ) -> dict[str, Any]:
-    """Write all files in place of those of an earlier evaluation, all or none. The caller holds the folder.
+    """Write all files in place of those of an earlier evaluation (see new_files). The caller holds the folder.
 
     Args:
         figures: None leaves the figures of an earlier evaluation.
@@ -58,11 +57,11 @@ def write_results(
     stale = [LIGHTS_PLOT, LIGHT_NOISE_PLOT]
     if figures is not None:
         stale += [f"{FIGURES}/{path.name}" for path in (output / FIGURES).glob("*.png")]
-    with new_files(output, report=RESULTS, stale=stale) as stage:
+    with new_files(output, report=RESULTS, stale=stale) as new:
         for name, text in texts.items():
-            write_text(stage / name, text)
+            new.write(name, text)
         for name, (_, png) in plots.items():
-            write_bytes(stage / name, png)
+            new.write(name, png)
         for figure in figures or ():
-            write_bytes(stage / FIGURES / f"{figure.stem}.png", figure.png)
+            new.write(f"{FIGURES}/{figure.stem}.png", figure.png)
     return document

@@ -83,7 +83,7 @@ def _markdown_table(evaluation: Evaluation) -> str:
 
 def _escape_markdown(text: str) -> str:
     """Return text of one line that Markdown shows as it is."""
-    return re.sub(r"([\\`*<>|])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*<>|\[\]&~])", r"\\\1", " ".join(text.split()))
 
 
 def _latex_table(evaluation: Evaluation) -> str:

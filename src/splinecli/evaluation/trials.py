@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,10 +14,10 @@ from typing import Any
 from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
 from splinecli.capture.stamp import digest
-from splinecli.errors import OutputError
 from splinecli.evaluation.protocol import Protocol
-from splinecli.files import is_special, parse_json, refusals_as_output_errors
+from splinecli.files import parse_json, refusals_as_output_errors, write_text
 from splinecli.methods import Estimator
+from splinecli.publishing import is_plain
 
 _LONGEST_LINE = 1 << 16  # characters
 
@@ -95,7 +96,7 @@ class Score:
 class TrialStore:
     """Scores by trial, in memory and, where a path is given, in a file of JSON lines.
 
-    A line that cannot be read, such as one that was cut short, is ignored.
+    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed.
 
     Args:
         path: the file, which the first score creates; None keeps the scores in memory only.
@@ -112,20 +113,17 @@ class TrialStore:
         if path is None:
             return
         with refusals_as_output_errors(path):
-            if fresh:
-                path.unlink(missing_ok=True)
-            if is_special(path):
-                raise OutputError("is not a file", path=path, hint="Remove it, or choose another -o")
-            lines = _lines(path) if path.is_file() else ()
-            line = "\n"
-            for line in lines:
+            kept = []
+            for line in _lines(path) if is_plain(path) and not fresh else ():
                 record = _read_line(line)
                 if record is not None:
+                    kept.append(line.rstrip("\n") + "\n")
                     self._scores[record["key"]] = Score(
                         record["mae_deg"], record["seconds"], record["estimated_intensities"]
                     )
-        # The next line must not be appended to one that was cut short.
-        self._break_first = not line.endswith("\n")
+            # Anew, because the next lines would reach every other name of this file.
+            if os.path.lexists(path):
+                write_text(path, "".join(kept))
 
     def find(self, trial: Trial) -> Score | None:
         """Return the score of a trial, or None where it is not stored."""
@@ -139,8 +137,7 @@ class TrialStore:
                 return
             line = json.dumps({**asdict(trial), **asdict(score), "key": trial.key})
             with refusals_as_output_errors(self._path), self._path.open("a", encoding="utf-8") as file:
-                file.write("\n" * self._break_first + line + "\n")
-            self._break_first = False
+                file.write(line + "\n")
 
 
 def plan_trials(

@@ -24,7 +24,8 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
         scenes.setdefault(entry.scene, []).append(entry)
     every = -(-len(scenes) // MOST_SCENES)
     tile = LARGE_TILE if len(scenes) <= FEW_SCENES else TILE
-    strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
+    with np.errstate(all="ignore"):  # a damaged array may have NaN
+        strips = [_strip(pixel_set, entries, tile) for entries in list(scenes.values())[::every]]
     width = max(strip.shape[1] for strip in strips)
     across = max(1, _WIDTH // width)
     padded = [np.pad(strip, ((2, 2), (2, width - strip.shape[1] + 6), (0, 0))) for strip in strips]

@@ -185,11 +185,11 @@ def _write(
         REPORT: json.dumps(report, indent=2) + "\n",
     }
     # Files that are not written anew would belong to earlier lights. They are removed.
-    with new_files(folder, report=REPORT, stale=OUTPUT_FILES) as stage:
+    with new_files(folder, report=REPORT, stale=OUTPUT_FILES) as new:
         for name, text in texts.items():
             if text is not None:
-                (stage / name).write_text(text, "utf-8")
-        (stage / PICTURE).write_bytes(encode_png(calibration_picture(lights.balls)))
+                new.write(name, text)
+        new.write(PICTURE, encode_png(calibration_picture(lights.balls)))
 
 
 def _text(values: NDArray[np.float64]) -> str:

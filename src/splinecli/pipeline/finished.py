@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import SplinecliError
-from splinecli.files import read_json
+from splinecli.locks import RefusedFolderError
 from splinecli.pipeline.infer_options import InferOptions
 
 if TYPE_CHECKING:
@@ -25,39 +25,46 @@ class EarlierResults:
     Args:
         report: the report in the folder if these results are still good, else None.
         changed: why they are not, in words; empty if they are, or if there are none.
-        ours: whether `infer` wrote them, so that --update may replace them.
+        unfinished: why what is in the folder does not count as results, in words; empty if it does.
     """
 
     report: dict[str, Any] | None = None
     changed: str = ""
-    ours: bool = True
+    unfinished: str = ""
 
 
 def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierResults:
-    """Compare the results in `target` with the capture in `folder` and the options. Raises InputError."""
-    from splinecli.results.files import OWN_FILES, REPORT
-    from splinecli.results.index import row_of
+    """Compare the results in `target` with the capture in `folder` and the options.
+
+    Raises:
+        InputError: the capture cannot be read.
+        RefusedFolderError: both are one folder, which may have files of the user with the names of results.
+    """
+    from splinecli.publishing import is_plain
+    from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
+    from splinecli.results.index import Entry
 
     try:
-        report = read_json(target / REPORT)
+        report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
-        version, stamp, names = report["version"], report["inputs_sha256"], [str(n) for n in report["files"]]
-        row_of(report)  # raises if the report is not whole
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, SplinecliError):
+        version, stamp = report["version"], report["inputs_sha256"]
+        if Entry.of(report).row.capture != target.name:  # raises if the report is not whole
+            raise ValueError
+    except UnfinishedError as error:
         found = next((name for name in OWN_FILES if (target / name).exists()), None)
-        if found is None:
-            return EarlierResults()
-        # A report of another version may have other options, but it is one of ours.
-        if found != REPORT and not (target / REPORT).is_file():
-            return EarlierResults(changed=f"contains {found}, but no {REPORT}", ours=False)
+        if found is not None and not is_plain(target / REPORT) and target.samefile(folder):
+            raise RefusedFolderError(
+                f"contains {found}, but no {REPORT}, and is the folder of the capture",
+                path=target,
+                hint="Add --overwrite, or choose another place with -o",
+            ) from None
+        return EarlierResults(unfinished="" if found is None else str(error))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         return EarlierResults(changed="contains results made by another version")
     if version != __version__:
         return EarlierResults(changed=f"contains results made by version {version}")
     if earlier != options:
         return EarlierResults(changed=f"contains results made with {_differences(earlier, options)}")
-    missing = [name for name in names if not (target / name).is_file()]
-    if missing:
-        return EarlierResults(changed=f"contains earlier results, but {missing[0]} is missing")
     if stamp != inputs_sha256(options.open(folder), options.weights):
         return EarlierResults(changed="contains results made from other input files")
     return EarlierResults(report)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
+    from splinecli.publishing import NewFiles
     from splinecli.results.clock import Clock
 
 
@@ -27,8 +29,8 @@ def infer_capture(
 ) -> dict[str, Any]:
     """Estimate the normals of the capture in `folder` and return the report.
 
-    The results go to `options.output`/<capture name>/, where they replace earlier ones, all or none. Meanwhile no other
-    process may write there.
+    The results go to `options.output`/<capture name>/, where they replace earlier ones (see new_files). Meanwhile no
+    other process may write there.
 
     Args:
         folder: the capture.
@@ -43,11 +45,20 @@ def infer_capture(
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
     """
     from splinecli.capture import capture_name
-    from splinecli.publishing import held_folder
 
-    target = Path(options.output) / capture_name(folder)
-    with held_folder(target, observer.warn):
+    with held_results(capture_name(folder), options, observer) as target:
         return _infer_into(folder, target, options, observer, estimator)
+
+
+@contextmanager
+def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
+    """Hold the folder of results of a capture (see held_folder) and yield it. Raises OutputError."""
+    from splinecli.publishing import held_folder, refuse_link
+
+    target = Path(options.output) / name
+    refuse_link(target)
+    with held_folder(target, observer.warn):
+        yield target
 
 
 def _infer_into(
@@ -178,12 +189,12 @@ def _further_files(
     options: InferOptions,
     observer: Observer,
     clock: Clock,
-) -> list[Callable[[Path], None]]:
-    """Compute what else the options ask for. Each function that is returned writes some files into a folder."""
+) -> list[Callable[[NewFiles], None]]:
+    """Compute what else the options ask for. Each function that is returned writes some files."""
     from splinecli.results import files
 
     capture = estimate.capture
-    writers: list[Callable[[Path], None]] = []
+    writers: list[Callable[[NewFiles], None]] = []
     albedo = colours = None
     clock.begin("pictures")
     if "albedo" in options.maps or options.html:
@@ -200,7 +211,7 @@ def _further_files(
     if "preview" in options.maps:
         writers.append(partial(files.write_preview, estimate))
     if source.automatic_mask is not None:
-        writers.append(partial(files.write_mask, capture.mask))
+        writers.append(partial(files.write_mask, source.window.filled(capture.mask)))
     if options.surface:
         clock.begin("surface")
         writers.append(_surface(estimate, colours, report, options, observer))
@@ -216,10 +227,10 @@ def _surface(
     report: dict[str, Any],
     options: InferOptions,
     observer: Observer,
-) -> Callable[[Path], None]:
+) -> Callable[[NewFiles], None]:
     """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
     from splinecli.pipeline.surface import make_surface, share_of_iterations, view_of_report
-    from splinecli.surface.surface_files import DEPTH_FORMATS, write_surface
+    from splinecli.surface.surface_files import DEPTH_FORMATS, encode_surface
 
     camera_matrix, pixel_size = view_of_report(report)
     with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
@@ -234,13 +245,17 @@ def _surface(
         )
     exr = ("exr",) if "exr" in options.formats else ()
     formats = (*options.mesh_formats, *DEPTH_FORMATS, *exr)
-    return partial(write_surface, surface=surface, formats=formats)
+
+    def write(new: NewFiles) -> None:
+        for name, content in encode_surface(surface, formats):
+            new.write(name, content)
+
+    return write
 
 
 def _page(
     estimate: NormalEstimate, albedo: NDArray[np.float32] | None, report: dict[str, Any]
-) -> Callable[[Path], None]:
-    from splinecli.files import write_text
+) -> Callable[[NewFiles], None]:
     from splinecli.results.files import PAGE
     from splinecli.results.page import result_page
 
@@ -252,4 +267,4 @@ def _page(
         confidence_map=estimate.confidence_map,
         error_map_deg=estimate.error_map_deg,
     )
-    return lambda folder: write_text(folder / PAGE, page)
+    return lambda new: new.write(PAGE, page)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from splinecli.errors import InputError, UsageError
 from splinecli.exr import check_exr
-from splinecli.files import is_unfinished, read_json
+from splinecli.files import read_json
 from splinecli.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
@@ -25,8 +25,8 @@ from splinecli.surface.surface_files import (
     DEFAULT_FORMATS,
     SURFACE_FILES,
     SURFACE_REPORT,
+    encode_surface,
     file_names,
-    write_surface,
 )
 
 if TYPE_CHECKING:
@@ -162,14 +162,13 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
     }
-    with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as stage:
-        write_surface(stage, surface, options.formats)
+    with new_files(options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)) as new:
+        for name, content in encode_surface(surface, options.formats):
+            new.write(name, content)
         report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [
-            name for name in options.files if (stage / name).exists() or name == SURFACE_REPORT
-        ]
-        (stage / SURFACE_REPORT).write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+        report["files"] = [*new.sizes, SURFACE_REPORT]
+        new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     return report
 
 
@@ -193,22 +192,18 @@ def _earlier_files(folder: Path) -> list[str]:
 
 
 def _find_normal_map(folder: Path) -> Path:
-    from splinecli.results.files import NORMALS
+    from splinecli.results.files import NORMALS, read_report
 
-    if is_unfinished(folder):
-        raise InputError(
-            "holds new files of an interrupted run, which are not all in their places",
-            path=folder,
-            hint="Run the same 'splinecli infer' again, which finishes this",
-        )
     names = [NORMALS[name] for name in INPUT_FORMATS]
-    for name in names:
-        if (folder / name).is_file():
-            return folder / name
+    try:
+        files = read_report(folder)["files"]
+        return folder / next(name for name in names if name in files)
+    except StopIteration:
+        problem = f"the folder has no normal map ({', '.join(names)})"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        problem = f"the folder has no whole results of infer: it {error}"
     raise InputError(
-        f"the folder has no normal map ({', '.join(names)})",
-        path=folder,
-        hint="Give a folder that 'splinecli infer' wrote",
+        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
     )
 
 

@@ -6,14 +6,13 @@ import errno
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splinecli.errors import InputError, OutputError, SplinecliError
 from splinecli.memory import is_out_of_memory
 from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.finished import find_earlier
-from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer import held_results, infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
 
@@ -87,34 +86,30 @@ def _error_document(error: SplinecliError, capture: str) -> dict[str, Any]:
 
 def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, redo: Redo) -> Outcome | None:
     """Return the outcome of a capture that is not to be computed, or None."""
-    from splinecli.files import check_writable
-    from splinecli.publishing import held_folder
-
-    target = Path(options.output) / member.name
-    check_writable(target)
     if redo == "all":
         return None
-    with held_folder(target, observer.warn):
+    with held_results(member.name, options, observer) as target:
         earlier = find_earlier(target, member.folder, options)
     if earlier.report is not None:
         return Outcome(member.name, "skipped", earlier.report)
-    if not earlier.changed or (redo == "changed" and earlier.ours):
+    if earlier.unfinished:
+        observer.warn(f"{target}: {earlier.unfinished}, so it is computed again")
+    if not earlier.changed or redo == "changed":
         return None
-    update = "--update to redo what changed, " if earlier.ours else ""
     error = OutputError(
         earlier.changed,
         path=target,
-        hint=f"Add {update}--overwrite to redo everything, or choose another place with -o",
+        hint="Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o",
     )
     return Outcome(member.name, "changed", _error_document(error, member.name), error.exit_code)
 
 
 def _failure(member: Member, error: Exception) -> Outcome:
-    """Return what became of a capture that failed. Raises OutputError again, but for BusyError: it ends the batch."""
-    from splinecli.locks import BusyError
+    """Return what became of a capture that failed. Raises OutputError again, if other folders would fail, too."""
+    from splinecli.locks import RefusedFolderError
 
     name = member.name
-    if isinstance(error, OutputError) and not isinstance(error, BusyError):
+    if isinstance(error, OutputError) and not isinstance(error, RefusedFolderError):
         raise error
     if isinstance(error, SplinecliError):
         return failed(name, error)

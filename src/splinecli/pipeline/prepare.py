@@ -157,7 +157,7 @@ def _summary(pixel_set: PixelSet, skipped: list[dict[str, Any]]) -> dict[str, An
         "entries": len(pixel_set.entries),
         "scenes": len({entry.scene for entry in pixel_set.entries}),
         "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
-        "bytes": sum(path.stat().st_size for path in pixel_set.folder.rglob("*.npy")),
+        "bytes": sum((pixel_set.folder / name).stat().st_size for name in pixel_set.file_names),
         "manifest": str(pixel_set.folder / MANIFEST),
         "contact_sheet": str(pixel_set.folder / CONTACT_SHEET) if pixel_set.entries else None,
         "skipped": skipped,

@@ -12,7 +12,7 @@ import numpy as np
 
 from splinecli.errors import InputError, OutputError
 from splinecli.extras import import_extra
-from splinecli.files import file_sha256
+from splinecli.files import file_sha256, replacing
 from splinecli.pixel_sets.captures import free_name
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
@@ -144,9 +144,9 @@ def add_rendered(
 
 
 def save_rendered(rendered: RenderedScene, path: Path) -> None:
-    """Write the pixels of all classes of materials to a file, for load_rendered. Raises OSError."""
+    """Write the pixels of all classes of materials to a file, for load_rendered. Raises OutputError."""
     arrays = {f"{kind}.{name}": getattr(_pixels(rendered, kind), name) for kind in CLASSES for name in ARRAYS}
-    with path.open("wb") as file:
+    with replacing(path) as file:
         np.savez(file, **arrays)
 
 

@@ -75,9 +75,17 @@ class PixelSet:
         content = json.dumps([[entry.name, entry.sha256] for entry in self.entries], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
+    @property
+    def file_names(self) -> list[str]:
+        """The names of the files of all entries."""
+        return [f"{entry.name}/{array}.npy" for entry in self.entries for array in ARRAYS]
+
     def load(self, entry: Entry) -> Pixels:
-        """Map the arrays of an entry into memory. Raises InputError."""
-        return _load(self.folder / entry.name)
+        """Map the arrays of an entry into memory. Raises InputError if they are not what the manifest says."""
+        # As plain arrays, because slicing an np.memmap object takes ten times as long.
+        pixels = Pixels(*(np.asarray(_map(self.folder / entry.name / f"{array}.npy")) for array in ARRAYS))
+        _check_arrays(entry, pixels, self.folder)
+        return pixels
 
 
 def open_pixel_set(folder: Path) -> PixelSet:
@@ -98,7 +106,7 @@ def open_pixel_set(folder: Path) -> PixelSet:
         raise InputError("the pixel set has no entries", path=folder / MANIFEST)
     for entry in pixel_set.entries:
         _check_checksums(entry, folder)
-        _check_shapes(entry, pixel_set.load(entry), folder)
+        pixel_set.load(entry)
     return pixel_set
 
 
@@ -135,62 +143,60 @@ def parse_entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
     if not complete:
         raise InputError("an entry is incomplete (a checksum is missing)", path=folder / MANIFEST)
     for entry in entries:
+        if not all(type(count) is int and count > 0 for count in (entry.n_pixels, entry.n_lights)):
+            raise InputError("a count of an entry is no whole number above 0", path=folder / MANIFEST)
+        if not isinstance(entry.recipe, dict):
+            raise InputError("the recipe of an entry is no table", path=folder / MANIFEST)
         if not all(isinstance(text, str) for text in (entry.name, entry.scene, entry.source)):
             raise InputError("the name, scene or source of an entry is no text", path=folder / MANIFEST)
-        if not entry.name or "\0" in entry.name or Path(entry.name).name != entry.name:
+        if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
             raise InputError(f"{entry.name!r} is not the name of a folder", path=folder / MANIFEST)
     return entries
 
 
 def _check_checksums(entry: Entry, folder: Path) -> None:
-    for array, expected in entry.sha256.items():
-        path = folder / entry.name / f"{array}.npy"
-        found = _sha256(path)
-        if found != expected:
-            raise InputError(
-                f"does not match the manifest: found {found[:16]}, expected SHA-256 {expected[:16]}...",
-                path=path,
-                hint="Make the set again with 'splinecli prepare'",
-            )
+    for array in ARRAYS:
+        path, expected = folder / entry.name / f"{array}.npy", entry.sha256[array]
+        mapped = _map(path)
+        # A file that is longer than its array is not read.
+        is_whole = path.stat().st_size == mapped.offset + mapped.nbytes
+        found = file_sha256(path)[:16] if is_whole else "another length"
+        if found != expected[:16]:
+            raise _mismatch(path, found, f"SHA-256 {expected[:16]}...")
 
 
-def _sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, or why it has none. A file that is longer than its array is not read."""
-    if not path.is_file():
-        return "no such file"
-    try:
-        array: np.memmap[Any, Any] = np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:  # a damaged header fails in a dozen ways
-        if is_out_of_memory(error):
-            raise
-        return "no array"
-    if path.stat().st_size != array.offset + array.nbytes:
-        return "another length"
-    return file_sha256(path)
-
-
-def _check_shapes(entry: Entry, pixels: Pixels, folder: Path) -> None:
-    shapes = {
+def _check_arrays(entry: Entry, pixels: Pixels, folder: Path) -> None:
+    expected = {
         "observations": (entry.n_pixels, entry.n_lights),
         "normals": (entry.n_pixels, 3),
         "light_directions": (entry.n_lights, 3),
     }
-    for array, expected in shapes.items():
-        found = getattr(pixels, array).shape
-        if found != expected:
-            raise InputError(
-                f"does not match the manifest: found an array of shape {found}, expected {expected}",
-                path=folder / entry.name / f"{array}.npy",
-            )
+    for array, shape in expected.items():
+        found = getattr(pixels, array)
+        if found.shape != shape or found.dtype.kind != "f":
+            path = folder / entry.name / f"{array}.npy"
+            raise _mismatch(path, f"an array of shape {found.shape}, {found.dtype}", f"{shape}, float")
+    mask = pixels.mask
+    if mask.ndim != 2 or mask.dtype != bool or np.count_nonzero(mask) != entry.n_pixels:
+        path = folder / entry.name / "mask.npy"
+        raise _mismatch(path, "another mask", f"(H, W), bool, with {entry.n_pixels} true pixels")
 
 
-def _load(folder: Path) -> Pixels:
-    arrays = []
-    for array in ARRAYS:
-        path = folder / f"{array}.npy"
-        try:
-            # As plain arrays, because slicing an np.memmap object takes ten times as long.
-            arrays.append(np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)))
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"cannot be read as an array ({error})", path=path) from error
-    return Pixels(*arrays)
+def _map(path: Path) -> np.memmap[Any, Any]:
+    """Map the array of a file into memory. Raises InputError."""
+    if not path.is_file():
+        raise _mismatch(path, "no such file", "an array")
+    try:
+        return np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # a damaged header fails in a dozen ways
+        if is_out_of_memory(error):
+            raise
+        raise _mismatch(path, "no array", "one") from error
+
+
+def _mismatch(path: Path, found: str, expected: str) -> InputError:
+    return InputError(
+        f"does not match the manifest: found {found}, expected {expected}",
+        path=path,
+        hint="Make the set again with 'splinecli prepare'",
+    )

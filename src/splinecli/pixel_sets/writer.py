@@ -29,7 +29,7 @@ from splinecli.publishing import new_files
 class PixelSetWriter:
     """Writes a new set, or adds entries to an existing one, finished or not.
 
-    An entry and the manifest that names it replace earlier ones together (see new_files).
+    The manifest never names an entry whose files change: it is written without it before, and with it after.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,7 +47,7 @@ class PixelSetWriter:
         elif folder.is_dir() and any(path.name != LOCK for path in folder.iterdir()):
             raise OutputError("has files in it but is not a pixel set", path=folder, hint="Choose another -o")
         else:
-            write_text(folder / MANIFEST, _manifest({}, complete=False))
+            self._write_manifest(complete=False)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -85,35 +85,34 @@ class PixelSetWriter:
         """Write an entry of at least one pixel, in place of an earlier entry of that name.
 
         Raises:
-            OutputError: it cannot be written. The set is then as it was before.
+            OutputError: it cannot be written. The other entries are then as they were before.
         """
         n_pixels, n_lights = pixels.observations.shape
-        with new_files(self.folder, report=MANIFEST) as stage:
-            work = stage / name
-            work.mkdir()
+        checksums = {}
+        with new_files(self.folder, report=None) as new:
             for array in ARRAYS:
-                np.save(work / f"{array}.npy", getattr(pixels, array), allow_pickle=False)
-            checksums = {array: file_sha256(work / f"{array}.npy") for array in ARRAYS}
-            entry = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
-            entries = {**self._entries, name: entry}
-            write_text(stage / MANIFEST, _manifest(entries, complete=False))
-        self._entries = entries
+                with new.open(f"{name}/{array}.npy") as file:
+                    np.save(file, getattr(pixels, array), allow_pickle=False)
+                checksums[array] = file_sha256(Path(file.name))
+            if self._entries.pop(name, None) is not None:
+                self._write_manifest(complete=False)
+        self._entries[name] = Entry(name, scene, source, _plain(recipe), n_pixels, n_lights, checksums)
+        self._write_manifest(complete=False)
 
     def finish(self) -> PixelSet:
         """Mark the set as finished and return it. Raises OutputError."""
-        write_text(self.folder / MANIFEST, _manifest(self._entries, complete=True))
+        self._write_manifest(complete=True)
         return self.pixel_set
 
-
-def _manifest(entries: dict[str, Entry], *, complete: bool) -> str:
-    manifest = {
-        "format": FORMAT,
-        "version": __version__,
-        "complete": complete,
-        "n_pixels": sum(entry.n_pixels for entry in entries.values()),
-        "entries": [asdict(entry) for entry in entries.values()],
-    }
-    return json.dumps(manifest, indent=1) + "\n"
+    def _write_manifest(self, *, complete: bool) -> None:
+        manifest = {
+            "format": FORMAT,
+            "version": __version__,
+            "complete": complete,
+            "n_pixels": sum(entry.n_pixels for entry in self._entries.values()),
+            "entries": [asdict(entry) for entry in self._entries.values()],
+        }
+        write_text(self.folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
 
 
 def _plain(recipe: dict[str, Any]) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from splinecli.errors import InputError, OutputError
-from splinecli.files import read_json
-from splinecli.results.files import NORMALS, PAGE, REPORT
+from splinecli.memory import is_out_of_memory
+from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
 from splinecli.results.templates import render
 
 INDEX = "index.html"
@@ -69,7 +69,7 @@ class Entry(NamedTuple):
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> Entry:
         """Return the entry of a report, or of a document with `capture` and `error`."""
-        words = tuple(warning["text"] for warning in report.get("warnings", ()))
+        words = tuple(str(warning["text"]) for warning in report.get("warnings", ()))
         return cls(row_of(report), tuple(report.get("files", ())), words)
 
 
@@ -127,11 +127,13 @@ def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
     names = {entry.row.capture for entry in entries}
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
-        if path.parent.name in names:
+        if path.parent.name in names or path.parent.is_symlink():
             continue
         try:
-            entry = Entry.of(read_json(path))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            entry = Entry.of(read_report(path.parent))
+        except Exception as error:  # a report of somebody else may be wrong in any way
+            if is_out_of_memory(error):
+                raise
             continue
         if entry.row.capture == path.parent.name:
             earlier.append(entry)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-from splinecli.files import write_bytes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -61,25 +58,22 @@ class Surface:
 
 
 def file_names(formats: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of all files that write_surface may write."""
+    """Return the names of all files that encode_surface may yield."""
     return tuple(name for form in formats for name in SURFACE_FILES[form])
 
 
-def write_surface(folder: Path, surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> None:
-    """Write a surface to the files that SURFACE_FILES names, each complete or not at all.
+def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, bytes]]:
+    """Yield the name and the content of each file of a surface.
 
     Args:
-        folder: the folder of the files; it is made where it does not exist.
         surface: the surface.
         formats: keys of SURFACE_FILES.
 
     Raises:
         InputError: a mesh without triangles cannot be written as GLB.
-        OutputError: a file cannot be written.
     """
     for form in formats:
-        for name, content in _encode(surface, form).items():
-            write_bytes(folder / name, content)
+        yield from _encode(surface, form).items()
 
 
 def _encode(surface: Surface, form: str) -> dict[str, bytes]:

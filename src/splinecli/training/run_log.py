@@ -13,6 +13,7 @@ from splinecli.extras import import_extra
 from splinecli.files import refusals_as_output_errors, write_bytes, write_text
 from splinecli.pictures.observation_maps import observation_map_figure
 from splinecli.pictures.training_curves import training_curves
+from splinecli.publishing import refuse_link
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.validation import SampleMaps
 
@@ -141,15 +142,13 @@ def _set_aside_if_damaged(path: Path) -> Path | None:
 
 def _drop_lines_after(step: int, path: Path) -> None:
     """Remove the lines of later steps from a metrics.csv, or the whole file where no line is left."""
-    if not path.exists():
-        return
-    _, *lines = path.read_text("utf-8").splitlines()
+    lines = path.read_text("utf-8").splitlines()[1:] if path.exists() else []
     kept = [line for line in lines if _step_of(line) <= step]
     if kept:
         write_text(path, "\n".join([_HEADER, *kept]) + "\n")
-    else:  # The run stopped before its first checkpoint.
+    else:  # The run stopped before its first checkpoint, or a link leads nowhere.
         with refusals_as_output_errors(path):
-            path.unlink()
+            path.unlink(missing_ok=True)
 
 
 def _step_of(line: str) -> float:
@@ -164,6 +163,7 @@ def _step_of(line: str) -> float:
 
 
 def _open_events(folder: Path, step: int) -> Any:
+    refuse_link(folder)
     writer = import_extra("torch.utils.tensorboard", "tensorboard").SummaryWriter
     with refusals_as_output_errors(folder):
         return writer(str(folder), purge_step=step + 1)

@@ -1,0 +1,185 @@
+"""An output folder that somebody else prepared: nothing outside of it changes, nothing hangs, no traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splinecli.evaluation.trials import TrialStore
+from splinecli.publishing import UNDONE
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
+
+COMMANDS: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
+    "infer": (
+        ("infer", "sphere", "--method", "ls", "--format", "npy,png8", "-o", "out"),
+        "out/sphere",
+        ("report.json", "normals.npy", "normals_8bit.png", ".lock"),
+    ),
+    "infer here": (
+        ("infer", "sphere", "--method", "ls", "--format", "npy", "-o", "."),
+        "sphere",
+        ("report.json", "normals.npy", "mesh.glb"),
+    ),
+    "integrate": (
+        ("integrate", "n.npy", "--format", "npy,ply", "-o", "out"),
+        "out",
+        ("surface.json", "depth.npy", "mesh.ply", "mesh.glb"),
+    ),
+    "evaluate": (
+        (
+            "evaluate",
+            "sphere",
+            "--method",
+            "ls",
+            "--n-lights",
+            "4",
+            "--trials",
+            "1",
+            "--figures",
+            "-o",
+            "out",
+        ),
+        "out",
+        ("results.json", "results.csv", "trials.jsonl", "lights.png", "figures/sphere.png", "figures"),
+    ),
+    "prepare": (
+        ("prepare", "sphere", "-o", "out"),
+        "out",
+        ("manifest.json", "contact_sheet.png", "sphere/mask.npy", "sphere"),
+    ),
+    "calibrate": (
+        ("calibrate", "ball", "--circle", "60,48,40", "-o", "out"),
+        "out",
+        ("calibration.json", "light_directions.txt", "light_intensities.txt", "calibration.png"),
+    ),
+}
+"""A command, the folder that it writes, and names in it that somebody may have taken."""
+
+PLANTS: dict[str, Callable[[Path, Path], object]] = {
+    "link": lambda path, target: path.symlink_to(target),
+    "dangling": lambda path, target: path.symlink_to(target.with_name("new")),
+    "loop": lambda path, _: path.symlink_to(path.name),
+    "folder": lambda path, _: path.mkdir(),
+    "folder link": lambda path, target: path.symlink_to(target.parent),
+    "pipe": lambda path, _: os.mkfifo(path),
+    "hard link": lambda path, target: path.hardlink_to(target),
+    "wrong": lambda path, _: path.write_bytes(b'{"files": ["../../x", 5, "\\ud800"], "entries": 5}'),
+}
+
+
+@pytest.fixture(autouse=True)
+def alarm():
+    """End what hangs."""
+
+    def hang(*_: object) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, hang)
+    signal.alarm(300)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def inputs(capture):
+    np.save("n.npy", np.tile(np.float32([0, 0, 1]), (8, 9, 1)))
+    Path("ball").mkdir()
+    y, x = np.indices((100, 120))
+    for number in range(3):
+        spot = np.exp(-((x - 50 - 10 * number) ** 2 + (y - 48) ** 2) / 20)
+        picture = np.where(np.hypot(x - 60, y - 48) < 40, 0.02 + 0.9 * spot, 0.2)
+        cv2.imwrite(f"ball/{number}.png", np.rint(picture * 65535).astype(np.uint16))
+    return capture
+
+
+def everything_but(folder: Path) -> dict[str, tuple[object, ...]]:
+    """What is beside a folder: kinds, contents and targets of links."""
+    state: dict[str, tuple[object, ...]] = {}
+    for path in Path().rglob("*"):
+        if not path.is_relative_to(folder) and not (folder.is_relative_to(path) or path.name == "index.html"):
+            status = path.lstat()
+            content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
+            state[str(path)] = status.st_mode, status.st_ino, content
+    return state
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
+    arguments, given, names = COMMANDS[name]
+    again = (*arguments, "--update" if name == "prepare" else "--overwrite")
+    folder = Path(given)
+    keep = shutil.copytree(inputs, "keep") if folder == inputs else None
+    assert run(*arguments).code == 0
+    shutil.copytree(folder, "whole")
+    # `prepare` writes an entry again only if the capture has changed.
+    lights = inputs / "light_directions.txt"
+    lights.write_text(lights.read_text() + "\n")
+    for taken in names:
+        shutil.rmtree(folder)
+        shutil.copytree(keep or "whole", folder)
+        place, target = folder / taken, Path("victim", Path(taken).name).absolute()
+        shutil.rmtree("victim", ignore_errors=True)
+        if place.is_dir():
+            shutil.copytree(place, target)
+            shutil.rmtree(place)
+        else:
+            target.parent.mkdir()
+            target.write_bytes(place.read_bytes() if place.exists() else b"precious")
+            place.unlink(missing_ok=True)
+        if plant == "hard link" and target.is_dir():
+            continue
+        PLANTS[plant](place, target)
+        before = everything_but(folder)
+        for call in (arguments, again):
+            result = run(*call)
+            assert result.code in (0, 3, 5), (taken, call, result.err)
+            assert "Traceback" not in result.err
+            assert everything_but(folder) == before, (taken, call)
+
+
+def test_planted_orders_and_hidden_files(inputs, run):
+    """What earlier versions carried out, and hidden files of the names that the commands make."""
+    Path("victim").write_text("precious")
+    plan = {"remove": ["../victim", "link"], "report": "report.json"}
+    for arguments, given, _ in COMMANDS.values():
+        if arguments[0] == "prepare" or given == "sphere":
+            continue
+        hidden = Path(given, ".new.splinecli-complete")
+        (hidden / "files").mkdir(parents=True)
+        (hidden / "plan.json").write_text(json.dumps(plan))
+        (hidden / "files/report.json").write_text("{}")
+        Path(given, "link").symlink_to(Path("victim").absolute())
+        Path(given, ".scene0.splinecli-unfinished").symlink_to(Path("victim").absolute())
+        Path(given, ".0123456789abcdef.splinecli-unfinished").write_text("left")
+        result = run(*arguments)
+        assert (result.code, UNDONE in result.err) == (0, True)
+        assert Path("victim").read_text() == "precious"
+        assert (hidden / "plan.json").exists() and Path(given, "link").is_symlink()
+        assert not Path(given, ".0123456789abcdef.splinecli-unfinished").exists()
+        shutil.rmtree("out")
+
+
+def test_trials_go_on_in_a_file_of_their_own(tmp_path):
+    """Neither through a link nor through another name of the same file; whole lines stay."""
+    line = json.dumps({"key": "a", "mae_deg": 1.0, "seconds": 1.0, "estimated_intensities": False}) + "\n"
+    elsewhere, path = tmp_path / "elsewhere", tmp_path / "trials.jsonl"
+    elsewhere.write_text(line + line[:20])
+    path.hardlink_to(elsewhere)
+    TrialStore(path)
+    assert (path.read_text(), path.samefile(elsewhere)) == (line, False)
+    path.unlink()
+    path.symlink_to(elsewhere)
+    TrialStore(path)
+    assert (path.read_text(), path.is_symlink()) == ("", False)
+    assert elsewhere.read_text() == line + line[:20]
