@@ -5,7 +5,7 @@
 DATA has the folders DiLiGenT/pmsData, synth/L17, uw, psbox and merl_nbrdf. Everything together takes hours on two
 cores. Each row is stored in docs/figures.json when it is done, with the version and the weights; rows of the shipped
 weights are not measured again, and a stopped evaluation goes on in --results. --only names measurements, or a row of
-one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a quiet machine, which --machine describes.
+one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a quiet machine.
 """
 
 from __future__ import annotations
