@@ -113,6 +113,7 @@ class Bench:
             for name, value in zip(
                 (*tables.EXPOSED, *tables.INTENSITIES), (*exposed, *unknown[2:]), strict=True
             )
+            if np.isfinite(value)  # without its saturated values, a pixel may have too few
         }
 
     def confidence(self, capture: str) -> Cells:
