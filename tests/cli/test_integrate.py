@@ -239,9 +239,9 @@ def test_a_decimated_mesh_and_its_textures(run):
 
     green = np.zeros((*SHAPE, 3), np.uint8)
     green[..., 1] = 180
-    cv2.imwrite("albedo.png", green)  # beside the normal map, as infer writes it
-    arguments = ["--decimate", 100, "--format", "glb,ply,obj", "--json"]
-    report = json.loads(run("integrate", ".", "-o", "out", *arguments).out)
+    cv2.imwrite("albedo.png", green)
+    arguments = ["--colours", "albedo.png", "--decimate", 100, "--format", "glb,ply,obj", "--json"]
+    report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
     assert (report["normal_texture"], report["colours"]) == (True, "albedo.png")
     assert 80 <= report["n_triangles"] <= 100
     assert report["files"] == ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "surface.json"]
