@@ -95,12 +95,12 @@ def test_a_pipe_in_place_of_the_lock_is_refused(capture, run):
 
 
 @posix
-def test_a_pipe_in_place_of_stored_scores_is_refused(capture, run):
+def test_a_pipe_in_place_of_stored_scores_is_replaced(capture, run):
     Path("evaluation").mkdir()
     os.mkfifo("evaluation/trials.jsonl")
     result = run("evaluate", capture, "--method", "ls", "--n-lights", 4, "--trials", 1)
-    message = "splinecli: evaluation/trials.jsonl: is not a file. Remove it, or choose another -o.\n"
-    assert (result.code, result.err) == (5, message)
+    assert (result.code, result.err) == (0, "")
+    assert Path("evaluation/trials.jsonl").is_file()
 
 
 def test_a_zero_byte_in_a_list_of_images(capture, run):

@@ -157,7 +157,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         for name, content in encode_surface(surface, options.formats):
             new.write(name, content)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [*new.sizes, SURFACE_REPORT]
+        report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     return report
 
