@@ -35,6 +35,7 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     normals, _, inside = sphere()
     np.save("normals.npy", normals)
+    Path("report.json").write_text('{"files": ["normals.npy", "normals.png"]}')
     cv2.imwrite("normals.png", encode_picture(normals, inside)[..., ::-1])
     cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
 
@@ -55,7 +56,7 @@ def test_heights_and_mesh_of_a_sphere(run):
     assert f"out: {inside.sum()} pixels, from " in result.out
 
 
-@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"]])
+@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"], ["."]])
 def test_formats_of_normal_maps(run, arguments):
     assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
     _, heights, inside = sphere()
