@@ -15,7 +15,7 @@ import pytest
 import tifffile
 
 from splinecli.capture import Overrides, find_capture_files, open_capture, read_capture
-from splinecli.capture.formats.header import stated_curve, stated_white_level
+from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
@@ -101,9 +101,7 @@ def test_a_file_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None
 def test_headers_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None]) -> None:
     forbid(folder / "1.tif")
     with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
-        stated_curve(folder / "1.tif")
-    with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
-        stated_white_level(folder / "1.tif")
+        print(read_facts(folder / "1.tif").size)
 
 
 def test_an_image_that_vanishes(folder: Path) -> None:

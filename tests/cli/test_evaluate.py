@@ -246,16 +246,16 @@ def test_the_white_level_is_used_and_named(overexposed, run):
 
 def test_an_unreadable_file_skips_its_capture(dataset, run, monkeypatch):
     """Permissions do not stop the superuser, so the refusal is simulated."""
-    from splinecli.capture import source
+    from splinecli.capture import linearise
 
-    decode = source.decode_image
+    decode = linearise.decode_image
 
     def refuse(path, *arguments):
         if path.parent.name == "matte":
             raise PermissionError(13, "Permission denied", str(path))
         return decode(path, *arguments)
 
-    monkeypatch.setattr(source, "decode_image", refuse)
+    monkeypatch.setattr(linearise, "decode_image", refuse)
     result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")
     assert result.code == 3
     document = json.loads(result.out)
