@@ -78,7 +78,7 @@ def common_orientation(images: Sequence[ImageFacts]) -> int:
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
     stated = [(facts.exif or {}).get(ORIENTATION) for facts in asked]
-    orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
+    orientations = [value if isinstance(value, int) and value in range(1, 9) else UPRIGHT for value in stated]
     for facts, orientation in zip(asked, orientations, strict=True):
         if orientation != orientations[0]:
             raise InputError(
