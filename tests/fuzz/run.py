@@ -182,7 +182,7 @@ def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> I
         yield f"exit code {ended.code}"
     if "Traceback" in ended.err or "defect" in ended.err:
         yield "traceback"
-    if "Warning:" in ended.err:
+    if any("Warning:" in line and "/trimesh/" not in line for line in ended.err.split("\n")):
         yield "a warning of Python"
     told = [line for line in ended.err.split("\n") if line.startswith("splinecli: ") and not _is_note(line)]
     if ended.code and len(told) != 1:
