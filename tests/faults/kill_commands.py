@@ -34,7 +34,7 @@ from sync_order import missing_syncs, record_calls  # noqa: E402
 
 from kills import changes_files, content  # noqa: E402
 
-_MEASURED = re.compile(rb'("(?:read|estimate|write|seconds|peak_memory_mib|minutes)\\?": ?)[\d.e-]+')
+_MEASURED = re.compile(rb'("(?:seconds|peak_memory_mib|minutes)\\?": ?)(?:[\d.e-]+|{[^}]*})')
 
 
 @dataclass(frozen=True)

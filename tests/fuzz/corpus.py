@@ -31,14 +31,16 @@ class Target:
         write: writes its files into an empty folder.
         files: patterns of the files that are mutated.
         commands: the arguments of each command that reads them.
-        earlier: the command whose output is there before; None for the first of `commands`.
+        earlier: the commands whose output is there before; the first of `commands` if there is none.
+        grows: whether a command that fails late has already added to the earlier output.
     """
 
     name: str
     write: Callable[[Path], None]
     files: tuple[str, ...]
     commands: tuple[str, ...]
-    earlier: str | None = None
+    earlier: tuple[str, ...] = ()
+    grows: bool = False
 
 
 def normals() -> np.ndarray:
@@ -129,6 +131,18 @@ def normal_maps(folder: Path) -> None:
     (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
 
 
+def profiles(folder: Path) -> None:
+    """Images with a colour profile, in each format that has one."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for ending in ("png", "tif", "jpg"):
+        (folder / ending).mkdir()
+        for number, light in enumerate(LIGHTS[:4]):
+            gray = (shaded(light) // 257).astype(np.uint8)
+            picture = Image.fromarray(np.dstack([gray] * 3))
+            picture.save(folder / ending / f"{number}.{ending}", icc_profile=profile)
+        np.savetxt(folder / ending / "light_directions.txt", LIGHTS[:4])
+
+
 def mirror_ball(folder: Path) -> None:
     y, x = np.indices((40, 50))
     nx, ny = (x - 25) / 16, (20 - y) / 16
@@ -146,10 +160,7 @@ def mirror_ball(folder: Path) -> None:
     for name in ("ball", "gray"):
         cv2.imwrite(str(folder / name / "mask.png"), inside.astype(np.uint8) * 255)
     np.savetxt(folder / "known.txt", LIGHTS[:4])
-    (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    with Image.open(folder / "gray/0.png") as image:
-        image.save(folder / "gray/0.png", icc_profile=profile)
+    (folder / "camera.txt").write_text("500 0 25\n0 500 20\n0 0 1\n")
 
 
 def thin(folder: Path) -> None:
@@ -174,9 +185,17 @@ def meshes(folder: Path) -> None:
 
 
 def earlier_results(folder: Path) -> None:
-    """A capture whose results are read again: reports, finished trials."""
+    """Captures whose results are read again: reports, thumbnails, finished trials."""
+    for name in ("capture", "second"):
+        (folder / name).mkdir()
+        png_capture(folder / name)
+
+
+def pixel_set(folder: Path) -> None:
     (folder / "capture").mkdir()
     png_capture(folder / "capture")
+    shutil.copytree(folder / "capture", folder / "second")
+    write_settings(folder)
 
 
 def weights(folder: Path) -> None:
@@ -204,6 +223,10 @@ def training(folder: Path) -> None:
     for name in "ab":
         writer.add(name, name, "a test", {"by": "hand"}, matte_pixels(12, 6))
     writer.finish()
+    write_settings(folder)
+
+
+def write_settings(folder: Path) -> None:
     (folder / "a.toml").write_text(
         "steps = 1\nbatch_size = 4\nseed = 3\nlearning_rate = 1e-3\nschedule = 'cosine'\nheld_share = 0.0\n"
         "[pixels]\nmin_lights = 4\nmax_lights = 6\nusual_lights = 5\n"
@@ -277,21 +300,48 @@ TARGETS = (
         mirror_ball,
         ("*/*", "known.txt"),
         (
-            "calibrate ball --gray-ball gray --compare known.txt --camera-matrix camera.txt -o out --overwrite",
+            "calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",
+            "calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite",
         ),
+    ),
+    Target(
+        "profiles",
+        profiles,
+        ("*/*.*",),
+        tuple(
+            f"{command} {ending}{options}"
+            for ending in ("png", "tif", "jpg")
+            for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
+        ),
+    ),
+    Target(
+        "set",
+        pixel_set,
+        ("out/set/*", "out/set/*/*"),
+        (
+            "prepare capture second -o out/set",
+            "prepare capture -o out/set --update",
+            "train out/set -o out/run -q --config a.toml",
+        ),
+        earlier=("prepare capture -o out/set",),
+        grows=True,
     ),
     Target(
         "earlier",
         earlier_results,
-        ("out/*/*.json", "out/*.jsonl", "out/*/*.npy", "out/index.html"),
+        ("out/*/*.json", "out/*.json", "out/*.jsonl", "out/*/*.npy", "out/*/*.png", "out/index.html"),
         (
             "infer capture --method ls -o out",
+            "infer second --method ls -o out --html --surface",
             "infer capture --method ls -o out --update",
             "integrate out/capture -o out/capture --overwrite",
             "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite",
             "prepare capture -o out/set",
         ),
-        earlier="evaluate capture --method ls --n-lights 4 --trials 1 -o out",
+        earlier=(
+            "evaluate capture --method ls --n-lights 4 --trials 1 -o out",
+            "infer capture --method ls -o out",
+        ),
     ),
     Target(
         "weights",
@@ -308,7 +358,7 @@ TARGETS = (
         training,
         ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"),
         (f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1"),
-        earlier=f"{TRAIN} --config a.toml",
+        earlier=(f"{TRAIN} --config a.toml",),
     ),
 )
 
@@ -327,15 +377,16 @@ def write_corpus(
         names: names of targets; empty for all.
     """
     targets = [target for target in TARGETS if not names or target.name in names]
+    folder.mkdir()
     for target in targets:
-        for tried in (True, False):
-            case.mkdir(parents=True)
-            target.write(case)
-            first = target.earlier or target.commands[0]
-            for command in dict.fromkeys((first, *(target.commands if tried else target.commands[:1]))):
+        case.mkdir(parents=True)
+        target.write(case)
+        earlier = target.earlier or target.commands[:1]
+        for command in earlier:
+            assert run(case, command) == 0, command
+        shutil.copytree(case, folder / target.name)
+        for command in target.commands:
+            if command not in earlier:
                 assert run(case, command) == 0 or ".ckpt" in command, command
-            if tried:
-                shutil.rmtree(case)
-        folder.mkdir(exist_ok=True)
-        case.rename(folder / target.name)
+        shutil.rmtree(case)
     return targets

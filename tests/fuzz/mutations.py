@@ -8,6 +8,7 @@ import os
 import random
 import re
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import tifffile
+from PIL import Image
 from scipy.io import savemat
 
 ODD_NUMBERS = (
@@ -160,7 +162,17 @@ def png_header(data: bytes, rng: random.Random) -> bytes:
 
 @cache
 def _bomb(suffix: str) -> bytes:
-    """Return a whole file of many zeros: a picture of 8000 x 8000 pixels, or normals of 4000 x 4000."""
+    """Return a whole file of many zeros: a picture of 8000 x 8000 pixels, normals of 4000 x 4000, or weights."""
+    if suffix == ".safetensors":  # many empty tensors
+        empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
+        header = json.dumps({f"t{number}": empty for number in range(10_000)}).encode()
+        return struct.pack("<Q", len(header)) + header
+    if suffix == ".ckpt":
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+            file.writestr("archive/data.pkl", b"\x80\x02}q\x00.")
+            file.writestr("archive/data/0", bytes(100_000_000))
+        return packed.getvalue()
     rows = zlib.compress(bytes(8000 * 8001), 1)
     if suffix == ".png":
         parts = (
@@ -222,6 +234,58 @@ def _another_type(content: bytes, rng: random.Random) -> bytes:
     return content[:place] + struct.pack("<I", kind) + content[place + 4 :]
 
 
+def npy_header(data: bytes, rng: random.Random) -> bytes:
+    """Change the shape or the type in the header of a .npy file."""
+    end = 10 + int.from_bytes(data[8:10], "little")
+    header = data[10:end].decode("latin-1")
+    if rng.random() < 0.5:
+        shape = rng.choice(
+            (
+                "(100000, 100000, 3)",
+                "(-1, 3)",
+                "()",
+                "(0, 0, 3)",
+                "(3,)",
+                "(2, 2, 3, 1)",
+                "(1" + "," * 99 + ")",
+            )
+        )
+        header = re.sub(r"'shape': \([^)]*\)", f"'shape': {shape}", header)
+    else:
+        kind = rng.choice(
+            ("|O", "<U9", "<c16", "|b1", ">f2", "<f16", "|V8", "<M8[s]", "|S99999999", "<i8", "<u1", "x")
+        )
+        header = re.sub(r"'descr': '[^']*'", f"'descr': '{kind}'", header)
+    text = header.encode("latin-1")
+    return data[:8] + struct.pack("<H", len(text)) + text + data[end:]
+
+
+def profile(data: bytes, rng: random.Random) -> bytes:
+    """Write an image anew with a damaged colour profile."""
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            old, buffer = image.info["icc_profile"], io.BytesIO()
+            change = rng.choice((flip, flip_header, cut, odd_word, odd_word, fill, _tag, _tag, _tag))
+            image.save(buffer, image.format, icc_profile=change(old, rng))
+        return buffer.getvalue()
+    except Exception:
+        return flip_header(data, rng)
+
+
+def _tag(data: bytes, rng: random.Random) -> bytes:
+    """Change a word in the table of a profile, or in one of its curves."""
+    count = int.from_bytes(data[128:132], "big")
+    entry = 132 + 12 * rng.randrange(count)
+    place = entry + 4 * rng.randrange(3)
+    if rng.random() < 0.7:
+        curve = data.find(rng.choice((b"para", b"curv")))
+        place = max(curve, 0) + 4 * rng.randrange(9)
+    word = rng.choice(
+        (b"para", b"curv", *(struct.pack(">i", n) for n in (0, 1, 3 << 16, 4, -1, -(2**31), 2**31 - 1)))
+    )
+    return data[:place] + word + data[place + 4 :]
+
+
 OF_TEXTS = (number, number, number, lines, lines)
 
 
@@ -232,7 +296,7 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
     choices = [*OF_BYTES]
     if path.suffix in _TEXTS:
         choices += OF_TEXTS * 2 + (long,)
-    if path.suffix in (".png", ".tif", ".mat"):
+    if path.suffix in (".png", ".tif", ".mat", ".safetensors", ".ckpt"):
         choices.append(lambda _, __: _bomb(path.suffix))
     if path.suffix == ".mat":
         choices += [mat_type] * 8
@@ -240,6 +304,10 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
         choices += [json_value] * 15
     if path.suffix == ".png":
         choices += [png_header] * 4
+    if path.suffix == ".npy":
+        choices += [npy_header] * 8
+    if path.parent.name == path.suffix[1:]:  # images with profiles
+        choices += [profile] * 25
     if path.suffix == ".safetensors":
         choices += [safetensors_header] * 20
     change = rng.choice(choices)

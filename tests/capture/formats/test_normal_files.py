@@ -184,6 +184,15 @@ def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> No
         read_normal_map(path)
 
 
+def test_a_huge_value_of_a_damaged_file_overflows_nothing(
+    tmp_path: Path, normals: NDArray[np.float64]
+) -> None:
+    damaged = normals.astype(np.float32)
+    damaged[3, 4] = 1e30
+    np.save(tmp_path / "a.npy", damaged)
+    np.testing.assert_allclose(np.linalg.norm(read_normal_map(tmp_path / "a.npy")[3, 4]), 1, atol=1e-6)
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_picture_saved_by_numpy(tmp_path: Path, normals: NDArray[np.float64], bits: int) -> None:
     has_normal = normals.any(axis=2)

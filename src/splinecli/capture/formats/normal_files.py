@@ -32,6 +32,7 @@ _GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", *PICTURE_SUFFIXES)
 _CLEARLY_BETTER = 0.02  # share of the mask's pixels
 _LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or JPEG
 _FEWEST_UNIT = 0.6  # share in a picture of normals; in photographs a third has unit length by chance
+_LARGEST = 1e100  # values of damaged files may have an infinite square
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
 
 
@@ -125,10 +126,10 @@ def _to_normals(
 
 def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) -> None:
     """Raise InputError for colours or vectors (H, W, 3) that are no directions, such as those of a photograph."""
-    vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float32)
+    vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float64)
     if stored.dtype.kind == "u":
         vectors = vectors * (2 / np.iinfo(stored.dtype).max) - 1
-    length = np.linalg.norm(vectors[np.isfinite(vectors).all(axis=1)], axis=1)
+    length = np.linalg.norm(vectors[(np.abs(vectors) < _LARGEST).all(axis=1)], axis=1)
     # Half of a picture may be gray background, whose length is 0.
     usable = length > SHORTEST_IN_PICTURE if stored.dtype.kind == "u" else length > 0
     if not usable.any():
@@ -153,8 +154,7 @@ def _is_upside_down(stored: NDArray[Any], mask: NDArray[np.bool_]) -> bool:
 def _unit_or_zero(stored: NDArray[Any]) -> NDArray[np.float64]:
     """Return vectors (P, 3) at unit length; zero where they are zero or not finite."""
     vectors = stored.astype(np.float64)
-    # NaN, infinity, and the values of a damaged file whose square would be infinite, are not usable.
-    usable = (np.abs(vectors) < 1e100).all(axis=1, keepdims=True)
+    usable = (np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True)
     length = np.linalg.norm(np.where(usable, vectors, 0), axis=1, keepdims=True)
     scaled: NDArray[np.float64] = np.divide(
         vectors, length, out=np.zeros_like(vectors), where=usable & (length > 0)
