@@ -49,10 +49,6 @@ def test_the_same_image_twice(mask: NDArray[np.bool_]) -> None:
     assert repeated_images(observations) == [(2, 7)]
 
 
-def test_uniform_images_are_not_repeated() -> None:
-    assert repeated_images(np.ones((50, 4))) == []
-
-
 def test_the_spread_of_lights() -> None:
     ring = np.array([(np.cos(a), np.sin(a), 1) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)])
     ring /= np.sqrt(2)

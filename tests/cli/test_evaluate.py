@@ -38,28 +38,6 @@ def test_files_and_table(dataset, run, golden):
     assert document["averages"]["ls"] == pytest.approx((matte["mae_deg"] + shaded["mae_deg"]) / 2, abs=1e-4)
 
 
-def test_the_draw_of_infer_is_the_first_of_evaluate(dataset, run):
-    (report,) = json.loads(
-        run("infer", dataset / "shaded", "--method", "ls", "--n-lights", 5, "--seed", 3, "--json").out
-    )
-    document = json.loads(
-        run(
-            "evaluate",
-            dataset / "shaded",
-            "--method",
-            "ls",
-            "--n-lights",
-            5,
-            "--seed",
-            3,
-            "--trials",
-            1,
-            "--json",
-        ).out
-    )
-    assert document["results"][0]["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
-
-
 @pytest.fixture
 def overexposed(make_capture):
     """A capture whose lights are unequally bright, which no file says, and whose brightest observations are clipped."""
@@ -212,17 +190,6 @@ def test_figures(dataset, run):
     assert not list(Path("evaluation/figures").iterdir())
 
 
-def test_weights_are_named_and_their_lights_warned_about(dataset, run):
-    result = run(
-        "evaluate", dataset / "matte", "--method", "cnn-ps", "--n-lights", 5, "--trials", 1, "--max-pixels", 9
-    )
-    assert result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 5.\n"
-    used = json.loads(Path("evaluation/results.json").read_text())["methods"]["cnn-ps"]
-    assert used["weights"]["name"] == "cnn-ps"
-    assert len(used["weights"]["sha256"]) == 64
-    assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
-
-
 def test_all_methods_by_one_word(dataset, run):
     document = json.loads(
         run(
@@ -242,23 +209,3 @@ def test_the_white_level_is_used_and_named(overexposed, run):
     assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
     assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
     assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()
-
-
-def test_an_unreadable_file_skips_its_capture(dataset, run, monkeypatch):
-    """Permissions do not stop the superuser, so the refusal is simulated."""
-    from splinecli.capture import source
-
-    decode = source.decode_image
-
-    def refuse(path, *arguments):
-        if path.parent.name == "matte":
-            raise PermissionError(13, "Permission denied", str(path))
-        return decode(path, *arguments)
-
-    monkeypatch.setattr(source, "decode_image", refuse)
-    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")
-    assert result.code == 3
-    document = json.loads(result.out)
-    assert [entry["capture"] for entry in document["skipped"]] == ["matte"]
-    assert ".png: cannot be read (Permission denied)" in document["skipped"][0]["reason"]
-    assert [entry["capture"] for entry in document["results"]] == ["shaded"]

@@ -55,13 +55,6 @@ def test_heights_and_mesh_of_a_sphere(run):
     assert f"out: {inside.sum()} pixels, from " in result.out
 
 
-@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"]])
-def test_formats_of_normal_maps(run, arguments):
-    assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
-    _, heights, inside = sphere()
-    assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
-
-
 @pytest.mark.parametrize("given", [[], ["--convention", "directx"]], ids=["found", "given"])
 @pytest.mark.parametrize("form", ["png", "png8", "npy", "tiff"])
 def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
@@ -102,15 +95,6 @@ def test_a_background_that_is_not_black(run, where):
     assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
 
 
-def test_results_of_infer_stay_together(run, capture):
-    assert run("infer", str(capture), "--method", "ls", "-o", "results").code == 0
-    folder = Path("results") / capture.name
-    assert run("integrate", str(folder), "-q").code == 0
-    assert {"normals.npy", "depth.npy", "mesh.ply", "surface.json"} <= {
-        path.name for path in folder.iterdir()
-    }
-
-
 @pytest.mark.parametrize(
     "view",
     [
@@ -145,14 +129,6 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
         )
         np.testing.assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)
         np.testing.assert_array_equal(one.faces, other.faces)
-
-
-def test_options_of_a_folder_of_results_concern_the_photographs(run, capture):
-    """--pixel-size of `integrate` means what it means to `infer`."""
-    for output, more in (("out", []), ("sized", ["--surface", "--pixel-size", 0.5])):
-        assert run("infer", capture, "--method", "ls", "--scale", "1/2", *more, "-o", output).code == 0
-    assert run("integrate", "out/sphere", "--pixel-size", 0.5, "--format", "npy").code == 0
-    assert Path("out/sphere/depth.npy").read_bytes() == Path("sized/sphere/depth.npy").read_bytes()
 
 
 def test_a_report_that_says_nothing_of_the_camera_is_refused(run, capture):
@@ -321,15 +297,3 @@ def test_normals_in_a_folder_without_report_are_refused(run):
     assert result.code == 3
     assert "results: the folder has no whole results of infer: it has no report.json" in result.err
     assert run("integrate", "results/normals.npy", "-o", "out", "--format", "npy").code == 0
-
-
-def test_quiet_prints_nothing(run):
-    result = run("integrate", "normals.npy", "-o", "out", "-q")
-    assert (result.code, result.out, result.err) == (0, "", "")
-
-
-def test_home_folder_in_paths(run, tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    result = run("integrate", "~/normals.npy", "--output=~/out", "--format", "npy")
-    assert (result.code, result.out.split(":")[0]) == (0, f"{tmp_path}/out")
-    assert not Path("~").exists()

@@ -119,11 +119,7 @@ def test_wrong_files_are_named(run, bump: Path) -> None:
         ("pixel_size.txt", "1 2\n", 'pixel_size.txt:1: found "1 2", expected one number above 0'),
         ("pixel_size.txt", "# width\n0.9 mm\n", 'pixel_size.txt:2: found "0.9 mm", expected one number'),
         ("camera_matrix.txt", "1 2\n3 4\n", "camera_matrix.txt: found 2 x 2 numbers, expected 3 x 3"),
-        (
-            "light_positions.txt",
-            "1 2 -3\n" * 7,
-            "light_positions.txt:1: found a lamp behind the object",
-        ),
+        ("light_positions.txt", "1 2 -3\n" * 7, "light_positions.txt:1: found a lamp behind the object"),
         ("light_positions.txt", "0 0 0\n" * 7, "found a zero vector, expected a lamp position"),
         ("light_positions.txt", "1 2 3\n" * 5, "found 5 lamp positions, expected 7"),
     ):
@@ -191,16 +187,6 @@ def test_evaluate_and_prepare(run, bump: Path) -> None:
     assert "near lamps, and training needs distant lights" in refused.err
 
 
-def test_positions_are_no_angles(run, bump: Path) -> None:
-    np.savetxt(bump / "light_positions.txt", POSITIONS)
-    (bump / "pixel_size.txt").write_text("2\n")
-    result = run("infer", "bump", "--method", "ls", "--lights-format", "azel")
-    assert result.code == 2
-    assert (
-        "--lights-format azel concerns light directions, but bump/light_positions.txt has pos" in result.err
-    )
-
-
 def test_albedo_and_saturation(run, bump: Path) -> None:
     """The bump has one albedo, and pixels that are clipped at 70 % of the brightest are restored."""
     np.savetxt(bump / "light_positions.txt", POSITIONS)
@@ -215,16 +201,3 @@ def test_albedo_and_saturation(run, bump: Path) -> None:
     if albedo is None:
         albedo = cv2.imread("out/bump/albedo.png", cv2.IMREAD_UNCHANGED).astype(float)
     assert albedo.std() < 0.03 * albedo.mean()
-
-
-def test_the_surface_is_seen_by_the_camera_of_the_lamps(run, bump: Path) -> None:
-    """What `infer --surface` integrates is what `integrate` makes of its normals with the same camera matrix."""
-    np.savetxt(bump / "light_positions.txt", POSITIONS)
-    (bump / "pixel_size.txt").write_text("2\n")
-    np.savetxt(bump / "camera_matrix.txt", ((100, 0, 15.5), (0, 100, 15.5), (0, 0, 1)))
-    report = infer(run, "--surface")
-    assert report["surface"]["camera"] == report["near_lamps"]["camera"] == "perspective"
-    assert report["surface"]["unit"] == "mean depth"
-    matrix = ["--camera-matrix", bump / "camera_matrix.txt", "--format", "npy"]
-    assert run("integrate", "out/bump", "-o", "again", *map(str, matrix)).code == 0
-    np.testing.assert_array_equal(np.load("again/depth.npy"), np.load("out/bump/depth.npy"))

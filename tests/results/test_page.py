@@ -129,19 +129,6 @@ def test_figures_and_pictures() -> None:
     assert {"0°", "30° or more"} <= set(page.text["span"])
 
 
-def test_what_is_not_given_is_absent() -> None:
-    normals, mask = sphere(40)
-    html = result_page(
-        {**REPORT, "weights": None, "angular_error_deg": None, "expected_under_5": None}, normals, mask
-    )
-    page = Page(html)
-    assert page.alternative_texts == ["Normal map", ""]
-    assert not {"Weights", "Mean", "Likely within 5°", "Size on this page"} & set(page.facts)
-    assert "Warnings" not in page.text["h2"]
-    assert 'id="coloured"' not in html
-    assert "or more" not in "".join(page.text["figcaption"])
-
-
 def test_names_are_text() -> None:
     normals, mask = sphere(40)
     hostile = {"capture": HOSTILE, "method": HOSTILE, "device": HOSTILE, "version": HOSTILE}
