@@ -1,9 +1,8 @@
-"""A small analytic capture, a way to run the command line in this process, and golden files."""
+"""A small analytic capture, and ways to run the command line."""
 
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -16,9 +15,7 @@ import numpy as np
 import pytest
 
 from splinecli.cli.main import main
-from splinecli.results.clock import STAGES
 
-GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 SIZE = 24
 LIGHTS = np.array(
     [
@@ -118,27 +115,3 @@ def run_without_privileges() -> Callable[..., Run]:
         return Run(done.returncode, done.stdout, done.stderr)
 
     return call
-
-
-@pytest.fixture
-def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
-    """Compare a text with tests/golden/<name>; `pytest --update-golden` writes it anew, and the diff is read.
-
-    What differs from run to run (seconds, memory, version) is blanked out.
-    """
-
-    def check(name: str, text: str) -> None:
-        path = GOLDEN / name
-        text = _without_measurements(text)
-        if request.config.getoption("--update-golden"):
-            path.write_text(text, "utf-8")
-        assert text == path.read_text("utf-8")
-
-    return check
-
-
-def _without_measurements(text: str) -> str:
-    """The text with seconds, memory, version and absolute paths blanked out."""
-    text = re.sub(rf'("(?:{"|".join(STAGES)}|total|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text)
-    text = re.sub(r", [\d.]+ s\n", ", ... s\n", text)
-    return re.sub(r'("(?:version|inputs_sha256|folder|light_file)": )"[^"]*"', r'\1"..."', text)
