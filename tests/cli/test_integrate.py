@@ -11,7 +11,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from bump_capture import POSITIONS, write_bump
+from scenes import BUMP_LAMPS, write_bump
 from splinecli.capture.capture_size import results_bytes
 from splinecli.capture.formats import image_size
 from splinecli.normals import encode_picture
@@ -110,7 +110,7 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     """Camera, pixel size and frame of the results are in their report."""
     import trimesh
 
-    np.savetxt("lamps.txt", POSITIONS)
+    np.savetxt("lamps.txt", BUMP_LAMPS)
     Path("camera.txt").write_text("100 0 15.5\n0 100 15.5\n0 0 1\n")
     folder = write_bump(Path("bump")) if "lamps.txt" in VIEWS[view] else capture
     arguments = ["--method", "ls", "--maps", "albedo", "--surface", "--mesh-format", "ply,glb", "--json"]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bump_capture import POSITIONS, WIDTH_MM, write_bump
+from scenes import BUMP_LAMPS, BUMP_MM, write_bump
 
 
 @pytest.fixture
@@ -30,18 +30,18 @@ def mean_error(report: dict) -> float:
 
 def test_one_distance_for_all_lamps(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    positions = 170 * POSITIONS / np.linalg.norm(POSITIONS, axis=1, keepdims=True)
+    positions = 170 * BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
     folder = write_bump(Path("bump"), positions)
     np.savetxt(folder / "light_directions.txt", positions / 170)
-    assert mean_error(infer(run, "--light-distance", 170, "--object-width", WIDTH_MM)) < 0.1
+    assert mean_error(infer(run, "--light-distance", 170, "--object-width", BUMP_MM)) < 0.1
     assert mean_error(infer(run)) > 5
-    assert mean_error(infer(run, "--light-distance", 200, "--object-width", WIDTH_MM)) < 3
+    assert mean_error(infer(run, "--light-distance", 200, "--object-width", BUMP_MM)) < 3
 
 
 @pytest.fixture
 def near(bump: Path) -> Path:
     """The bump with the files that tell where its lamps are."""
-    np.savetxt(bump / "light_positions.txt", POSITIONS)
+    np.savetxt(bump / "light_positions.txt", BUMP_LAMPS)
     (bump / "pixel_size.txt").write_text("2\n")
     return bump
 
@@ -51,33 +51,33 @@ def test_files_and_options_mean_the_same(run, near: Path) -> None:
     assert mean_error(report) < 0.1
     assert report["warnings"] == []
     assert report["near_lamps"]["pixel_size"] == 2
-    assert report["near_lamps"]["distances"] == pytest.approx(np.linalg.norm(POSITIONS, axis=1), abs=1e-3)
+    assert report["near_lamps"]["distances"] == pytest.approx(np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3)
     assert "lamps        near, as in bump/light_positions.txt; a pixel is 2 wide" in run("info", "bump").out
     # A changed position is a change of the capture.
-    moved = POSITIONS.copy()
+    moved = BUMP_LAMPS.copy()
     moved[0] += 5
     np.savetxt(near / "light_positions.txt", moved)
     assert "other input files" in run("infer", "bump", "--method", "ls").err
     for name in ("light_positions.txt", "pixel_size.txt"):
         (near / name).unlink()
-    np.savetxt("lamps.txt", POSITIONS)
-    for scale in (("--pixel-size", 2), ("--object-width", WIDTH_MM)):
+    np.savetxt("lamps.txt", BUMP_LAMPS)
+    for scale in (("--pixel-size", 2), ("--object-width", BUMP_MM)):
         assert mean_error(infer(run, "--light-positions", "lamps.txt", *scale)) < 0.1
     # The same file as directions: distant lights, and without a scale nothing to warn of.
     assert mean_error(infer(run, "--lights", "lamps.txt")) > 5
 
 
 def test_distant_lights_despite_positions_are_warned_of(run, near: Path) -> None:
-    np.savetxt("directions.txt", POSITIONS)
+    np.savetxt("directions.txt", BUMP_LAMPS)
     (warning,) = infer(run, "--lights", "directions.txt")["warnings"]
     assert warning["code"] == "near_lamps"
     # The middles of the outermost pixels.
     corners = np.array([(x, y, 0) for x in (-31, 31) for y in (-31, 31)])
-    towards = POSITIONS[:, None] - corners
-    cosine = (towards * POSITIONS[:, None]).sum(axis=2) / np.linalg.norm(towards, axis=2)
-    angle = np.degrees(np.arccos(cosine / np.linalg.norm(POSITIONS, axis=1)[:, None])).max()
+    towards = BUMP_LAMPS[:, None] - corners
+    cosine = (towards * BUMP_LAMPS[:, None]).sum(axis=2) / np.linalg.norm(towards, axis=2)
+    angle = np.degrees(np.arccos(cosine / np.linalg.norm(BUMP_LAMPS, axis=1)[:, None])).max()
     assert f"a light direction changes by up to {angle:.0f} degrees" in warning["text"]
-    np.savetxt(near / "light_positions.txt", 10 * POSITIONS)
+    np.savetxt(near / "light_positions.txt", 10 * BUMP_LAMPS)
     assert infer(run, "--lights", "directions.txt")["warnings"] == []
 
 
@@ -96,8 +96,8 @@ REFUSED = [
 
 @pytest.mark.parametrize(("arguments", "code", "message"), REFUSED)
 def test_refused_options(run, bump: Path, arguments: str, code: int, message: str) -> None:
-    np.savetxt(bump / "light_directions.txt", POSITIONS)
-    np.savetxt("l.txt", POSITIONS)
+    np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
+    np.savetxt("l.txt", BUMP_LAMPS)
     result = run("infer", "bump", "--method", "ls", *arguments.split())
     assert (result.code, message in result.err) == (code, True), result.err
 
@@ -122,8 +122,8 @@ def test_wrong_files_are_named(run, near: Path) -> None:
 def test_positions_in_another_unit_than_the_pixel_size(run, near: Path, command: str) -> None:
     """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the bump."""
     arguments = [command, "bump", *(["--method", "ls", "--overwrite"] if command == "infer" else [])]
-    distances = np.linalg.norm(POSITIONS, axis=1) / 1000
-    np.savetxt(near / "light_positions.txt", POSITIONS / 1000)
+    distances = np.linalg.norm(BUMP_LAMPS, axis=1) / 1000
+    np.savetxt(near / "light_positions.txt", BUMP_LAMPS / 1000)
     refused = run(*arguments, "--strict")
     assert refused.code == 3
     lamp = (
@@ -132,11 +132,11 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near: Path, command:
     assert lamp in refused.err
     assert "inside the object. Give all lengths in one unit, such as millimetres" in refused.err
     for factor, words in ((0.3, "A lamp is very near"), (1000, "so far that they are distant")):
-        np.savetxt(near / "light_positions.txt", POSITIONS * factor)
+        np.savetxt(near / "light_positions.txt", BUMP_LAMPS * factor)
         for strict, code in ((("--strict",), 3), ((), 0)):
             warned = run(*arguments, *strict)
             assert (warned.code, words in warned.err) == (code, True), warned.err
-    np.savetxt(near / "light_positions.txt", POSITIONS)
+    np.savetxt(near / "light_positions.txt", BUMP_LAMPS)
     assert run(*arguments, "--strict").code == 0
 
 

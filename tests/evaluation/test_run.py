@@ -302,11 +302,6 @@ def test_noise_that_lays_lights_into_a_plane_is_drawn_again(
     assert sigmas == [30, 30]
 
 
-def test_no_capture_is_called_like_the_average(write_dome: WriteDome) -> None:
-    folders = [write_dome("x/average"), write_dome("x/other")]
-    assert evaluate(folders, [make_estimator("ls")], Protocol()).captures == ("x/average", "x/other")
-
-
 def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     folders = [write_dome("bearPNG"), write_dome("other")]
     fake = Fake(folders[0])
