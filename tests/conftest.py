@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 # The tests run in one process a core. Each of these, and the commands that they start, computes in one thread.
@@ -15,8 +17,11 @@ from numpy.typing import NDArray
 
 from browser import browser, open_page
 from scenes import cap_directions, directions_at, shade, spiral_lights
+from splinecli.results.clock import STAGES
 
 __all__ = ["browser", "directions_at", "open_page"]
+
+GOLDEN = Path(__file__).resolve().parent / "golden"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -53,3 +58,28 @@ def glossy_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[n
     """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe, attached shadows."""
     normals, lights = cap_directions(60, 70), spiral_lights(14, 60)
     return normals, lights, 0.6 * shade(normals, lights, gloss=5 / 6, exponent=40)
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
+    """Compare a text with tests/golden/<name>; `pytest --update-golden` writes it anew, and the diff is read.
+
+    What differs from run to run (seconds, memory, sizes of files, version) is blanked out.
+    """
+
+    def check(name: str, text: str) -> None:
+        path = GOLDEN / name
+        text = _without_measurements(text)
+        if request.config.getoption("--update-golden"):
+            path.write_text(text, "utf-8")
+        assert text == path.read_text("utf-8")
+
+    return check
+
+
+def _without_measurements(text: str) -> str:
+    """The text with seconds, memory, sizes of files, version and absolute paths blanked out."""
+    text = re.sub(r'("[a-z_0-9]+\.[a-z]+": )\d+', r"\1...", text)
+    text = re.sub(rf'("(?:{"|".join(STAGES)}|total|peak_memory_mib|seconds)": )[\d.]+', r"\1...", text)
+    text = re.sub(r", [\d.]+ s\n", ", ... s\n", text)
+    return re.sub(r'("(?:version|inputs_sha256|folder|light_file)": )"[^"]*"', r'\1"..."', text)

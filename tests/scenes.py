@@ -76,18 +76,21 @@ def shade(
 def write_capture(
     folder: Path,
     images: NDArray[np.generic],
-    lights: NDArray[np.floating],
+    lights: NDArray[np.floating] | None,
     *,
     mask: Mask | None = None,
     normals: NDArray[np.floating] | None = None,
     intensities: NDArray[np.floating] | None = None,
+    names: str = "{:03}.png",
+    first: int = 0,
 ) -> Path:
     """Write images (F, H, W) or (F, H, W, 3) RGB as PNGs, with the lights and what else is given."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number, image in enumerate(images):
+    for number, image in enumerate(images, start=first):
         stored = image if image.ndim == 2 else image[..., ::-1]
-        assert cv2.imwrite(str(folder / f"{number:03}.png"), stored)
-    np.savetxt(folder / "light_directions.txt", lights, fmt="%.9f")
+        assert cv2.imwrite(str(folder / names.format(number)), stored)
+    if lights is not None:
+        np.savetxt(folder / "light_directions.txt", lights, fmt="%.9f")
     if mask is not None:
         assert cv2.imwrite(str(folder / "mask.png"), mask.astype(np.uint8) * 255)
     if normals is not None:
@@ -95,3 +98,26 @@ def write_capture(
     if intensities is not None:
         np.savetxt(folder / "light_intensities.txt", intensities)
     return folder
+
+
+BUMP_MM = 64.0
+BUMP_LAMPS = np.array(
+    [(0, 20, 200), (70, 10, 170), (-80, 20, 160), (20, 90, 150), (-10, -80, 170), (60, 60, 140), (-60, -70, 150)]
+) * 1.0  # fmt: skip
+"""Lamps in millimetres, at about three widths of the object."""
+
+
+def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = False) -> Path:
+    """Write a matte bump of 32 x 32 pixels, 64 mm wide, without a mask or lights, under near or distant lamps."""
+    x, y = square_grid(32, BUMP_MM / 2 * (1 - 1 / 32))
+    heights = 8 * np.cos(x / 20) * np.cos(y / 25)
+    slopes = 8 / 20 * np.sin(x / 20) * np.cos(y / 25), 8 / 25 * np.cos(x / 20) * np.sin(y / 25)
+    normals = np.dstack((*slopes, np.ones_like(x)))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    points = np.dstack((x, y, heights - heights.mean()))
+    towards = positions[:, None, None] - (0 if distant else 1) * points
+    distance = np.linalg.norm(towards, axis=3)
+    shading = np.clip((towards * normals).sum(axis=3) / distance, 0, None)
+    pictures = shading * (1 if distant else 150.0**2 / distance**2)
+    stored = np.rint(pictures * 30_000).astype(np.uint16)
+    return write_capture(folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1)

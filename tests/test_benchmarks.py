@@ -111,17 +111,6 @@ def test_large_captures(run: Run, tmp_path: Path) -> None:
     assert plot.stat().st_size > 1000
 
 
-def test_busy_machine(run: Run) -> None:
-    """The quiet machine alone: each figure takes a process that loads PyTorch."""
-    header, row = run("busy_machine", "--busy", "0", "--pixels", "100", "--repeats", "1").splitlines()
-    assert header.split("  ")[-1].strip() == "default / passive"
-    assert row.startswith("quiet")
-    default, passive, single, ratio = numbers(row)
-    assert min(default, passive, single) > 0
-    half = 0.0051  # of the last digit that is printed
-    assert (default - half) / (passive + half) - half <= ratio <= (default + half) / (passive - half) + half
-
-
 def test_all_figures(run: Run, tmp_path: Path) -> None:
     """A row is stored with what it was measured with, and is not measured again."""
     for name in ("ballPNG", "catPNG", "readingPNG"):
@@ -138,13 +127,6 @@ def test_all_figures(run: Run, tmp_path: Path) -> None:
     assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]
     assert measured["rows"]["ls"]["0"] < measured["rows"]["ls"]["8"]
     assert run("all_figures", *arguments) == ""
-
-
-def test_figure_tables(run: Run) -> None:
-    """The documentation has them all filled; tests/test_docs.py compares what they say."""
-    before = [(ROOT / name).read_bytes() for name in ("README.md", "docs/measurements.md")]
-    assert run("figure_tables").startswith("README.md: 1 tables")
-    assert [(ROOT / name).read_bytes() for name in ("README.md", "docs/measurements.md")] == before
 
 
 def test_wrong_lights(run: Run) -> None:

@@ -126,11 +126,7 @@ def test_memory_left_in_control_groups_of_version_1(mount: Path, monkeypatch: py
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
 def test_available_cores(
-    machine: int | None,
-    affinity: int,
-    quotas: list[float],
-    expected: int,
-    monkeypatch: pytest.MonkeyPatch,
+    machine: int | None, affinity: int, quotas: list[float], expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(devices.os, "cpu_count", lambda: machine)
     monkeypatch.setattr(devices.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)

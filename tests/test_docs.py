@@ -57,12 +57,6 @@ def test_every_page_is_linked_from_the_readme():
     assert [page.name for page in DOCS.glob("*.md") if f"(docs/{page.name})" not in readme] == []
 
 
-def test_source_names_pages_that_exist():
-    for path in (REPOSITORY / "src").rglob("*.py"):
-        for name in re.findall(r"docs/[\w-]+\.md", path.read_text("utf-8")):
-            assert (REPOSITORY / name).is_file(), (path.name, name)
-
-
 def commands() -> Iterator[tuple[str, str]]:
     """Page and command line of every splinecli command in the code blocks and tables of the documentation."""
     for page in PAGES:

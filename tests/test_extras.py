@@ -5,15 +5,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from splinecli.errors import InputError, UsageError
 from splinecli.extras import import_extra
-
-
-def test_an_installed_module_is_returned() -> None:
-    assert import_extra("numpy", "render") is np
 
 
 @pytest.mark.parametrize(

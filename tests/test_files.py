@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -21,14 +20,6 @@ def test_writes_into_folders_that_do_not_exist_yet(tmp_path: Path) -> None:
     assert names_in(tmp_path / "a" / "b") == ["out.txt"]
 
 
-def test_replaces_an_older_file_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
-    path = tmp_path / "out.bin"
-    write_bytes(path, b"a longer content")
-    write_bytes(path, b"new")
-    assert path.read_bytes() == b"new"
-    assert names_in(tmp_path) == ["out.bin"]
-
-
 def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     (tmp_path / "plain").touch()
     write_bytes(tmp_path / "written", b"")
@@ -43,13 +34,6 @@ def test_a_folder_that_cannot_be(tmp_path: Path) -> None:
     assert caught.value.path == tmp_path / "file" / "out.bin"
     assert names_in(tmp_path) == ["file"]
     assert (tmp_path / "file").read_text() == "in the way"
-
-
-def test_a_folder_in_the_file_s_place(tmp_path: Path) -> None:
-    (tmp_path / "out.bin").mkdir()
-    with pytest.raises(OutputError):
-        write_bytes(tmp_path / "out.bin", b"content")
-    assert names_in(tmp_path) == ["out.bin"]
 
 
 def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,8 +66,3 @@ def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.M
 def test_json_that_cannot_be_used_is_a_value_error(text: str) -> None:
     with pytest.raises(ValueError):
         parse_json(text)
-
-
-def test_json(tmp_path: Path) -> None:
-    values = {"a": [1, -2.5, None, True, "x"], "b": 10**299}
-    assert parse_json(json.dumps(values)) == values

@@ -56,11 +56,7 @@ def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Pa
     assert main(["infer", str(folder), *options]) == 0
     expected = np.load(tmp_path / "out/medallion/normals.npy")
     estimate = splinecli.estimate_normals(
-        images,
-        directions,
-        mask,
-        light_intensities=intensities if intensities_known else None,
-        method="iw12",
+        images, directions, mask, light_intensities=intensities if intensities_known else None, method="iw12"
     )
     assert (estimate.capture.estimated_intensities is None) == intensities_known
     assert estimate.normal_map.tobytes() == expected.tobytes()

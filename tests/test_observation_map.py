@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -32,50 +33,31 @@ def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
     return observations, torch.nn.functional.normalize(directions, dim=-1)
 
 
-# A cell is 1/16 wide; the axis runs between columns 15 and 16 and rows 15 and 16; row 0 is y = +1.
-@pytest.mark.parametrize(
-    ("x", "y", "row", "column"),
-    [
-        (0.01, 0.01, 15, 16),
-        (-0.01, 0.01, 15, 15),
-        (0.01, -0.01, 16, 16),
-        (-0.01, -0.01, 16, 15),
-        (0.0, 0.99, 0, 16),
-        (0.0, 1.0, 0, 16),
-        (0.0, -1.0, 31, 16),
-        (1.0, 0.0, 16, 31),
-        (-1.0, 0.0, 16, 0),
-        (1.0000001, 0.0, 16, 31),
-        # (0.6 + 1) * 16 = 25.6 and (1 - 0.3) * 16 = 11.2
-        (0.6, 0.3, 11, 25),
+# Ours: a cell is 1/16 wide; the axis runs between columns 15 and 16 and rows 15 and 16; row 0 is y = +1.
+# (0.6 + 1) * 16 = 25.6 and (1 - 0.3) * 16 = 11.2.
+# CNN-PS: floor((n + 1) 31 / 2) from the lower left, which is row 31 and column 0; its last cell is a single point.
+# (0.6 + 1) * 15.5 = 24.8 and (0.3 + 1) * 15.5 = 20.15.
+CELLS = {
+    "ours": [
+        (0.01, 0.01, 15, 16), (-0.01, 0.01, 15, 15), (0.01, -0.01, 16, 16), (-0.01, -0.01, 16, 15),
+        (0.0, 0.99, 0, 16), (0.0, 1.0, 0, 16), (0.0, -1.0, 31, 16), (1.0, 0.0, 16, 31), (-1.0, 0.0, 16, 0),
+        (1.0000001, 0.0, 16, 31), (0.6, 0.3, 11, 25),
     ],
-)
-def test_cell_of_a_known_direction(x: float, y: float, row: int, column: int) -> None:
-    z = math.sqrt(max(0.0, 1 - x * x - y * y))
-    assert light_cells(torch.tensor((x, y, z), dtype=torch.float64)).item() == row * 32 + column
+    "cnn-ps": [
+        (0.01, 0.01, 16, 15), (-0.1, -0.1, 18, 13), (0.0, 1.0, 0, 15), (0.0, 0.99, 1, 15), (0.0, -1.0, 31, 15),
+        (1.0, 0.0, 16, 31), (0.99, 0.0, 16, 30), (-1.0, 0.0, 16, 0), (0.6, 0.3, 11, 24),
+    ],
+}  # fmt: skip
 
 
-# floor((n + 1) 31 / 2) from the lower left, which is row 31 and column 0; its last cell is a single point.
-@pytest.mark.parametrize(
-    ("x", "y", "row", "column"),
-    [
-        (0.01, 0.01, 16, 15),
-        (-0.1, -0.1, 18, 13),
-        (0.0, 1.0, 0, 15),
-        (0.0, 0.99, 1, 15),
-        (0.0, -1.0, 31, 15),
-        (1.0, 0.0, 16, 31),
-        (0.99, 0.0, 16, 30),
-        (-1.0, 0.0, 16, 0),
-        # (0.6 + 1) * 15.5 = 24.8 and (0.3 + 1) * 15.5 = 20.15
-        (0.6, 0.3, 11, 24),
-    ],
-)
-def test_cell_of_a_known_direction_on_the_grid_of_cnn_ps(x: float, y: float, row: int, column: int) -> None:
-    direction = torch.tensor((x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64)
-    assert light_cells(direction, grid="cnn-ps").item() == row * 32 + column
-    occupied = sparse_map(torch.ones(1, 1), direction[None], grid="cnn-ps").occupied
-    assert occupied.flatten().nonzero().item() == row * 32 + column
+@pytest.mark.parametrize("grid", CELLS)
+def test_cell_of_a_known_direction(grid: Any) -> None:
+    options = {} if grid == "ours" else {"grid": grid}
+    for x, y, row, column in CELLS[grid]:
+        direction = torch.tensor((x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64)
+        assert light_cells(direction, **options).item() == row * 32 + column, (x, y)
+        occupied = sparse_map(torch.ones(1, 1), direction[None], **options).occupied
+        assert occupied.flatten().nonzero().item() == row * 32 + column, (x, y)
 
 
 def test_the_disc_of_both_grids() -> None:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import spiral_lights
+
 Render = Callable[..., NDArray[np.float32]]
 
 
@@ -40,7 +42,4 @@ def render_ball() -> Render:
 @pytest.fixture
 def lights() -> NDArray[np.float64]:
     """Seven lights (7, 3), 0 to 60 degrees from the view."""
-    zenith, azimuth = np.radians(np.linspace(0, 60, 7)), np.arange(7) * 2.4
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+    return spiral_lights(7, 60, 0)

@@ -103,11 +103,6 @@ def test_pictures_of_another_size(ball: Path) -> None:
         calibrate_ball(find_ball_files(ball))
 
 
-def test_a_circle_outside_the_picture(ball: Path) -> None:
-    with pytest.raises(InputError, match="outside the image"):
-        calibrate_ball(find_ball_files(ball), circle=Circle(900, 900, 20))
-
-
 def test_real_balls(shared_data: Path) -> None:
     chrome = calibrate_ball(find_ball_files(shared_data / "uw/chrome"))
     off = angle_between_deg(

@@ -36,46 +36,6 @@ def ball_images() -> NDArray[np.float64]:
     return 0.5 * cosine[..., None] * INTENSITIES[:, None, None]
 
 
-def test_intensities_from_a_ball(tmp_path: Path) -> None:
-    images = ball_images()
-    folder = write(tmp_path / "gray", images, BALL.inside(images.shape[1:3]))
-    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
-
-
-def test_intensities_from_a_card(tmp_path: Path) -> None:
-    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
-    folder = write(tmp_path / "card", images, None)
-    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-4)
-
-
-def test_photographs_for_a_screen(tmp_path: Path) -> None:
-    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
-    folder = write(tmp_path / "card", images ** (1 / 2.2), None)
-    found = measure_light_intensities(
-        find_ball_files(folder), LIGHTS, "card", radiometry=RadiometricCalibration(2.2)
-    )
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)
-
-
-def test_ambient_light_is_taken_off(tmp_path: Path) -> None:
-    images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
-    folder = write(tmp_path / "card", images + 0.1, None)
-    cv2.imwrite(str(folder / "ambient.png"), np.full((20, 30, 3), round(0.1 * 65535), np.uint16))
-    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)
-
-
-def test_saturated_pixels_do_not_count(tmp_path: Path) -> None:
-    images = ball_images()
-    cut = (images * 1.7).clip(0, 1)
-    assert (cut == 1).any()
-    folder = write(tmp_path / "bright", cut, BALL.inside(cut.shape[1:3]))
-    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
-
-
 @pytest.mark.parametrize("target", ["card", "ball"])
 @pytest.mark.parametrize("brightest", [1.25, 3.0])
 def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest: float) -> None:
@@ -120,3 +80,27 @@ def test_images_and_masks_of_another_size(tmp_path: Path) -> None:
         InputError, match=r"mask\.png: found a mask of 30 x 10 pixels, expected 30 x 20 as in 0\.png"
     ):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
+
+
+def card_images() -> NDArray[np.float64]:
+    return np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
+
+
+@pytest.mark.parametrize("exposure", [1.0, 1.7], ids=["whole", "partly saturated"])
+def test_a_ball(tmp_path: Path, exposure: float) -> None:
+    images = (ball_images() * exposure).clip(0, 1)
+    assert (images == 1).any() == (exposure > 1)
+    folder = write(tmp_path / "gray", images, BALL.inside(images.shape[1:3]))
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
+
+
+@pytest.mark.parametrize(("gamma", "ambient"), [(1.0, 0.0), (2.2, 0.0), (1.0, 0.1)])
+def test_a_card(tmp_path: Path, gamma: float, ambient: float) -> None:
+    folder = write(tmp_path / "card", (card_images() + ambient) ** (1 / gamma), None)
+    if ambient:
+        stored = np.full((20, 30, 3), round(ambient * 65535), np.uint16)
+        cv2.imwrite(str(folder / "ambient.png"), stored)
+    radiometry = RadiometricCalibration(gamma)
+    found = measure_light_intensities(find_ball_files(folder), LIGHTS, "card", radiometry=radiometry)
+    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)

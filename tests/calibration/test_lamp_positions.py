@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import spiral_lights
 from splinecli.calibration.balls import (
     BallCalibration,
     BallFiles,
@@ -47,9 +48,7 @@ def photograph(circle: Circle, lamp: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 def lamps(distance: float) -> NDArray[np.float64]:
     """Six lamps at 15 to 50 degrees from the view."""
-    zenith, azimuth = np.radians(np.linspace(15, 50, 6)), np.arange(6) * 2.4
-    directions = (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith))
-    return distance * np.stack(directions, axis=1)
+    return distance * spiral_lights(6, 50, 15)
 
 
 def calibrate(folder: Path, positions: NDArray[np.float64], *, known: bool = True) -> list[BallCalibration]:

@@ -49,13 +49,6 @@ def test_a_sparkle_is_no_lamp(render_ball: Render, lights: NDArray[np.float64]) 
     assert (found.x, found.y) == (expected.x, expected.y)
 
 
-def test_light_outside_the_ball_does_not_count(render_ball: Render, lights: NDArray[np.float64]) -> None:
-    picture = render_ball(lights[3])
-    expected = find_highlight(picture, BALL)
-    picture[:20, :20] = 100
-    assert find_highlight(picture, BALL) == expected
-
-
 def test_no_highlight(render_ball: Render) -> None:
     behind = np.array([0.0, 0.6, -0.8])
     with pytest.raises(InputError, match="found no highlight"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.calibration.balls import BallCalibration, BallFiles, CalibratedLights, combine_balls
+from splinecli.calibration.balls import BallCalibration, BallFiles, combine_balls
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.mirror_ball import Highlight
 from splinecli.calibration.report import calibration_report, summary_lines
@@ -69,19 +69,6 @@ def test_balls_that_disagree(directions: NDArray[np.float64], degrees: float, wa
     assert f"the balls differ from their mean by {degrees / 2:.1f} degrees" in summary_lines(found)[-1]
 
 
-@pytest.mark.parametrize(
-    ("circle", "warned"),
-    [
-        (Circle(0, 0, 100, spread=0.9, visible=0.61), False),
-        (Circle(0, 0, 100, spread=1.1, visible=0.61), True),
-        (Circle(0, 0, 100, spread=0.9, visible=0.59), True),
-    ],
-)
-def test_uncertain_outlines(directions: NDArray[np.float64], circle: Circle, warned: bool) -> None:
-    found = report([ball(directions, circle)])["warnings"]
-    assert ["Check calibration.png" in warning for warning in found] == [True] * warned
-
-
 def test_a_compared_file(directions: NDArray[np.float64]) -> None:
     lights = turned(directions, 40)
     found = report([ball(lights)], turned(lights, 2))
@@ -93,10 +80,3 @@ def test_a_compared_file(directions: NDArray[np.float64]) -> None:
     assert "the normals of the ball at the highlights instead of the light directions" in found["warnings"][0]
     # Directions that are wrong in another way are not mistaken for normals.
     assert report([ball(lights)], turned(lights, 20))["warnings"] == []
-
-
-def test_intensities_are_rows_of_the_report(directions: NDArray[np.float64]) -> None:
-    intensities = np.arange(12).reshape(4, 3) / 7
-    lights: CalibratedLights = combine_balls([ball(directions)])
-    found = calibration_report(lights, intensities, None, picture="calibration.png")
-    np.testing.assert_allclose(found["light_intensities"], intensities, atol=5e-7)

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from splinecli.capture import Overrides, find_capture_files, open_capture, read_capture
-from splinecli.capture.formats.facts import read_facts
+from splinecli.capture import open_capture, read_capture
 from splinecli.errors import InputError
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
@@ -98,20 +97,8 @@ def test_a_file_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None
     assert str(caught.value) == f"{folder / name}: the file cannot be read (Permission denied)."
 
 
-def test_headers_that_may_not_be_read(folder: Path, forbid: Callable[[Path], None]) -> None:
-    forbid(folder / "1.tif")
-    with pytest.raises(InputError, match=r"1\.tif: the file cannot be read \(Permission denied\)"):
-        print(read_facts(folder / "1.tif").size)
-
-
 def test_an_image_that_vanishes(folder: Path) -> None:
     source = open_capture(folder)
     (folder / "3.tif").unlink()
     with pytest.raises(InputError, match=r"3\.tif: the file (does not exist|cannot be read)"):
         source.read()
-
-
-def test_a_folder_in_place_of_a_named_file(folder: Path) -> None:
-    (folder / "sub").mkdir()
-    with pytest.raises(InputError, match="sub: found a folder, expected a file"):
-        find_capture_files(folder, Overrides(mask=folder / "sub"))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import spiral_lights
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.explanations import decoding_ratio, explain, near_distance
 from splinecli.capture.lights.near_lamps import NearLamps
@@ -15,13 +16,7 @@ from splinecli.transfer import encode_srgb
 
 Array = NDArray[np.float64]
 SIZE = 48
-
-
-def lights(count: int = 10) -> Array:
-    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(15, 52, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+LIGHTS = spiral_lights(10, 52, 15)
 
 
 def scene(shape: str, *, widths: float | None = None, shine: float = 0.0) -> Sample:
@@ -35,9 +30,9 @@ def scene(shape: str, *, widths: float | None = None, shine: float = 0.0) -> Sam
         mask = np.ones((SIZE, SIZE), np.bool_)
         slopes = np.stack((0.5 * np.cos(5 * x) * np.cos(4 * y), 0.4 * np.sin(5 * x) * np.sin(4 * y)), axis=2)
     normals = unit(np.concatenate((slopes, np.ones((SIZE, SIZE, 1))), axis=2))[mask]
-    directions, strengths = lights()[None], np.ones(1)
+    directions, strengths = LIGHTS[None], np.ones(1)
     if widths is not None:
-        lamps = NearLamps.of(lights() * widths * SIZE, 1.0, mask.shape, equal=True)
+        lamps = NearLamps.of(LIGHTS * widths * SIZE, 1.0, mask.shape, equal=True)
         directions, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(mask)))
     half = unit(directions + np.array((0.0, 0.0, 1.0)))
     albedo = rng.uniform(0.4, 0.8, (len(normals), 1))
@@ -48,7 +43,7 @@ def scene(shape: str, *, widths: float | None = None, shine: float = 0.0) -> Sam
 
 
 def found(sample: Sample) -> list[CaptureWarning]:
-    return explain(sample, lights(), linear=True, has_positions=False)
+    return explain(sample, LIGHTS, linear=True, has_positions=False)
 
 
 @pytest.mark.parametrize("shape", ["ball", "relief"])
@@ -64,25 +59,25 @@ def test_encoded_values(shape: str, shine: float) -> None:
     encoded = Sample(encode_srgb(linear.observations) / 255, linear.mask, 1)
     (warning,) = found(encoded)
     assert warning.code == "encoded_values" and "--transfer srgb" in warning.text
-    assert explain(encoded, lights(), linear=False, has_positions=True) == []
+    assert explain(encoded, LIGHTS, linear=False, has_positions=True) == []
 
 
 @pytest.mark.parametrize(("widths", "shine"), [(2.0, 0.0), (3.0, 0.0), (4.0, 0.0), (2.0, 0.1), (3.0, 0.1)])
 def test_near_lamps(widths: float, shine: float) -> None:
     near = scene("relief", widths=widths, shine=shine)
-    distance = near_distance(near, lights())
+    distance = near_distance(near, LIGHTS)
     # An error of 20 % costs 2 to 4 degrees, where distant lights cost 6 to 20.
     assert distance is not None and distance[0] == pytest.approx(widths, rel=0.2)
     (warning,) = found(near)
     assert warning.code == "lamps_near"
     assert f"--light-distance {distance[0]:.1f} --object-width 1" in warning.text
-    assert explain(near, lights(), linear=True, has_positions=True) == []
+    assert explain(near, LIGHTS, linear=True, has_positions=True) == []
 
 
 def test_too_little_is_not_judged() -> None:
     few = Sample(scene("ball").observations[:30], np.ones((5, 6), np.bool_), 1)
-    assert decoding_ratio(few.observations, lights()) is None and near_distance(few, lights()) is None
+    assert decoding_ratio(few.observations, LIGHTS) is None and near_distance(few, LIGHTS) is None
     black = Sample(np.zeros((400, 10)), np.ones((20, 20), np.bool_), 1)
-    assert decoding_ratio(black.observations, lights()) is None and near_distance(black, lights()) is None
-    five = scene("relief", widths=3).observations[:, :5], lights()[:5]
+    assert decoding_ratio(black.observations, LIGHTS) is None and near_distance(black, LIGHTS) is None
+    five = scene("relief", widths=3).observations[:, :5], LIGHTS[:5]
     assert decoding_ratio(*five) is None

@@ -7,18 +7,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from scenes import spiral_lights
 from splinecli.capture.image_checks import repeated_images
 from splinecli.capture.lights.light_check import light_spread
 
 Array = NDArray[np.float64]
 SIZE = 96
-
-
-def lights(count: int = 10) -> Array:
-    azimuth, zenith = np.arange(count) * 2.4, np.radians(np.linspace(12, 50, count))
-    return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+LIGHTS = spiral_lights(10, 50, 12)
 
 
 def images(shine: float = 0.2) -> Array:
@@ -29,9 +24,9 @@ def images(shine: float = 0.2) -> Array:
     normals = np.stack((-z_x, -z_y, np.ones_like(x)), axis=2)
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     albedo = 0.6 + 1.7 * gaussian_filter(rng.normal(size=x.shape), 2)
-    half = lights() + np.array((0.0, 0.0, 1.0))
+    half = LIGHTS + np.array((0.0, 0.0, 1.0))
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    cosine = np.clip(normals @ lights().T, 0, None)
+    cosine = np.clip(normals @ LIGHTS.T, 0, None)
     shaded = albedo[..., None] * cosine + shine * np.clip(normals @ half.T, 0, None) ** 40
     return np.clip(shaded + rng.normal(0, 0.004, shaded.shape), 0.001, None)
 
@@ -47,10 +42,6 @@ def test_the_same_image_twice(mask: NDArray[np.bool_]) -> None:
     assert repeated_images(observations) == []
     observations[:, 7] = observations[:, 2]
     assert repeated_images(observations) == [(2, 7)]
-
-
-def test_uniform_images_are_not_repeated() -> None:
-    assert repeated_images(np.ones((50, 4))) == []
 
 
 def test_the_spread_of_lights() -> None:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
 from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
-from splinecli.results.albedo import albedo_map
 
 LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
 
@@ -91,18 +90,6 @@ def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one:
     flats = tuple(write(tmp_path / f"flat/{n}.png", 0.5 * falloff[n]) for n in range(1 if one else 4))
     mean = falloff.mean(axis=(1, 2, 3), keepdims=True)
     np.testing.assert_allclose(observed(folder, flat_field=flats), expected(light * mean), rtol=2e-4)
-
-
-def test_the_albedo_sees_the_same_light(tmp_path: Path, light: NDArray[np.float64]) -> None:
-    ambient = np.full(light.shape[1:], 0.1)
-    up = np.broadcast_to(np.array((0, 0, 1), np.float32), light.shape[1:])
-    normals = np.array(LIGHTS.split(), float).reshape(4, 3)
-    cosine = 1 / np.linalg.norm(normals, axis=1)
-    matte = 0.5 * light[:1] * cosine[:, None, None, None]
-    folder = store(tmp_path / "capture", matte + ambient)
-    write(folder / "ambient.png", ambient)
-    source = open_capture(folder)
-    np.testing.assert_allclose(albedo_map(source, source.read(), up), 0.5 * light[0], atol=1e-4)
 
 
 def test_files_that_do_not_fit(tmp_path: Path, light: NDArray[np.float64]) -> None:

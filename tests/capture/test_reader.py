@@ -167,9 +167,3 @@ def test_least_squares_on_diligent(shared_data: Path, name: str, n_pixels: int, 
     truth = capture.ground_truth[capture.mask]
     scored = truth.any(axis=1)
     assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(mae_deg, abs=0.02)
-
-
-def test_psbox_s_transposed_lights(shared_data: Path) -> None:
-    source = open_capture(shared_data / "psbox/Objects", lights=shared_data / "psbox/light_directions.txt")
-    assert source.n_lights == 12
-    assert source.read([0, 4, 8]).n_pixels == 430 * 550

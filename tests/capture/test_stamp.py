@@ -5,17 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import RadiometricCalibration, open_capture
-from splinecli.capture.lights.named_lights import read_lights
 from splinecli.capture.stamp import digest
-from splinecli.pixel_sets.captures import add_capture
-from splinecli.pixel_sets.writer import PixelSetWriter
 
 WriteImage = Callable[..., Path]
 
@@ -64,41 +60,6 @@ def test_other_files_are_stamped_by_their_content(folder: Path, name: str, write
     else:
         (folder / name).write_bytes(content + b" ")
     assert stamp(folder) != before
-
-
-def test_a_new_ambient_image_replaces_the_pixels_that_prepare_kept(
-    folder: Path, tmp_path: Path, write_image: WriteImage
-) -> None:
-    """`prepare` compares the recipe of an entry with the capture's, and the recipe holds the stamp."""
-
-    def recipe() -> dict[str, object]:
-        writer = PixelSetWriter(tmp_path / f"set{len(list(tmp_path.glob('set*')))}")
-        add_capture(writer, "vase", folder)
-        return writer.recipe_of("vase")
-
-    before = recipe()
-    assert recipe() == before
-    write_image("vase/ambient.png", np.full((4, 5), 200, np.uint16))
-    assert recipe() != before
-
-
-@pytest.mark.parametrize("name", ["light_directions.txt", "mask.png", "1.png"])
-def test_a_file_that_changes_while_the_capture_is_read_has_another_stamp_the_next_time(
-    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The stamp is older than what is read, so that it never belongs to content that was not used."""
-    before = stamp(folder)
-
-    def change_and_read(*arguments: Any, **options: Any) -> Any:
-        content = (folder / name).read_bytes()
-        (folder / name).write_bytes(content + b"\n")
-        os.utime(folder / name, ns=(1, 1))
-        return read_lights(*arguments, **options)
-
-    monkeypatch.setattr("splinecli.capture.reader.read_lights", change_and_read)
-    during = stamp(folder)
-    monkeypatch.undo()
-    assert during == before != stamp(folder)
 
 
 def test_pixel_sizes_are_stamped(folder: Path) -> None:

@@ -106,13 +106,6 @@ def test_bad_input(name, code, spoil, capture, run, golden):
     assert not Path("out").exists()
 
 
-def test_missing_folder(run, golden, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = run("infer", "nowhere")
-    assert result.code == 3
-    golden("bad_input/missing_folder.txt", result.err)
-
-
 def test_capture_with_two_images(capture, run, golden):
     for index in range(3, 9):
         (capture / f"image{index}.png").unlink()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import warnings
 from pathlib import Path
 
@@ -15,14 +14,6 @@ import splinecli
 from splinecli.pipeline import input_checks
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
-
-
-@pytest.fixture
-def medallion(tmp_path, monkeypatch):
-    """A copy of the example, in an empty working folder."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(EXAMPLE, tmp_path / "medallion")
-    return tmp_path / "medallion"
 
 
 def move(path: Path, right: int, down: int) -> None:

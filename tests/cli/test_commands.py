@@ -44,19 +44,6 @@ def test_home_folders_are_expanded(capture, run, monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
-@pytest.mark.parametrize("command", ["info", "infer"])
-def test_a_closed_pipe_is_no_error(command, capture):
-    read, write = os.pipe()
-    os.close(read)
-    arguments = [sys.executable, "-m", "splinecli", command, str(capture)]
-    arguments += ["--method", "ls"] if command == "infer" else []
-    done = subprocess.run(arguments, stdout=write, stderr=subprocess.PIPE, text=True)
-    os.close(write)
-    unexpected = [line for line in done.stderr.splitlines() if not line.startswith("splinecli: warning: ")]
-    assert (done.returncode, unexpected) == (0, [])
-
-
-@pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
 @pytest.mark.parametrize("closed", ["stdout", "both"])
 def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_capture):
     """`infer captures/* | head -1` and `infer captures/* 2>&1 | head -1` compute every capture."""

@@ -38,28 +38,6 @@ def test_files_and_table(dataset, run, golden):
     assert document["averages"]["ls"] == pytest.approx((matte["mae_deg"] + shaded["mae_deg"]) / 2, abs=1e-4)
 
 
-def test_the_draw_of_infer_is_the_first_of_evaluate(dataset, run):
-    (report,) = json.loads(
-        run("infer", dataset / "shaded", "--method", "ls", "--n-lights", 5, "--seed", 3, "--json").out
-    )
-    document = json.loads(
-        run(
-            "evaluate",
-            dataset / "shaded",
-            "--method",
-            "ls",
-            "--n-lights",
-            5,
-            "--seed",
-            3,
-            "--trials",
-            1,
-            "--json",
-        ).out
-    )
-    assert document["results"][0]["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
-
-
 @pytest.fixture
 def overexposed(make_capture):
     """A capture whose lights are unequally bright, which no file says, and whose brightest observations are clipped."""
@@ -79,15 +57,16 @@ def overexposed(make_capture):
 @pytest.mark.parametrize("n_lights", ["all", 7])
 @pytest.mark.parametrize("method", ["iw12", "ls"])
 def test_infer_and_evaluate_give_the_same_figure(overexposed, run, method, n_lights):
+    """The draw of `infer` is the first of `evaluate`."""
     lights = [] if n_lights == "all" else ["--n-lights", n_lights, "--seed", 3]
     figures = []
-    for policy in ([], ["--as-stored"]):
+    for policy, reading in (([], "restored"), (["--as-stored"], "as stored")):
         shared = [overexposed, "--method", method, *policy, "--json", "--overwrite"]
         (report,) = json.loads(run("infer", *shared, *lights).out)
         document = json.loads(run("evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1).out)
         (result,) = document["results"]
         assert result["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
-        assert document["protocol"]["as_stored"] is bool(policy)
+        assert (document["protocol"]["as_stored"], report["reading"]) == (bool(policy), reading)
         figures.append(result["mae_deg"])
     restored, as_stored = figures
     assert restored < as_stored / 2
@@ -152,20 +131,14 @@ def test_a_wide_table_is_turned_and_never_cut(make_capture, run, golden):
     assert "…" not in wide
 
 
+FILES = ["lights.png", "report.html", "results.csv", "results.json", "table.md", "table.tex", "trials.jsonl"]
+
+
 def test_every_file_is_there_and_goes_on(dataset, run):
     arguments = ["evaluate", dataset, "--method", "ls", "--method", "iw12", "--n-lights", 4, "--n-lights", 5]
     first = run(*arguments, "--trials", 2, "--json")
     assert first.code == 0
-    names = [
-        "lights.png",
-        "report.html",
-        "results.csv",
-        "results.json",
-        "table.md",
-        "table.tex",
-        "trials.jsonl",
-    ]
-    assert sorted(path.name for path in Path("evaluation").iterdir() if path.name != ".lock") == names
+    assert sorted(path.name for path in Path("evaluation").iterdir() if path.name != ".lock") == FILES
     assert "iw12" in Path("evaluation/report.html").read_text()
     kept = Path("evaluation/trials.jsonl").read_text()
     assert len(kept.splitlines()) == 2 * 2 * 2 * 2
@@ -184,11 +157,11 @@ def test_every_file_is_there_and_goes_on(dataset, run):
 def test_figures(dataset, run):
     arguments = [
         "--n-lights",
-        4,
+        "4",
         "--trials",
-        1,
+        "1",
         "--max-pixels",
-        30,
+        "30",
         "--figures",
         "--pixel",
         "9,10",
@@ -212,26 +185,16 @@ def test_figures(dataset, run):
     assert not list(Path("evaluation/figures").iterdir())
 
 
-def test_weights_are_named_and_their_lights_warned_about(dataset, run):
-    result = run(
-        "evaluate", dataset / "matte", "--method", "cnn-ps", "--n-lights", 5, "--trials", 1, "--max-pixels", 9
-    )
-    assert result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 5.\n"
-    used = json.loads(Path("evaluation/results.json").read_text())["methods"]["cnn-ps"]
-    assert used["weights"]["name"] == "cnn-ps"
-    assert len(used["weights"]["sha256"]) == 64
-    assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
-
-
 def test_all_methods_by_one_word(dataset, run):
-    document = json.loads(
-        run(
-            "evaluate", dataset / "matte", "--method", "all", "--n-lights", "all", "--max-pixels", 9, "--json"
-        ).out
-    )
     from splinecli.methods import method_names
 
-    assert [result["method"] for result in document["results"]] == method_names()
+    options = ("--method", "all", "--n-lights", "all", "--max-pixels", 9, "--json")
+    result = run("evaluate", dataset / "matte", *options)
+    document = json.loads(result.out)
+    assert [scored["method"] for scored in document["results"]] == method_names()
+    assert result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 8.\n"
+    assert document["methods"]["cnn-ps"]["weights"]["name"] == "cnn-ps"
+    assert "cnn-ps (SHA-256" in Path("evaluation/report.html").read_text()
 
 
 def test_the_white_level_is_used_and_named(overexposed, run):
@@ -242,23 +205,3 @@ def test_the_white_level_is_used_and_named(overexposed, run):
     assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
     assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
     assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()
-
-
-def test_an_unreadable_file_skips_its_capture(dataset, run, monkeypatch):
-    """Permissions do not stop the superuser, so the refusal is simulated."""
-    from splinecli.capture import linearise
-
-    decode = linearise.decode_image
-
-    def refuse(path, *arguments):
-        if path.parent.name == "matte":
-            raise PermissionError(13, "Permission denied", str(path))
-        return decode(path, *arguments)
-
-    monkeypatch.setattr(linearise, "decode_image", refuse)
-    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")
-    assert result.code == 3
-    document = json.loads(result.out)
-    assert [entry["capture"] for entry in document["skipped"]] == ["matte"]
-    assert ".png: cannot be read (Permission denied)" in document["skipped"][0]["reason"]
-    assert [entry["capture"] for entry in document["results"]] == ["shaded"]

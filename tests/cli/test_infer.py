@@ -134,15 +134,6 @@ def test_how_sure_the_network_is(capture, run):
     assert f"{confidence[mask].mean():.0%} of them likely within 5 deg" in said
 
 
-@pytest.mark.parametrize("method", ["ls", "cnn-ps"])
-def test_who_does_not_tell_how_sure_it_is(capture, run, method):
-    assert run("infer", capture, "--method", method, "--html", "--quiet").code == 0
-    assert read_report(Path("out/sphere"))["expected_under_5"] is None
-    assert "Confidence map" not in Path("out/sphere/page.html").read_text("utf-8")
-    result = run("infer", capture, "--method", method, "--maps", "confidence", "--overwrite")
-    assert (result.code, f"method {method} gives no confidence" in result.err) == (2, True)
-
-
 def test_a_mask_is_found_where_there_is_none(capture, run):
     mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE)
     for path in capture.glob("image*.png"):
@@ -221,10 +212,7 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     cv2.imwrite(str(capture / "ambient.png"), dark)
     assert mean_deg("--transfer", "gamma:2.2") < 0.1
     assert read_report(Path("out/sphere"))["warnings"] == [
-        {
-            "code": "ambient_subtracted",
-            "text": "ambient.png was subtracted from all images as ambient light.",
-        }
+        {"code": "ambient_subtracted", "text": "ambient.png was subtracted from all images as ambient light."}
     ]
     result = run("infer", capture, "--transfer", "rec709")
     assert (result.code, result.out) == (2, "")

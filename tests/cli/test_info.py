@@ -79,16 +79,6 @@ def test_the_plot_replaces_no_photograph(run, capture, tmp_path):
     assert run("info", capture, "--plot", tmp_path / "mine.png", "--overwrite").code == 0
 
 
-def test_quiet_prints_nothing_but_errors(run, capture):
-    result = run("info", capture, "-q")
-    assert (result.code, result.out, result.err) == (0, "", "")
-    # --json asks for its document, quiet or not.
-    assert json.loads(run("info", capture, "-q", "--json").out)["images"] == 8
-    result = run("info", "nowhere", "-q")
-    assert (result.code, result.out) == (3, "")
-    assert result.err.startswith("splinecli: nowhere: ")
-
-
 def clip_at_12_bits(capture: Path, times: float = 1.2) -> None:
     """Turn the images into 12-bit data in 16-bit files, `times` overexposed."""
     for path in capture.glob("image*.png"):

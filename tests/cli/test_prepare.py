@@ -160,18 +160,6 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     assert "was made with reading = 'as stored', not 'restored'" in refused.err
 
 
-def test_a_white_level_is_used_and_named(run, capture):
-    for index in range(8):
-        path = capture / f"image{index + 1}.png"
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 16
-        cv2.imwrite(str(path), picture)
-    assert run("prepare", capture, "-o", "set", "--white-level", 3500, "--quiet").code == 0
-    assert run("prepare", capture, "-o", "set", "--white-level", 3500, "--quiet").code == 0
-    refused = run("prepare", capture, "-o", "set")
-    assert refused.code == 5
-    assert "was made with white_level = 3500.0, not None" in refused.err
-
-
 @pytest.fixture
 def cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cube's mesh, its top turned to the camera."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -11,15 +10,6 @@ import numpy as np
 import pytest
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
-
-
-@pytest.fixture
-def medallion(tmp_path, monkeypatch):
-    """A copy of the example, in an empty working folder."""
-    monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "medallion"
-    shutil.copytree(EXAMPLE, folder)
-    return folder
 
 
 def write_lights(folder: Path, change) -> None:
@@ -119,19 +109,6 @@ def test_lights_as_angles(run, medallion):
     assert (read.code, read.err) == (0, "")
 
 
-def test_a_relief_without_outline_gets_both_mends(run, medallion):
-    mask = cv2.imread(str(medallion / "mask.png"), cv2.IMREAD_GRAYSCALE)
-    height, width = mask.shape
-    inner = np.zeros_like(mask)
-    inner[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 255
-    cv2.imwrite(str(medallion / "mask.png"), inner)
-    write_lights(medallion, lambda lights: lights * (1, -1, 1))
-    err = run("info", medallion).err
-    assert "--light-frame x-left or y-down." in err or "--light-frame y-down or x-left." in err
-    assert "with x negated or with y negated (" in err or "with y negated or with x negated (" in err
-    assert "without a closed outline, only you can tell which is right" in err
-
-
 def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     usual = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "-o", "usual")
     assert (usual.code, usual.err) == (0, "")
@@ -180,15 +157,6 @@ def test_a_file_of_all_intensities_fits_a_light_file_that_names_some_images(run,
         assert run("infer", medallion, "--method", "ls", "--overwrite").code == 0
         normals.append(np.load("out/medallion/normals.npy"))
     np.testing.assert_array_equal(*normals)
-
-
-def test_other_faults_of_captures(run, medallion):
-    shutil.copy(medallion / "03.png", medallion / "08.png")
-    result = run("info", medallion, "--intensities", "equal", "--strict", "--json")
-    assert result.code == 3
-    report = json.loads(result.out)
-    assert "repeated_images" in report["warning_codes"]
-    assert any(text.startswith("03.png and 08.png are the same image, but") for text in report["warnings"])
 
 
 def test_an_image_that_contradicts_the_others_is_named(run, medallion):

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
 from splinecli.evaluation.outcome import Evaluation, Result
 from splinecli.evaluation.protocol import Protocol
-from splinecli.methods import method_names
 from splinecli.pictures.plotting import method_styles
 
 METHODS = ("ls", "spline-net")
@@ -64,14 +63,6 @@ def test_each_method_has_its_colour_in_both_plots() -> None:
     ):
         for method in METHODS:
             assert share_of(styles[method].colour, decode(png)) > 0.002  # a line 3 pixels thick
-
-
-def test_styles_are_fixed_and_all_different() -> None:
-    everyone = method_styles(method_names())
-    assert len({style.colour for style in everyone.values()}) == len(everyone)
-    assert len({style.marker for style in everyone.values()}) == len(everyone)
-    assert method_styles(["ls"])["ls"] == everyone["ls"]
-    assert method_styles(["new", "ls"])["ls"] == everyone["ls"]
 
 
 def test_captures_that_not_all_have_are_left_out() -> None:

@@ -125,10 +125,7 @@ def test_a_draws_file_that_does_not_fit_a_capture(write_dome: WriteDome, tmp_pat
     evaluation = evaluate(folders, [make_estimator("ls")], protocol)
     assert evaluation.captures == ("ten",)
     assert [(s.capture, s.reason) for s in evaluation.skipped] == [
-        (
-            "eight",
-            f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights.",
-        )
+        ("eight", f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights.")
     ]
 
 
@@ -305,11 +302,6 @@ def test_noise_that_lays_lights_into_a_plane_is_drawn_again(
     assert sigmas == [30, 30]
 
 
-def test_no_capture_is_called_like_the_average(write_dome: WriteDome) -> None:
-    folders = [write_dome("x/average"), write_dome("x/other")]
-    assert evaluate(folders, [make_estimator("ls")], Protocol()).captures == ("x/average", "x/other")
-
-
 def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     folders = [write_dome("bearPNG"), write_dome("other")]
     fake = Fake(folders[0])
@@ -337,15 +329,6 @@ def test_draws_keep_to_the_images_that_are_not_left_out(write_dome: WriteDome, t
     (tmp_path / "draws.txt").write_text("3 4 5\n2 4 5\n")
     with pytest.raises(InputError, match=r"draws\.txt:2: found light index 2; the first 3 images"):
         evaluate([folder], [fake], Protocol(draws_file=tmp_path / "draws.txt", skip_first={"*": 3}))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("n_lights", 2), ("trials", 0), ("seed", -3), ("light_noise_deg", float("nan")), ("max_pixels", 0)],
-)
-def test_a_protocol_out_of_range(name: str, value: float) -> None:
-    with pytest.raises(UsageError, match=f"{value}.*expected"):
-        Protocol(**{name: value})
 
 
 def test_what_to_score_is_needed_once(write_dome: WriteDome) -> None:

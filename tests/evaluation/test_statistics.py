@@ -8,12 +8,7 @@ from scipy import stats
 
 from splinecli.evaluation.outcome import Evaluation, Result
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.statistics import (
-    AVERAGE,
-    compare,
-    holm,
-    trial_averages,
-)
+from splinecli.evaluation.statistics import AVERAGE, compare, holm, trial_averages
 
 
 def evaluation_of(**maes_deg: dict[str, tuple[float, ...]]) -> Evaluation:

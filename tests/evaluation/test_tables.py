@@ -1,22 +1,21 @@
-"""The whole text of every document of an evaluation."""
+"""The whole text of every document of an evaluation stands in tests/golden/."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from splinecli import __version__
 from splinecli.evaluation.document import results_csv, results_document
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.tables import best_cells, latex, markdown, table_rows
 
-GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 TEN = Evaluation(
     Protocol(n_lights=10, trials=2, seed=7, max_pixels=500),
     (
@@ -38,43 +37,18 @@ ALL = Evaluation(
     TEN.skipped,
 )
 
-TABLE = """\
-| method | ball | cat | average |
-|---|---:|---:|---:|
-| ls | 4.50 | **9.00** | 6.75 |
-| spline-net | **3.25** | **9.00** | **6.13** |
-"""
-PROTOCOL = "10 lights, 2 random draws, seed 7, at most 500 pixels of each capture, images restored"
-CAPTION = f"Mean angular error in degrees: {PROTOCOL}.\n"
 
-
-def test_markdown_of_one() -> None:
-    assert markdown([TEN]) == f"{TABLE}\n{CAPTION}"
-
-
-def test_markdown_of_two() -> None:
-    assert markdown([TEN, ALL]) == (
-        f"## 10 lights\n\n{TABLE}\n{CAPTION}"
-        "\n## all lights\n\n"
-        "| method | ball | cat | average |\n"
-        "|---|---:|---:|---:|\n"
-        "| ls | **4.00** | 8.50 | 6.25 |\n"
-        "| spline-net | 4.50 | **6.00** | **5.25** |\n"
-        "\nMean angular error in degrees: all lights, seed 7, at most 500 pixels of each capture,"
-        " images restored.\n"
-    )
-
-
-def test_a_bar_in_a_name_does_not_end_the_cell() -> None:
-    odd = replace(TEN, results=(replace(TEN.results[0], capture="a|b"),))
-    assert markdown([odd]).startswith("| method | a\\|b | average |\n")
-
-
-def test_a_link_in_a_name_is_no_link() -> None:
-    name = "![a](javascript:alert(1)) &lt; ~~b~~"
-    odd = replace(TEN, results=(replace(TEN.results[0], capture=name),))
-    shown = r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"
-    assert markdown([odd]).startswith(f"| method | {shown} | average |\n")
+def test_whole_documents(golden: Callable[[str, str], None]) -> None:
+    """Of the comparisons by hand: differences 0.75 and 1.75, t = 1.25 / 0.5 = 2.5 with one degree of freedom, where t's
+    distribution is Cauchy's: p = 1 - 2 atan(2.5) / pi = 0.242, and 0.5 tan(0.95 pi / 2) = 6.3531."""
+    both = [TEN, ALL]
+    for suffix, text in (
+        ("md", markdown(both)),
+        ("csv", results_csv(both)),
+        ("tex", latex([TEN])),
+        ("json", json.dumps(results_document(both), indent=1) + "\n"),
+    ):
+        golden(f"evaluation_results.{suffix}", text)
 
 
 def test_rows_for_a_terminal() -> None:
@@ -87,46 +61,16 @@ def test_rows_for_a_terminal() -> None:
     assert best_cells(rows) == {(2, 1), (1, 2), (2, 2), (2, 3)}
 
 
-def test_csv() -> None:
-    assert results_csv([TEN, ALL]) == (
-        "method,capture,n_lights,light_noise_deg,mae_deg,std_deg,trials,seconds,as_stored\n"
-        "ls,ball,10,0.0,4.5,0.5,2,0.0013,False\n"
-        "spline-net,ball,10,0.0,3.25,0.0,2,1.5,False\n"
-        "ls,cat,10,0.0,9.002,0.001,2,0.001,False\n"
-        "spline-net,cat,10,0.0,9.004,0.0,2,1.25,False\n"
-        "ls,ball,96,0.0,4.0,0.0,1,0.01,False\n"
-        "spline-net,ball,96,0.0,4.5,0.0,1,2.0,False\n"
-        "ls,cat,50,0.0,8.5,0.0,1,0.01,False\n"
-        "spline-net,cat,50,0.0,6.0,0.0,1,2.0,False\n"
-    )
-
-
-def test_json_of_one() -> None:
-    # The comparison by hand: differences 0.75 and 1.75, t = 1.25 / 0.5 = 2.5 with one degree of freedom, where t's
-    # distribution is Cauchy's: p = 1 - 2 atan(2.5) / pi = 0.242, and 0.5 tan(0.95 pi / 2) = 6.3531.
-    one = replace(TEN, results=TEN.results[:2])
-    expected = (GOLDEN / "evaluation_results.json").read_text("utf-8")
-    assert json.dumps(results_document([one]), indent=1) + "\n" == expected.replace("VERSION", __version__)
-
-
-def test_json_of_two() -> None:
-    document = results_document([TEN, ALL])
-    assert document["protocol"]["n_lights"] == [10, "all"]
-    assert document["averages"] == {
-        "ls": {"10": 6.751, "all": 6.25},
-        "spline-net": {"10": 6.127, "all": 5.25},
-    }
-    assert [record["n_lights"] for record in document["results"]] == [10, 10, 10, 10, 96, 96, 50, 50]
-    assert document["skipped"] == [{"capture": "bear", "reason": "bear: no images."}]  # once
-    comparisons = [(c["capture"], c["n_lights"], c["differs"]) for c in document["comparisons"]]
-    assert comparisons == [
-        ("ball", 10, False),
-        ("cat", 10, False),
-        ("average", 10, False),
-        ("ball", "all", None),
-        ("cat", "all", None),
-        ("average", "all", None),
-    ]
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("a|b", r"a\|b"),
+        ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"),
+    ],
+)
+def test_names_are_text_in_markdown(name: str, shown: str) -> None:
+    odd = replace(TEN, results=(replace(TEN.results[0], capture=name),))
+    assert markdown([odd]).startswith(f"| method | {shown} | average |\n")
 
 
 def test_light_noise_tells_evaluations_apart() -> None:
@@ -151,26 +95,6 @@ def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> Non
     assert all(line.endswith(f",{as_stored}") for line in results_csv([evaluation]).splitlines()[1:])
     shown = "as stored: nothing restored" if as_stored else "saturated observations restored"
     assert shown in html_report([evaluation], [], [])
-
-
-def test_latex_of_one() -> None:
-    assert latex([TEN]) == LATEX.replace("PROTOCOL", PROTOCOL)
-
-
-LATEX = r"""% Needs \usepackage{booktabs} in the preamble.
-\begin{table*}
-  \centering
-  \caption{Mean angular error in degrees: PROTOCOL. The best of each column in bold.}
-  \begin{tabular}{lrrr}
-    \toprule
-    method & ball & cat & average \\
-    \midrule
-    ls & 4.50 & \textbf{9.00} & 6.75 \\
-    spline-net & \textbf{3.25} & \textbf{9.00} & \textbf{6.13} \\
-    \bottomrule
-  \end{tabular}
-\end{table*}
-"""
 
 
 def test_latex_escapes_names() -> None:

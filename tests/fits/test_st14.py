@@ -29,10 +29,7 @@ def bipolynomial(normals: Array, lights: Array) -> Array:
     coefficients[:, 0, 0] = 1
     powers = np.arange(3)
     reflectance: Array = np.einsum(
-        "pab,pfa,fb->pf",
-        coefficients,
-        (1 - half[..., None]) ** powers,
-        (1 - difference[..., None]) ** powers,
+        "pab,pfa,fb->pf", coefficients, (1 - half[..., None]) ** powers, (1 - difference[..., None]) ** powers
     )
     return reflectance * (normals @ lights.T)
 

@@ -67,9 +67,7 @@ def mean_errors(folder: Path, methods: list[str], protocol: Protocol) -> dict[st
 
 
 def check(
-    errors: dict[str, float],
-    table: dict[str, tuple[tuple[float, float], tuple[float, float]]],
-    place: int,
+    errors: dict[str, float], table: dict[str, tuple[tuple[float, float], tuple[float, float]]], place: int
 ) -> None:
     ours = {method: own[place] for method, (own, _) in table.items()}
     assert errors == pytest.approx(ours, abs=REPEATED_DEG)

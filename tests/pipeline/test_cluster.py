@@ -7,7 +7,6 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -122,13 +121,6 @@ def test_workers_that_do_not_fit(client, work, tmp_path):
         distributor = Distributor(client, other, ClusterOptions(), SILENT)
         with pytest.raises(kind, match=rf"{message}.* \(on the worker tcp://"):
             list(distributor.run(numbered(range(3))))
-
-
-def test_workers_without_splinecli(client, work, monkeypatch):
-    missing = {"tcp://elsewhere:1": metadata.PackageNotFoundError("splinecli")}
-    monkeypatch.setattr(client, "run", lambda *_, **__: missing)
-    with pytest.raises(UsageError, match="splinecli is not installed on the worker tcp://elsewhere:1"):
-        run(client, work(worker_tasks.double), numbered(range(3)))
 
 
 def test_gpu_workers_only(client, work):

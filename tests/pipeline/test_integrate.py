@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import FrozenInstanceError
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from splinecli.errors import OutputError, UsageError
+from splinecli.errors import OutputError
 from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
 from splinecli.pipeline.observer import Advance, Observer
 
@@ -32,25 +31,6 @@ def tilted(tmp_path: Path) -> Path:
     """A plane that rises by 3 / 4 of a pixel in each column."""
     np.save(tmp_path / "normals.npy", np.tile(np.float32((-0.6, 0, 0.8)), (6, 9, 1)))
     return tmp_path / "normals.npy"
-
-
-def test_options() -> None:
-    options = IntegrateOptions(normals=Path("a/normals.npy"), formats=("obj",))
-    assert (options.folder, options.files) == (
-        Path("a"),
-        ("mesh.obj", "mesh.mtl", "mesh.png", "surface.json"),
-    )
-    with pytest.raises(FrozenInstanceError):
-        options.stiffness = 1.0  # type: ignore[misc]
-    with pytest.raises(
-        UsageError, match="no format named 'fbx'; expected one of glb, ply, obj, stl, npy, tiff, png"
-    ):
-        IntegrateOptions(normals=Path("a"), formats=("fbx",))
-    with pytest.raises(UsageError, match="--decimate is 0, expected a number of triangles of at least 1"):
-        IntegrateOptions(normals=Path("a"), decimate=0)
-    for size in (0, -1, float("nan"), 1e30):
-        with pytest.raises(UsageError, match="expected 1e-06 to 1e\\+06"):
-            IntegrateOptions(normals=Path("a"), pixel_size=size)
 
 
 def test_a_plane(tilted: Path, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -80,18 +79,6 @@ def test_restored_pixels_do_not_spoil_it(scene):
     # This includes highlights and shadows, as below.
     assert np.median(found[touched]) == pytest.approx(1, abs=0.02)
     assert np.quantile(found, 0.99) < 1.5
-
-
-def test_colours_are_divided_by_estimated_intensities(scene):
-    folder, normals, _ = scene
-    source = open_capture(folder)
-    capture = source.read()
-    twice = replace(
-        capture, observations=capture.observations / 2, estimated_intensities=np.full(capture.n_lights, 2.0)
-    )
-    np.testing.assert_allclose(
-        albedo_map(source, twice, normals), albedo_map(source, capture, normals) / 2, rtol=1e-5
-    )
 
 
 def test_albedo_in_colour(scene):

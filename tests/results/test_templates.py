@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import zlib
-from importlib import resources
 from pathlib import Path
 from unittest import mock
 
 import cv2
 import numpy as np
-import pytest
 import tifffile
 
 from browser import OpenPage
@@ -20,18 +17,7 @@ from splinecli.evaluation.report import html_report
 from splinecli.results.files import NORMALS
 from splinecli.results.index import Entry, Row, index_page
 
-ASSETS = resources.files("splinecli") / "assets"
-PAGES = ("index.html", "page.html", "report.html")
 RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_heads_colours_and_lists_are_written_once(name):
-    template = (ASSETS / name).read_text("utf-8")
-    assert template.startswith('{% extends "base.html" %}')
-    for tag in ("meta", "html", "head", "title", "caption", "dl", "dt"):
-        assert f"<{tag}" not in template
-    assert not re.findall(r"(?<![&\w'\"])#[0-9a-f]{3,8}\b", template), "colours belong into base.html"
 
 
 def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):

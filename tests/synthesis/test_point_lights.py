@@ -39,10 +39,7 @@ def height_field(heights: Floats) -> Mesh:
     x, y = np.meshgrid(place, place)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate(
-        [
-            np.stack((corner, corner + 1, corner + n), 1),
-            np.stack((corner + 1, corner + n + 1, corner + n), 1),
-        ]
+        [np.stack((corner, corner + 1, corner + n), 1), np.stack((corner + 1, corner + n + 1, corner + n), 1)]
     )
     slope_y, slope_x = np.gradient(heights, place, place)
     normals = np.stack((-slope_x, -slope_y, np.ones_like(x)), -1).reshape(-1, 3)

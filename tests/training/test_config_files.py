@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,13 +25,6 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_without_anything_it_is_compact() -> None:
-    assert configure() == preset("compact")
-    assert configure("paper") == preset("paper")
-    with pytest.raises(UsageError, match="no preset named 'huge'; expected one of compact, refine, paper"):
-        configure("huge")
-
-
 def test_a_toml_file_over_a_preset(tmp_path: Path) -> None:
     file = write(
         tmp_path / "a.toml",
@@ -54,13 +46,6 @@ def test_a_toml_file_over_a_preset(tmp_path: Path) -> None:
         pixels=replace(compact.pixels, wall_share=0.3),
         network=replace(compact.network, map_size=16),
     )
-
-
-def test_the_config_of_a_run(tmp_path: Path) -> None:
-    config = replace(preset("paper"), seed=7, sources={"/data/set": 1.0, GENERATOR: 0.5}, minutes=2.0)
-    file = write(tmp_path / "config.json", json.dumps(config.to_dict(), indent=2))
-    assert configure(None, file) == config
-    assert configure("compact", file) == config  # it names every setting
 
 
 def test_presets_then_files_then_changes_in_their_order(tmp_path: Path) -> None:
@@ -175,12 +160,7 @@ def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
 
 def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    config = configure(
-        changes=[
-            {"sources": {"~/set": 1.0}},
-            {"start_from": "~/mine.safetensors"},
-        ]
-    )
+    config = configure(changes=[{"sources": {"~/set": 1.0}}, {"start_from": "~/mine.safetensors"}])
     assert config.sources == {str(tmp_path / "set"): 1.0}
     assert config.start_from == str(tmp_path / "mine.safetensors")
 

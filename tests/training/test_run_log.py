@@ -59,14 +59,6 @@ def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) 
     assert read_metrics(tmp_path / METRICS) == ROWS[:2]
 
 
-def test_every_damaged_file_is_kept(tmp_path: Path) -> None:
-    for number in range(3):
-        (tmp_path / METRICS).write_text(f"damage {number}\n")
-        RunLog(tmp_path, 0)
-    kept = ("metrics.damaged.csv", "metrics.damaged-2.csv", "metrics.damaged-3.csv")
-    assert [(tmp_path / name).read_text() for name in kept] == ["damage 0\n", "damage 1\n", "damage 2\n"]
-
-
 def read_png(path: Path) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None

@@ -19,7 +19,7 @@ from PIL import Image, ImageCms
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.colour_profile import profile_curve
 from splinecli.capture.formats.facts import StatedCurve, read_facts
-from splinecli.transfer import TransferCurve, decode_transfer, encode_srgb
+from splinecli.transfer import TransferCurve, decode_transfer
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 STORED = np.linspace(0, 1, 1001).astype(np.float32)
@@ -174,15 +174,6 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix:
         'The images say that they are display-encoded (colour profile "Adobe RGB (1998)") and are read as gamma:2.1992.'
         " Add --transfer linear if their values are linear."
     ]
-
-
-def test_an_srgb_profile_in_place_of_a_tag(tmp_path: Path) -> None:
-    light = np.linspace(0.02, 0.9, 99).reshape(9, 11, 1) * np.ones(3)
-    folder = capture(tmp_path / "a", SRGB_PROFILE, encode_srgb(light).astype(np.uint16) * 257, ".png")
-    found = read_capture(folder, as_stored=True)
-    np.testing.assert_allclose(
-        found.observations[:, 0], light[..., 0].ravel(), atol=0.005
-    )  # half of a grey level
 
 
 def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:

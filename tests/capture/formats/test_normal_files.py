@@ -253,8 +253,3 @@ def write_mat(path: Path, values: NDArray[np.float64], order: str, *, kind: int,
     mark = struct.pack(order + "HH", 0x100, 0x4D49)
     path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + mark + matrix)
     return path
-
-
-def test_a_path_that_the_system_refuses(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot be read \(File name too long\)\."):
-        read_normals(tmp_path / ("x" * 300 + ".npy"), SHAPE, MASK)

@@ -6,19 +6,16 @@ import struct
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.calibration.balls import find_ball_files
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.exif import Exposure, find_exposure
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.raw import _full_scale
 from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
 from splinecli.capture.layouts.image_lists import list_images
 from splinecli.errors import InputError
@@ -171,21 +168,6 @@ def test_saturated_photosites_are_at_full_scale(tmp_path: Path, white: int, blac
         assert (pixels[:, 30:] < 65535).all()
 
 
-def test_full_scale_is_where_the_camera_says() -> None:
-    def full_scale(stated: list[int] | None) -> int:
-        raw: Any = SimpleNamespace(
-            white_level=16383,
-            camera_white_level_per_channel=stated,
-            black_level_per_channel=[510, 512, 511, 512],
-        )
-        return _full_scale(raw)
-
-    assert full_scale(None) == 16383 - 512 - 1
-    assert full_scale([15300, 15200, 15200, 15300]) == 15200 - 512 - 1
-    for other_unit in (3800, 60000):
-        assert full_scale([other_unit] * 4) == 16383 - 512 - 1
-
-
 @pytest.mark.usefixtures("needs_rawpy")
 @pytest.mark.parametrize("colour", [(0.2, 0.5, 0.3), (0.4,)])
 def test_sensors_without_bayer_filter(tmp_path: Path, colour: tuple[float, ...]) -> None:
@@ -193,35 +175,6 @@ def test_sensors_without_bayer_filter(tmp_path: Path, colour: tuple[float, ...])
     pixels = decode_image(write_dng(tmp_path / "a.dng", np.round(light * WHITE)))
     assert pixels.shape == light.shape
     np.testing.assert_allclose(pixels / 65535, light, atol=1e-4)
-
-
-@pytest.mark.usefixtures("needs_rawpy")
-def test_normals_of_a_matte_sphere(tmp_path: Path) -> None:
-    size, radius = 96, 44
-    y, x = np.indices((size, size)) - (size - 1) / 2
-    z = np.sqrt(np.clip(radius**2 - x**2 - y**2, 0, None))
-    normals = np.stack((x, -y, z), axis=2) / radius
-    mask = x**2 + y**2 < (0.8 * radius) ** 2  # within all lights' reach
-    azimuth = np.arange(8) * 2.4
-    lights = np.stack((0.5 * np.cos(azimuth), 0.5 * np.sin(azimuth), np.ones(8)), axis=1)
-    lights[::2, :2] /= 2
-    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
-    colours = np.where((x // 8 + y // 8)[..., None] % 2, (0.8, 0.3, 0.2), (0.2, 0.6, 0.7))
-    black = (512, 516, 514, 509)
-    rng = np.random.default_rng(0)
-    for number, light in enumerate(lights):
-        shading = np.where(z > 0, np.clip(normals @ light, 0, None), 0)[..., None] * colours
-        as_shot = (rng.uniform(0.3, 0.9), 1.0, rng.uniform(0.3, 0.9))
-        write_dng(tmp_path / f"{number}.dng", mosaic(shading, black=black), black=black, neutral=as_shot)
-    np.savetxt(tmp_path / "lights.txt", lights)
-    capture = read_capture(tmp_path)
-    assert {warning.code for warning in capture.warnings} == {"black_pixels"}
-    observations = capture.observations.reshape(size, size, 8)[mask]
-    estimate = np.linalg.lstsq(lights, observations.T.astype(np.float64), rcond=None)[0].T
-    estimate /= np.linalg.norm(estimate, axis=1, keepdims=True)
-    error = np.degrees(np.arccos(np.clip((estimate * normals[mask]).sum(axis=1), -1, 1)))
-    # Pixels are 1.3 degrees apart, more on the slopes, and interpolation mixes neighbours of two colours.
-    assert error.mean() < 0.5 and error.max() < 4
 
 
 @pytest.mark.usefixtures("without_rawpy")
@@ -285,13 +238,6 @@ def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:
     ]
 
 
-def test_photographs_of_mirror_balls(tmp_path: Path) -> None:
-    touch(tmp_path, "1.cr3", "1.jpg", "2.cr3", "2.jpg", "ref.cr3", "ref.jpg", "mask.png")
-    files = find_ball_files(tmp_path)
-    assert names_of(files.images) == ["1.cr3", "2.cr3"]
-    assert files.reference == tmp_path / "ref.cr3"
-
-
 @pytest.mark.usefixtures("without_rawpy")
 def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
     stated = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
@@ -310,15 +256,6 @@ def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture
     path.write_bytes(path.read_bytes()[:2000])
     assert find_exposure(read_facts(path)) is None
     assert capfd.readouterr() == ("", "")
-
-
-def test_mixed_exposures_are_refused(tmp_path: Path) -> None:
-    for number, seconds in enumerate((1 / 64, 1 / 64, 1 / 32)):
-        write_dng(tmp_path / f"{number}.nef", mosaic(ramp()), exposure=(seconds, 8.0, 100))
-    (tmp_path / "lights.txt").write_text(LIGHTS)
-    message = r"2\.nef: found an exposure of 1/32 s, f/8, ISO 100, expected 1/64 s, f/8, ISO 100 as in 0\.nef"
-    with pytest.raises(InputError, match=message):
-        open_capture(tmp_path)
 
 
 @pytest.mark.usefixtures("needs_rawpy")

@@ -66,33 +66,22 @@ def write_jpeg(path: Path) -> None:
     path.write_bytes(content)
 
 
-def write_tiff(path: Path, height: int, width: int, strip: bytes) -> None:
-    """A TIFF whose only strip is these compressed bytes."""
-    tags = [
-        (256, width),
-        (257, height),
-        (258, 8),
-        (259, 8),
-        (262, 1),
-        (273, 0),
-        (277, 1),
-        (278, height),
-        (279, len(strip)),
-    ]
+def write_tiff(path: Path, height: int, width: int, data: bytes, *, tile: int = 0) -> None:
+    """A TIFF whose only strip, or tile, is these compressed bytes."""
+    layout = [(322, tile), (323, tile), (324, 0), (325, len(data))] if tile else [(273, 0), (278, height)]
+    layout += [] if tile else [(279, len(data))]
+    tags = sorted([(256, width), (257, height), (258, 8), (259, 8), (262, 1), (277, 1), *layout])
     start = 8 + 2 + 12 * len(tags) + 4
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, start if tag == 273 else value) for tag, value in tags)
-    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + strip)
+    values = ((tag, start if tag in (273, 324) else value) for tag, value in tags)
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in values)
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + data)
 
 
 def write_tile(path: Path, side: int) -> None:
     """A small TIFF with one compressed tile of zeros, far larger than the picture."""
     packer = zlib.compressobj(1)
     tile = b"".join(packer.compress(bytes(side)) for _ in range(side)) + packer.flush()
-    tags = [(256, 18), (257, 16), (258, 8), (259, 8), (262, 1), (277, 1), (322, side), (323, side), (324, 0)]
-    tags.append((325, len(tile)))
-    start = 8 + 2 + 12 * len(tags) + 4
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, start if tag == 324 else value) for tag, value in tags)
-    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + tile)
+    write_tiff(path, *SMALL, tile, tile=side)
 
 
 def write_mat(path: Path, shape: tuple[int, int, int], n_zeros: int) -> None:

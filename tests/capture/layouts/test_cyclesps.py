@@ -12,9 +12,6 @@ import tifffile
 
 from splinecli.capture import capture_name, find_captures, open_capture, read_capture
 from splinecli.errors import InputError
-from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate
-from splinecli.methods import make_estimator
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
 LIGHTS = np.array([(0.1, 0.2, 0.9), (-0.7, 0.1, 0.5), (0.3, -0.6, 0.4), (0.0, 0.5, 0.6), (0.5, 0.5, 0.3)])
@@ -100,16 +97,6 @@ def test_an_object_with_one_kind_is_that_capture(tmp_path: Path, monkeypatch: py
         assert capture_name(way) == open_capture(way).files.name == "Bunny_diffuse"
 
 
-def test_an_object_with_two_kinds(tmp_path: Path) -> None:
-    folder = tmp_path / "Bunny"
-    write_object(folder, "specular", "metallic")
-    assert message(lambda: open_capture(folder)) == (
-        f"{folder}: found 2 folders of images (images_metallic, images_specular), expected one."
-        f" Give one of them, such as {folder / 'images_metallic'}."
-    )
-    assert capture_name(folder) == "Bunny"
-
-
 def test_find_captures(tree: Path) -> None:
     objects = [tree / "PRPS/Bunny9", tree / "PRPS/Bunny10"]
     of_prps = [folder / f"images_{kind}" for folder in objects for kind in ("metallic", "specular")]
@@ -122,16 +109,6 @@ def test_find_captures(tree: Path) -> None:
     assert f"There are captures in {tree}: give that folder." in message(lambda: find_captures(tree.parent))
     names = [capture_name(folder) for folder in find_captures(tree)]
     assert names[1:5] == ["Bunny9_specular", "Bunny10_metallic", "Bunny10_specular", "Bunny9_diffuse"]
-
-
-def test_evaluation_calls_the_captures_by_their_names(tree: Path) -> None:
-    result = evaluate(find_captures(tree / "PRPS"), [make_estimator("ls")], Protocol(4, trials=1))
-    assert [result.capture for result in result.results] == [
-        "Bunny9_metallic",
-        "Bunny9_specular",
-        "Bunny10_metallic",
-        "Bunny10_specular",
-    ]
 
 
 def test_a_missing_image(tmp_path: Path) -> None:

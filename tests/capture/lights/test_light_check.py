@@ -19,7 +19,6 @@ from splinecli.errors import UsageError
 from splinecli.normals import unit
 
 Array = NDArray[np.float64]
-MEDALLION = Path(__file__).resolve().parents[3] / "examples/medallion"
 SIZE = 64
 
 
@@ -186,12 +185,6 @@ def test_the_columns_of_an_exchanged_file() -> None:
 def test_refused_frames(text: str) -> None:
     with pytest.raises(UsageError, match="--light-frame is"):
         parse_light_frame(text)
-
-
-def test_the_medallion_is_not_doubted() -> None:
-    capture = read_capture(MEDALLION)
-    check = check_lights(capture.observations, capture.mask, capture.light_directions)
-    assert (check.order, check.best) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -24,39 +24,26 @@ def write(folder: Path, text: str, encoding: str = "utf-8") -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "\n".join(ROWS),
-        "\r\n".join(ROWS) + "\r\n\r\n",
-        "4\n" + "\n".join(ROWS),
-        "# x y z\n\n" + "\n\n".join(row + "  # a light" for row in ROWS),
-        "\n".join(ROWS).replace(" ", "\t"),
-        "\n".join(ROWS).replace(" ", ", "),
-        "\n".join(ROWS).replace(" ", ";"),
-        "0 0 2\n3,0,4\n0;\t-6e-1; 0.8,\n-0.48\t0.36 , 0.8",
-        "0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
-        "4\n0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
-    ],
-    ids=[
-        "rows",
-        "crlf",
-        "count",
-        "comments",
-        "tabs",
-        "commas",
-        "semicolons",
-        "mixed",
-        "transposed",
-        "count-transposed",
-    ],
-)
-@pytest.mark.parametrize("n_images", [None, 4])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-def test_directions(tmp_path: Path, text: str, n_images: int | None, encoding: str) -> None:
-    directions = read_light_directions(write(tmp_path, text, encoding), n_images)
-    assert directions.dtype == np.float64
-    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
+FORMS = {
+    "rows": "\n".join(ROWS),
+    "crlf": "\r\n".join(ROWS) + "\r\n\r\n",
+    "count": "4\n" + "\n".join(ROWS),
+    "comments": "# x y z\n\n" + "\n\n".join(row + "  # a light" for row in ROWS),
+    "tabs": "\n".join(ROWS).replace(" ", "\t"),
+    "commas": "\n".join(ROWS).replace(" ", ", "),
+    "semicolons": "\n".join(ROWS).replace(" ", ";"),
+    "mixed": "0 0 2\n3,0,4\n0;\t-6e-1; 0.8,\n-0.48\t0.36 , 0.8",
+    "transposed": "0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
+    "count-transposed": "4\n0 0.6 0 -0.48\n0 0 -0.6 0.36\n1 0.8 0.8 0.8",
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_directions(tmp_path: Path, form: str) -> None:
+    for n_images, encoding in ((None, "utf-8"), (4, "utf-8"), (None, "utf-8-sig"), (4, "utf-8-sig")):
+        directions = read_light_directions(write(tmp_path, FORMS[form], encoding), n_images)
+        assert directions.dtype == np.float64
+        np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
 
 
 def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> None:
@@ -120,17 +107,16 @@ def test_wrong_directions(tmp_path: Path, text: str, line: int | None, message: 
 
 
 def test_files_that_are_no_text(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.txt: the file does not exist\."):
-        read_light_directions(tmp_path / "none.txt")
-    with pytest.raises(InputError, match=r"found a folder, expected a text file with a line x y z for"):
-        read_light_directions(tmp_path)
-    with pytest.raises(InputError, match=r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."):
-        read_light_directions(write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1"))
     cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((3, 3), np.uint8))
-    with pytest.raises(
-        InputError, match=r"found an image, expected a text file with a line x y z for each image\."
+    write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1")
+    for name, message in (
+        ("none.txt", r"none\.txt: the file does not exist\."),
+        (".", r"found a folder, expected a text file with a line x y z for"),
+        ("lights.txt", r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."),
+        ("mask.png", r"found an image, expected a text file with a line x y z for each image\."),
     ):
-        read_light_directions(tmp_path / "mask.png")
+        with pytest.raises(InputError, match=message):
+            read_light_directions(tmp_path / name)
     with pytest.raises(InputError, match=r"expected a text file with a line r g b for each image\."):
         read_light_intensities(tmp_path / "mask.png", 3)
 
@@ -150,22 +136,17 @@ def test_gray_intensities_count_for_every_channel(tmp_path: Path, text: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("text", "line", "message"),
+    ("text", "message"),
     [
-        ("1 1 1\n1 0 1\n1 1 1\n1 1 1", 2, "found the intensity 0, expected a number above 0."),
-        ("1 1 1 1\n1 1 -2 1\n1 1 1 1", 2, "found the intensity -2 in column 3, expected a number above 0."),
-        ("1 1\n1 1\n1 1\n1 1", 1, "found 2 columns, expected 3 (R G B) or 1 (gray)."),
-        ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", 2, 'found "inf", expected a finite number.'),
-        (
-            "1 1 1\n1 1 1",
-            None,
-            "found 2 light intensities, expected 4, one for each image."
-            " The file needs one line for each image, in the order of the images.",
-        ),
+        ("1 1 1\n1 0 1\n1 1 1\n1 1 1", ":2: found the intensity 0, expected a number above 0."),
+        ("1 1 1 1\n1 1 -2 1\n1 1 1 1", ":2: found the intensity -2 in column 3, expected a number above 0."),
+        ("1 1\n1 1\n1 1\n1 1", ":1: found 2 columns, expected 3 (R G B) or 1 (gray)."),
+        ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", ':2: found "inf", expected a finite number.'),
+        ("1 1 1\n1 1 1", ": found 2 light intensities, expected 4, one for each image."),
     ],
 )
-def test_wrong_intensities(tmp_path: Path, text: str, line: int | None, message: str) -> None:
+def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
     path = write(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_light_intensities(path, 4)
-    assert str(caught.value) == (f"{path}: " if line is None else f"{path}:{line}: ") + message
+    assert str(caught.value).startswith(f"{path}{message}")

@@ -81,14 +81,6 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> Non
     np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 
-def test_lp_files_with_decimal_commas(tmp_path: Path) -> None:
-    path = tmp_path / "a.lp"
-    path.write_text("2\nimg1.png 0,6 0 0,8\nimg2.png 0 -0,6 0,8", encoding="utf-16")
-    lights = read_lights(path, 2)
-    assert isinstance(lights, NamedLights)
-    np.testing.assert_allclose(lights.directions, DIRECTIONS[1:3], atol=1e-15)
-
-
 @pytest.mark.parametrize(
     "vectors", [DIRECTIONS * 3, DIRECTIONS.T.astype(np.float32)], ids=["rows", "columns"]
 )

@@ -15,6 +15,7 @@ from splinecli.capture.lights.light_check import check_lights
 from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.capture.lights.odd_image import OddImage, find_odd_image
+from splinecli.normals import unit
 
 Array = NDArray[np.float64]
 SIZE, ODD = 64, 4
@@ -64,34 +65,6 @@ def test_a_dimmed_image_is_odd_where_intensities_are_known() -> None:
     assert find(observations, intensities_known=False) is None, "lamps may differ"
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_a_moved_light_is_odd(known: bool) -> None:
-    true = LIGHTS.copy()
-    true[ODD] = tilted(true[ODD], -40)
-    odd = find(shade(sphere()[0], true), intensities_known=known)
-    assert odd is not None and odd.place == ODD
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_the_image_of_another_object_is_odd(known: bool) -> None:
-    normals, _ = sphere()
-    observations = shade(normals, LIGHTS)
-    other = np.stack((-0.8 * normals[:, 1], 0.6 * normals[:, 0], np.ones(len(normals))), axis=1)
-    other /= np.linalg.norm(other, axis=1, keepdims=True)
-    observations[:, ODD] = shade(other, LIGHTS)[:, ODD]
-    odd = find(observations, intensities_known=known)
-    assert odd is not None and odd.place == ODD
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_an_image_half_in_shadow_is_odd(known: bool) -> None:
-    normals, _ = sphere()
-    observations = shade(normals, LIGHTS)
-    observations[normals[:, 1] > 0.1, ODD] *= 0.2
-    odd = find(observations, intensities_known=known)
-    assert odd is not None and odd.place == ODD
-
-
 def test_the_other_images_are_judged_without_the_odd_one() -> None:
     normals, mask = sphere()
     observations = shade(normals, LIGHTS)
@@ -111,3 +84,19 @@ def test_real_captures_have_no_odd_image(shared_data: Path, name: str) -> None:
     factors = find_factors(capture.observations)
     assert factors is not None
     assert find_odd_image(factors, capture.light_directions) is None
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("fault", ["a moved light", "another object", "half in shadow"])
+def test_each_fault_of_an_image_is_odd(fault: str, known: bool) -> None:
+    normals, lights = sphere()[0], LIGHTS.copy()
+    if fault == "a moved light":
+        lights[ODD] = tilted(lights[ODD], -40)
+    observations = shade(normals, lights)
+    if fault == "another object":
+        other = unit(np.stack((-0.8 * normals[:, 1], 0.6 * normals[:, 0], np.ones(len(normals))), axis=1))
+        observations[:, ODD] = shade(other, LIGHTS)[:, ODD]
+    elif fault == "half in shadow":
+        observations[normals[:, 1] > 0.1, ODD] *= 0.2
+    odd = find(observations, intensities_known=known)
+    assert odd is not None and odd.place == ODD

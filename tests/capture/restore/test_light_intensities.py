@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
-import cv2
 import numpy as np
 import pytest
 
+from scenes import shade, sphere_cap, write_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.reader import open_capture
@@ -112,13 +112,8 @@ def test_saturated_observations_do_not_count():
 
 def test_a_capture_without_a_file_of_intensities(tmp_path):
     directions = lights(8)
-    axis = np.linspace(-0.6, 0.6, 40)
-    x, y = np.meshgrid(axis, -axis)
-    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
-    for index in range(8):
-        picture = np.maximum(normals @ directions[index], 0) * INTENSITIES[index] * 30_000
-        cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16))
-    np.savetxt(tmp_path / "lights.txt", directions)
+    shaded = np.moveaxis(shade(sphere_cap(40, 0.6), directions) * INTENSITIES, 2, 0)
+    write_capture(tmp_path, np.rint(30_000 * shaded).astype(np.uint16), directions)
     source = open_capture(tmp_path)
     plain, restored = source.read(as_stored=True), source.read()
     assert plain.estimated_intensities is None

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from scenes import spiral_lights
+from scenes import shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
 from splinecli.errors import InputError
@@ -25,12 +25,9 @@ Images = NDArray[np.integer]
 
 def sphere(*, noise: float = 0.01) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Images (F, H, W) of a matte sphere, which fills the picture, with a largest value of about 1; its normals."""
-    axis = np.linspace(-0.65, 0.65, SIDE)
-    x, y = np.meshgrid(axis, -axis)
-    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
-    rng = np.random.default_rng(3)
+    normals, rng = sphere_cap(SIDE), np.random.default_rng(3)
     albedo = rng.uniform(0.6, 1, (SIDE, SIDE)) if noise else 1.0
-    images = np.stack([albedo * np.maximum(normals @ light, 0) for light in LIGHTS])
+    images = albedo * np.moveaxis(shade(normals, LIGHTS), 2, 0)
     return images * rng.normal(1, noise, images.shape), normals
 
 
@@ -157,14 +154,6 @@ def test_a_given_level_is_used_as_it_is() -> None:
     )
 
 
-def write_capture(folder: Path, images: Images) -> Path:
-    folder.mkdir()
-    for number, image in enumerate(images):
-        cv2.imwrite(str(folder / f"{number}.png"), image)
-    np.savetxt(folder / "lights.txt", LIGHTS)
-    return folder
-
-
 def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) -> float:
     capture = open_capture(folder, **settings).read()
     solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
@@ -173,7 +162,7 @@ def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) 
 
 def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
     images, normals = sphere()
-    folder = write_capture(tmp_path / "vase", clip(images, 4095))
+    folder = write_capture(tmp_path / "vase", clip(images, 4095), LIGHTS)
     capture = open_capture(folder).read()
     assert capture.white_level == WhiteLevel(4095, "images")
     assert {"white_level", "saturated"} <= {warning.code for warning in capture.warnings}
@@ -186,7 +175,7 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
         capture.restored.any(axis=1), (capture.observations > stored.observations).any(axis=1)
     )
     found = ls_error_deg(folder, normals)
-    full = ls_error_deg(write_capture(tmp_path / "full", clip(images, 65_535)), normals)
+    full = ls_error_deg(write_capture(tmp_path / "full", clip(images, 65_535), LIGHTS), normals)
     assert found == pytest.approx(full, abs=0.02)
     assert found < 0.5 * ls_error_deg(folder, normals, white_level=65_535)
     assert ls_error_deg(folder, normals, white_level=4095) == found
@@ -208,12 +197,12 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
     images[0, 0, 0] = 4095  # one pixel alone would not tell
     if len(bits) == 3:
         images = np.repeat(images[..., None], 3, axis=-1)
-    folder = write_capture(tmp_path / "vase", images)
+    folder = write_capture(tmp_path / "vase", images, LIGHTS)
     for path in folder.glob("*.png"):
         add_sbit(path, *bits)
     expected = WhiteLevel(65_535, "full scale") if level is None else WhiteLevel(level, "file")
     assert open_capture(folder).read().white_level == expected
-    (folder / "11.png").write_bytes(cv2.imencode(".png", images[11])[1].tobytes())  # not all of them
+    (folder / "011.png").write_bytes(cv2.imencode(".png", images[11])[1].tobytes())  # not all of them
     assert open_capture(folder).read().white_level == WhiteLevel(65_535, "full scale")
 
 

@@ -1,0 +1,195 @@
+"""What an earlier run has left: what is skipped, kept, redone or refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splinecli.files import UNFINISHED
+from splinecli.publishing import UNDONE
+
+
+def read_report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text("utf-8"))
+
+
+def test_refuses_to_overwrite(capture, run, golden):
+    run("infer", capture, "--method", "ls")
+    before = read_report(Path("out/sphere"))
+    result = run("infer", capture, "--method", "ls", "--n-lights", 4)
+    assert (result.code, result.out) == (5, "")
+    golden("error_exists.txt", result.err)
+    assert read_report(Path("out/sphere")) == before
+    assert run("infer", capture, "--method", "ls", "--n-lights", 4, "--overwrite").code == 0
+    assert read_report(Path("out/sphere"))["n_lights"] == 4
+
+
+def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
+    make_capture("second")
+    broken = make_capture("third") / "image3.png"
+    whole = broken.read_bytes()
+    broken.write_bytes(b"no picture")
+    captures = ("sphere", "second", "third")
+    first = run("infer", *captures, "--method", "ls")
+    assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
+    before = {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in captures[:2]}
+    broken.write_bytes(whole)
+    Path("out", f".index.html.x{UNFINISHED}").touch()  # a killed process was writing this
+    again = run("infer", *captures, "--method", "ls")
+    assert again.code == 0
+    assert f"splinecli: warning: out: {UNDONE}" in again.err
+    assert again.out.startswith("out/third: ")
+    assert "out/second: already done, skipped\n" in again.err
+    assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
+    assert before == {name: (Path("out") / name / "normals.npy").stat().st_mtime_ns for name in before}
+    # The same in JSON has all reports.
+    reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
+    assert [report["capture"] for report in reports] == list(captures)
+
+
+def change_light_file(capture: Path) -> tuple[str, ...]:
+    light = capture / "light_directions.txt"
+    light.write_text(light.read_text() + "# measured anew\n")
+    return ()
+
+
+def change_the_version(capture: Path) -> tuple[str, ...]:
+    path = Path("out") / capture / "report.json"
+    path.write_text(path.read_text().replace('"version": "', '"version": "0.0.'))
+    return ()
+
+
+CHANGES = {
+    "made with another --n-lights": lambda _: ("--n-lights", "4"),
+    "other input files": change_light_file,
+    "made by version 0.0.": change_the_version,
+}
+
+
+@pytest.mark.parametrize("reason", CHANGES)
+@pytest.mark.parametrize("others", [(), ("second",)], ids=["one", "several"])
+def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason, others):
+    """One capture and several obey the same rules."""
+    make_capture("second")
+    call = ("infer", capture, *others, "--method", "ls")
+    assert run(*call).code == 0
+    extra = CHANGES[reason](capture)
+    before = (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere")))
+    kept = run(*call, *extra)
+    assert (kept.code, kept.out) == (5, "")
+    line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
+    assert reason in line
+    assert "Add --update to redo what changed, --overwrite to redo everything" in line
+    assert (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere"))) == before
+    first, *_ = json.loads(run(*call, *extra, "--json").out)
+    assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
+    updated = run(*call, *extra, "--update")
+    assert updated.code == 0
+    assert Path("out/sphere/normals.npy").stat().st_mtime_ns > before[0]
+    if others and not extra:
+        assert "out/second: already done, skipped" in updated.err
+    assert run(*call, *extra).code == 0
+
+
+def link_elsewhere(path: Path) -> None:
+    path.rename("elsewhere")
+    path.symlink_to(Path("elsewhere").absolute())
+
+
+def surrogate_among_files(path: Path) -> None:
+    report = json.loads(path.read_text())
+    path.write_text(json.dumps({**report, "files": ["\ud800"]}))
+
+
+UNFINISHED_FOLDERS: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "no report": ("report.json", Path.unlink, "has no report.json"),
+    "linked report": ("report.json", link_elsewhere, "has no report.json"),
+    "missing": ("normals.png", Path.unlink, "normals.png is missing"),
+    "linked": ("normals.npy", link_elsewhere, "normals.npy is missing"),
+    "cut short": ("normals.npy", lambda path: os.truncate(path, 100), "normals.npy has another size than"),
+    "no such name": ("report.json", surrogate_among_files, "\\ud800 is missing"),
+}
+
+
+@pytest.mark.parametrize("name", UNFINISHED_FOLDERS)
+def test_an_unfinished_folder_is_computed_again(capture, run, name):
+    call = ("infer", capture, "--method", "ls")
+    assert run(*call).code == 0
+    whole = {path.name: path.stat().st_size for path in Path("out/sphere").iterdir()}
+    file, damage, reason = UNFINISHED_FOLDERS[name]
+    damage(Path("out/sphere", file))
+    elsewhere = Path("elsewhere").read_bytes() if Path("elsewhere").exists() else None
+    again = run(*call)
+    assert (again.code, again.out[:11]) == (0, "out/sphere:")
+    assert reason in again.err
+    assert "so it is computed again" in again.err
+    assert {path.name: path.stat().st_size for path in Path("out/sphere").iterdir()}.keys() == whole.keys()
+    assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
+    assert elsewhere in (None, Path("elsewhere").read_bytes() if elsewhere else b"")
+    report = read_report(Path("out/sphere"))
+    sizes = {
+        path.name: path.stat().st_size for path in Path("out/sphere").iterdir() if path.suffix != ".json"
+    }
+    assert report["file_sizes"] == sizes
+    assert "already done, skipped" in run(*call).err
+
+
+def test_an_edited_mask_and_an_integrated_surface_stay(capture, run):
+    (capture / "mask.png").unlink()
+    call = ("infer", capture, "--method", "ls", "--auto-mask", "--surface", "--mesh-format", "ply")
+    assert run(*call, "--overwrite").code == 0
+    assert run("integrate", "out/sphere", "--format", "ply", "--stiffness", 0, "--overwrite").code == 0
+    assert run("integrate", "out/sphere", "--format", "ply", "--overwrite").code == 0
+    with Path("out/sphere/found_mask.png").open("ab") as file:
+        file.write(b"edited")
+    assert "already done, skipped" in run(*call).err
+
+
+def test_a_link_in_the_place_of_a_result_folder_fails_its_capture_only(capture, make_capture, run):
+    make_capture("second")
+    Path("elsewhere").mkdir()
+    Path("out").mkdir()
+    Path("out/sphere").symlink_to(Path("elsewhere").absolute())
+    for overwrite in ((), ("--overwrite",)):
+        result = run("infer", capture, "second", "--method", "ls", *overwrite)
+        assert (result.code, "out/sphere: found a link, expected a folder" in result.err) == (5, True)
+        assert Path("out/second/report.json").is_file()
+        assert not list(Path("elsewhere").iterdir())
+
+
+BAD_REPORTS = [
+    ("files", [1, 2]), ("files", ["\ud800"]), ("files", ["../../kept"]), ("files", {"a": 1}),
+    ("file_sizes", 5), ("file_sizes", None), ("warnings", [1]), ("warnings", [{"text": ["\ud800"]}]),
+    ("seconds", {"read": "x"}), ("n_pixels", "\ud800"), ("angular_error_deg", {"mean": []}),
+    ("capture", "\ud800"), ("error", ["\ud800"]),
+]  # fmt: skip
+
+
+def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run):
+    names = [str(make_capture(f"c{number}")) for number in range(len(BAD_REPORTS))]
+    assert run("infer", *names, "--method", "ls").code == 0
+    Path("kept").touch()
+    for name, (key, value) in zip(names, BAD_REPORTS, strict=True):
+        path = Path("out", name, "report.json")
+        path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    result = run("infer", capture, make_capture("third"), "--method", "ls")
+    assert (result.code, "Traceback" in result.err) == (0, False)
+    page = Path("out/index.html").read_text("utf-8")
+    assert "sphere" in page and "third" in page
+    # The same where the captures themselves come next.
+    assert run("infer", *names, "--method", "ls", "--update").code == 0
+    assert [json.loads(Path("out", name, "report.json").read_text())["capture"] for name in names] == names
+    assert Path("kept").is_file()
+
+
+def test_files_of_the_user_in_the_capture_are_kept(capture, run):
+    (capture / "normals.png").write_text("drawn by hand")
+    for update in ((), ("--update",)):
+        result = run("infer", capture, "--method", "ls", "-o", capture.parent, *update)
+        assert result.code == 5
+        assert "sphere: contains normals.png, but no report.json" in result.err
+    assert (capture / "normals.png").read_text() == "drawn by hand"
