@@ -16,7 +16,7 @@ from splinecli.calibration.view import View, find_view
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import read_mask, to_linear
+from splinecli.capture.formats.images import read_image, read_mask, to_linear
 from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
@@ -228,7 +228,7 @@ def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
     total: NDArray[np.float32] | None = None
     for path in images:
         expected = None if total is None else ExpectedSize(total.shape, images[0].name)
-        gray = to_linear(decode_image(path, expected), path).mean(axis=2)
+        gray = read_image(path, expected).mean(axis=2)
         total = gray if total is None else total + gray
     assert total is not None
     return total / np.float32(len(images))

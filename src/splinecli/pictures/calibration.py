@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from splinecli.calibration.balls import BallCalibration
-from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.images import to_linear
+from splinecli.capture.formats.images import read_image
 from splinecli.pictures.png import Picture
 
 TILE = 200
@@ -39,7 +38,7 @@ def calibration_picture(balls: tuple[BallCalibration, ...]) -> Picture:
 
 def _tile(ball: BallCalibration, number: int) -> Picture:
     path, circle, highlight = ball.files.images[number], ball.circle, ball.highlights[number]
-    values = to_linear(decode_image(path), path).mean(axis=2)
+    values = read_image(path).mean(axis=2)
     reach = _MARGIN * circle.radius
     scale = TILE / (2 * reach)
     # The transformation from the tile to the image; pixel centres are at whole numbers in both.

@@ -77,8 +77,8 @@ def common_orientation(images: Sequence[ImageFacts]) -> int:
         InputError: two images state different orientations, so that their pixels do not fit on each other.
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
-    stated = [(facts.exif or {}).get(ORIENTATION) for facts in asked]
-    orientations = [value if isinstance(value, int) and value in range(1, 9) else UPRIGHT for value in stated]
+    stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)
+    orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
     for facts, orientation in zip(asked, orientations, strict=True):
         if orientation != orientations[0]:
             raise InputError(

@@ -261,9 +261,8 @@ def _tiff_facts(file: BinaryIO, path: Path) -> ImageFacts:
 
 def _one_value(tag: object) -> int | None:
     """Return the tag's value where it is one whole number, or the same one for each channel."""
-    values = set(tag) if isinstance(tag, tuple) else {tag}
-    value = values.pop() if len(values) == 1 else None
-    return value if isinstance(value, int) else None
+    first, *others = tag if isinstance(tag, tuple) and tag else (tag,)
+    return first if isinstance(first, int) and all(other == first for other in others) else None
 
 
 def _level(bits: int) -> int | None:
