@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -61,7 +60,7 @@ class Bench:
         labels = {path.name: label for label, path in captures.items()}
         # mae_deg has four decimals; rounding it again may differ from what evaluate prints.
         return [
-            {**result, "label": labels[result["capture"]], "mae_deg": round(np.mean(result["maes_deg"]), 4)}
+            {**result, "label": labels[result["capture"]], "mae_deg": round(fmean(result["maes_deg"]), 4)}
             for result in document["results"]
         ]
 
@@ -114,6 +113,7 @@ class Bench:
             for name, value in zip(
                 (*tables.EXPOSED, *tables.INTENSITIES), (*exposed, *unknown[2:]), strict=True
             )
+            if np.isfinite(value)  # without its saturated values, a pixel may have too few
         }
 
     def confidence(self, capture: str) -> Cells:
@@ -181,10 +181,8 @@ class Bench:
 
         cells: Cells = {}
         for name, distils in (("network", False), ("distilled", True)):
-            output = str(self.results / name)
-            options = InferOptions(n_lights=10, distil=distils, output=output, overwrite=True)
-            report = infer_capture(self.objects[label], options)
-            cells[name] = round(report["angular_error_deg"]["mean"], 4)
+            options = InferOptions(n_lights=10, distil=distils, output=str(self.results / name))
+            cells[name] = round(infer_capture(self.objects[label], options)["angular_error_deg"]["mean"], 4)
         return cells
 
     def speed(self) -> dict[str, Cells]:
@@ -243,7 +241,7 @@ def means(results: Sequence[Mapping[str, Any]], column: Callable[[Mapping[str, A
     values: dict[str, list[float]] = {}
     for result in results:
         values.setdefault(column(result), []).append(result["mae_deg"])
-    return {name: round(float(np.mean(errors)), 4) for name, errors in values.items()}
+    return {name: round(fmean(errors), 4) for name, errors in values.items()}
 
 
 def rewritten(folder: Path, place: Path, convert: Callable[[Any], Any]) -> Path:
@@ -271,6 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--only", nargs="+", default=[])
     parser.add_argument("--again", action="store_true", help="measure rows again that are done")
+    parser.add_argument("--machine", default="unnamed machine", help="as in 'two cores of an AMD EPYC'")
     options = parser.parse_args(arguments)
     measured: Measured = json.loads(options.figures.read_text("utf-8")) if options.figures.exists() else {}
     measurements = Bench(options.data, options.results, options.trials).measurements()
@@ -281,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         stored = measured.get(name, {})
         if options.again or stored.get("weights") != used:
             stored = {}
-        machine = processor() if name in NEED_QUIET else ""
+        machine = options.machine if name in NEED_QUIET else ""
         measured[name] = {"version": __version__, "weights": used, "machine": machine, "rows": {}, **stored}
         for row, measure in measurements[name].items():
             if row in measured[name]["rows"] or wanted not in ("", row):
@@ -292,12 +291,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(f"{name}, {row}: {measured[name]['rows'][row]}", flush=True)
     if options.figures == tables.FIGURES:
         tables.main()
-
-
-def processor() -> str:
-    """Return the model of the processor, as Linux names it."""
-    models = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text("utf-8"))
-    return f"{len(models)} cores of {models[0]}" if models else platform.machine()
 
 
 if __name__ == "__main__":

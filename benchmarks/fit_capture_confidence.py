@@ -13,8 +13,9 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -43,8 +44,7 @@ RIGHT_WEIGHT = 2.0
 """Weight of right captures in the fit. Most captures are right."""
 
 
-@dataclass(frozen=True)
-class Example:
+class Example(NamedTuple):
     """What the fit needs of some pixels of an estimated capture: see CaptureHead.forward. errors_deg: true."""
 
     kind: str

@@ -125,7 +125,7 @@ def cell(kind: str, named: int, mended: int, total: int) -> str:
     return f"{named}" + ("" if kind == "right" else f" / {mended}") + f" of {total}"
 
 
-def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str, str]:
+def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str, float | str]:
     """Return one kind of file for all photographs, for metal, and for all other rendered scenes together."""
     sums: dict[str, NDArray[np.integer]] = {}
     for name, found in by_name.items():

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from splinecli.calibration.view import DISTANT, find_view
+from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
 
 
@@ -33,7 +34,7 @@ def photograph(path: Path, tags: dict[int, object]) -> Path:
     ],
 )
 def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) -> None:
-    view = find_view(photograph(tmp_path / "a.jpg", tags), None)
+    view = find_view(read_facts(photograph(tmp_path / "a.jpg", tags)), None)
     assert view.source == ("assumed distant" if focal == DISTANT else "EXIF")
     np.testing.assert_allclose(view.matrix, ((focal, 0, 179.5), (0, focal, 119.5), (0, 0, 1)), rtol=1e-6)
 
@@ -41,7 +42,7 @@ def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) ->
 def test_a_file_comes_first(tmp_path: Path) -> None:
     image = photograph(tmp_path / "a.jpg", {0xA405: 50})
     (tmp_path / "m.txt").write_text("700 0 180\n0 710 120\n0 0 1\n")
-    assert find_view(image, tmp_path / "m.txt").matrix[1, 1] == 710
+    assert find_view(read_facts(image), tmp_path / "m.txt").matrix[1, 1] == 710
     (tmp_path / "m.txt").write_text("-700 0 180\n0 710 120\n0 0 1\n")
     with pytest.raises(InputError, match="is not a camera matrix"):
-        find_view(image, tmp_path / "m.txt")
+        find_view(read_facts(image), tmp_path / "m.txt")

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
-from splinecli.capture.formats.header import stated_curve
+from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
 
 LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
@@ -124,7 +124,7 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     ):
         path = tmp_path / name
         path.write_bytes(content)
-        assert (stated_curve(path).curve is None) == encoded, name
+        assert (read_facts(path).curve.curve is None) == encoded, name
     folder = store(tmp_path / "capture", light)
     assert "display_encoded" not in codes(read_capture(folder).warnings)
     (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))

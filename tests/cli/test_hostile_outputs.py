@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from splinecli.evaluation.trials import TrialStore
-from splinecli.publishing import UNDONE
+from splinecli.publishing import UNDONE, NewFiles
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
 
@@ -183,3 +183,16 @@ def test_trials_go_on_in_a_file_of_their_own(tmp_path):
     TrialStore(path)
     assert (path.read_text(), path.is_symlink()) == ("", False)
     assert elsewhere.read_text() == line + line[:20]
+
+
+def test_an_interrupt_at_the_very_end(inputs, run, monkeypatch):
+    publish = NewFiles.publish
+
+    def interrupt(*arguments: object) -> None:
+        publish(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(NewFiles, "publish", interrupt)
+    for arguments, _, _ in COMMANDS.values():
+        result = run(*arguments)
+        assert (result.code, result.err.splitlines()[-1]) == (130, "splinecli: interrupted.")

@@ -175,7 +175,7 @@ def test_a_mended_mask_stays(capture, run):
 
 
 @pytest.mark.parametrize(
-    "part", [("--crop", "2,3,19,18"), ("--scale", "1/2"), ("--crop", "1,1,21,20", "--scale", "1/3")]
+    "part", [("--crop", "1,2,22,21"), ("--scale", "1/2"), ("--crop", "1,1,22,22", "--scale", "1/3")]
 )
 def test_a_found_mask_of_a_part_is_a_mask_of_the_capture(capture, run, part):
     mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_GRAYSCALE)

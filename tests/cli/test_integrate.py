@@ -35,6 +35,7 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     normals, _, inside = sphere()
     np.save("normals.npy", normals)
+    Path("report.json").write_text('{"files": ["normals.npy", "normals.png"]}')
     cv2.imwrite("normals.png", encode_picture(normals, inside)[..., ::-1])
     cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
 
@@ -53,6 +54,13 @@ def test_heights_and_mesh_of_a_sphere(run):
     assert report["files"] == ["mesh.ply", "mesh.obj", "mesh.mtl", "depth.npy", "depth.tiff", "surface.json"]
     assert sorted(path.name for path in Path("out").iterdir()) == sorted(report["files"])
     assert f"out: {inside.sum()} pixels, from " in result.out
+
+
+@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"], ["."]])
+def test_formats_of_normal_maps(run, arguments):
+    assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
+    _, heights, inside = sphere()
+    assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
 
 
 @pytest.mark.parametrize("given", [[], ["--convention", "directx"]], ids=["found", "given"])
@@ -201,9 +209,9 @@ def test_a_decimated_mesh_and_its_textures(run):
 
     green = np.zeros((*SHAPE, 3), np.uint8)
     green[..., 1] = 180
-    cv2.imwrite("albedo.png", green)  # beside the normal map, as infer writes it
-    arguments = ["--decimate", 100, "--format", "glb,ply,obj", "--json"]
-    report = json.loads(run("integrate", ".", "-o", "out", *arguments).out)
+    cv2.imwrite("albedo.png", green)
+    arguments = ["--colours", "albedo.png", "--decimate", 100, "--format", "glb,ply,obj", "--json"]
+    report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
     assert (report["normal_texture"], report["colours"]) == (True, "albedo.png")
     assert 80 <= report["n_triangles"] <= 100
     assert report["files"] == ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "surface.json"]

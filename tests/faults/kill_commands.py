@@ -129,7 +129,14 @@ class KilledCommand:
         self.new_count += after == self.new
         yield from self._problems(after)
         self._run_again()
-        if self._state(self.case) != self.new:
+        after = self._state(self.case)
+        if self.replacement.target == "normals":  # the lost report named the earlier files that were to go
+            after = {
+                name: value
+                for name, value in after.items()
+                if name in self.new or value != self.old.get(name)
+            }
+        if after != self.new:
             yield "the next run ends with other files"
 
     def missing_syncs(self) -> Iterator[str]:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import tifffile
 import trimesh
+from PIL import Image, ImageCms
 from scipy.io import savemat
 
 SHAPE = (16, 18)
@@ -145,6 +146,10 @@ def mirror_ball(folder: Path) -> None:
     for name in ("ball", "gray"):
         cv2.imwrite(str(folder / name / "mask.png"), inside.astype(np.uint8) * 255)
     np.savetxt(folder / "known.txt", LIGHTS[:4])
+    (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    with Image.open(folder / "gray/0.png") as image:
+        image.save(folder / "gray/0.png", icc_profile=profile)
 
 
 def thin(folder: Path) -> None:
@@ -271,7 +276,9 @@ TARGETS = (
         "ball",
         mirror_ball,
         ("*/*", "known.txt"),
-        ("calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",),
+        (
+            "calibrate ball --gray-ball gray --compare known.txt --camera-matrix camera.txt -o out --overwrite",
+        ),
     ),
     Target(
         "earlier",

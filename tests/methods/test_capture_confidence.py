@@ -103,8 +103,11 @@ def test_the_head_takes_as_many_features_as_there_are() -> None:
 
 def test_an_untrained_head_changes_little() -> None:
     errors = torch.tensor([[-2.0, 1.0], [0.0, 0.5]])
-    found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), torch.full((CAPTURE_FEATURES,), torch.nan))
-    added = np.exp(-3.5)
+    capture = torch.full((CAPTURE_FEATURES,), torch.nan)
+    turn = list(CaptureFeatures.__dataclass_fields__).index("bend_turn")
+    capture[turn] = np.log(2.0)
+    found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), capture)
+    added = np.exp(-3.5) + np.radians(0.6 * 2.0)
     np.testing.assert_allclose(found[:, 0].exp().detach(), errors[:, 0].exp() + added, rtol=1e-5)
     np.testing.assert_array_equal(found[:, 1].detach(), errors[:, 1])
 
@@ -138,6 +141,12 @@ def test_what_cannot_be_judged() -> None:
     assert not claim(tiny)[0].capture_judged
     assert capture_head("0" * 64) is None
     assert capture_head(manifest()["cnn-ps"]["sha256"]) is None
+
+
+def test_a_capture_one_pixel_high() -> None:
+    capture = relief(draw_lights())
+    flat = replace(capture, mask=capture.mask.reshape(1, -1), ground_truth=None)
+    assert estimate_normals(flat, make_estimator("spline-net-pixelwise")).capture_judged
 
 
 def test_dark_pixels_stay_unknown() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
 from splinecli.calibration.view import View, find_view
-from splinecli.capture.formats.decoding import decode_image, stored_size
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask, to_linear
 from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
@@ -41,6 +43,11 @@ class BallFiles:
     images: tuple[Path, ...]
     reference: Path | None
     mask: Path | None
+
+    @cached_property
+    def facts(self) -> tuple[ImageFacts, ...]:
+        """What the headers of the images state."""
+        return tuple(map(read_facts, self.images))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +141,7 @@ def calibrate_ball(
     circle_from = "--circle"
     if circle is None:
         circle, circle_from = _find_outline(files)
-    view = find_view(files.images[0], camera_matrix)
+    view = find_view(files.facts[0], camera_matrix)
     centre = ball_centre(circle.outline, view.matrix)
     highlights, normals, directions = [], [], []
     expected: ExpectedSize | None = None
@@ -198,7 +205,7 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
     path = files.mask or files.reference or files.images[0]
     try:
         if files.mask is not None:
-            expected = ExpectedSize(stored_size(files.images[0])[0], files.images[0].name, "a mask")
+            expected = ExpectedSize(files.facts[0].size[0], files.images[0].name, "a mask")
             mask = read_mask(files.mask, expected)
             circle, source, shape = circle_from_mask(mask), "mask", mask.shape
         else:

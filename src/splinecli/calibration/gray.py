@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallFiles
 from splinecli.calibration.circle import Circle, circle_from_mask
-from splinecli.capture.formats.decoding import stored_size
-from splinecli.capture.formats.exposure import check_exposures
+from splinecli.capture.formats.exif import check_exposures
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
@@ -57,10 +56,11 @@ def measure_light_intensities(
         raise InputError(
             f"found {len(files.images)} images, expected {n_lights}, one for each light", path=files.folder
         )
-    mask, normals = _target_normals(files, stored_size(files.images[0])[0][:2], target)
-    check_exposures(files.images)
+    mask, normals = _target_normals(files, files.facts[0].size[0][:2], target)
+    check_exposures(files.facts)
     capture = CaptureSource(
         CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
+        files.facts,
         light_directions,
         np.ones((n_lights, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
@@ -68,7 +68,7 @@ def measure_light_intensities(
     finder = SaturationFinder(len(normals), n_lights, even=True)
     rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.int64)
     values = []
-    for position, image in enumerate(capture.stored_pixels(range(n_lights), mask)):
+    for position, image in enumerate(capture.read_pixels(mask, range(n_lights), lambda pixels: pixels)):
         finder.add(position, image.values, image.path, stated=image.stated_white_level)
         values.append(image.linear[rows].astype(np.float64))
     saturated = finder.finish().choose_pixels(rows).flags

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.decoding import stored_size
+from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.lights.lamp_files import read_camera_matrix
 from splinecli.normals import unit
 from splinecli.surface.camera import ray_basis
@@ -26,7 +27,7 @@ SHORTEST_LENS = 0.7
 EXIF_ERROR = 0.05
 """Standard deviation of a focal length in EXIF, as a share: numbers are rounded, and focusing changes it."""
 
-_EXIF, _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x8769, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
+_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405
 _MILLIMETRES = {2: 25.4, 3: 10.0}
 _FILM_DIAGONAL = math.hypot(36, 24)
 
@@ -72,41 +73,33 @@ def unit_rays(points: Floats, matrix: Floats) -> Floats:
     return unit(np.column_stack((points, np.ones(len(points)))) @ ray_basis(matrix))
 
 
-def find_view(image: Path, matrix: Path | None) -> View:
+def find_view(image: ImageFacts, matrix: Path | None) -> View:
     """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a distant one.
 
     Raises:
         InputError: the file or the image cannot be read, or the file has no camera matrix.
     """
-    height, width = stored_size(image)[0][:2]
+    height, width = image.size[0][:2]
     shortest = SHORTEST_LENS * max(width, height)
     if matrix is not None:
         given = read_camera_matrix(matrix)
         ray_basis(given)  # refuses other numbers
         return View(given, "--camera-matrix", shortest)
-    focal = _exif_focal_length(image, width, height)
+    focal = _focal_length(image.exif or {}, width, height)
     middle = (width - 1) / 2, (height - 1) / 2
     source = "assumed distant" if focal is None else "EXIF"
     focal = focal or DISTANT
     return View(np.array(((focal, 0, middle[0]), (0, focal, middle[1]), (0, 0, 1.0))), source, shortest)
 
 
-def _exif_focal_length(image: Path, width: int, height: int) -> float | None:
+def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
     """Return the focal length in pixels from EXIF tags; None where they do not tell it."""
-    from PIL import Image
-
-    with warnings.catch_warnings():  # Pillow warns of tags that it does not expect
-        warnings.simplefilter("ignore")
-        try:
-            with Image.open(image) as file:
-                tags = Image.Image.getexif(file).get_ifd(_EXIF)
-            if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
-                pixels = (
-                    float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
-                )
-                pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
-            else:
-                pixels = float(tags[_FILM]) / _FILM_DIAGONAL * math.hypot(width, height)
-        except Exception:  # damaged tags cause a dozen types of errors
-            return None
+    try:
+        if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in _MILLIMETRES:
+            pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION]) / _MILLIMETRES[tags.get(_UNIT, 2)]
+            pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
+        else:
+            pixels = float(tags[_FILM]) / _FILM_DIAGONAL * math.hypot(width, height)
+    except Exception:  # damaged tags cause a dozen types of errors
+        return None
     return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None

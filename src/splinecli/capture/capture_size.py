@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from splinecli.capture.formats.decoding import stored_size
+from splinecli.capture.formats.facts import ImageFacts, StoredSize
 from splinecli.capture.formats.image_size import ExpectedSize, check_memory, check_stored_size, image_bytes
-from splinecli.capture.formats.raw import is_raw
 
 _BYTES_OF_RESULTS = 52
 """Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
@@ -21,26 +20,21 @@ BYTES_OF_SURFACE = 600
 _IMAGES = 2
 """Images in memory while they are read; see read_ahead."""
 
-StoredSize = tuple[tuple[int, ...], int]
-"""The shape (H, W, C) of an image as stored, and the bytes of each number."""
 
-
-def common_size(images: Sequence[Path]) -> StoredSize:
-    """Return the size of the largest of some images, from their headers.
+def common_size(images: Sequence[ImageFacts]) -> StoredSize:
+    """Return the size of the largest of some images.
 
     Raises:
         InputError: an image has another height or width than the first, is too large, or has no whole header.
     """
-    first = largest = stored_size(images[0])
-    check_stored_size(*first, images[0])
-    expected = ExpectedSize(first[0], images[0].name)
-    for path in images[1:]:
-        # Opening a RAW file takes long. Its size is compared when it is decoded.
-        if not is_raw(path):
-            size = stored_size(path)
-            expected.check(size[0], path)
-            largest = max(largest, size, key=lambda size: image_bytes(*size))
-    return largest
+    first = images[0]
+    check_stored_size(*first.size, first.path)
+    expected = ExpectedSize(first.size[0], first.path.name)
+    # Opening a RAW file takes long. Its size is compared when it is decoded.
+    asked = [first, *(image for image in images[1:] if image.kind != "RAW")]
+    for image in asked[1:]:
+        expected.check(image.size[0], image.path)
+    return max((image.size for image in asked), key=lambda size: image_bytes(*size))
 
 
 def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False, surface: bool = False) -> int:

@@ -1,4 +1,5 @@
-"""Linear light from stored values: invert the transfer curve, subtract ambient light, divide by the falloff."""
+"""Pixels of images: decode, take the window and the mask, invert the transfer curve, subtract ambient light, divide by
+the falloff."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.header import stated_curve
+from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import to_linear
 from splinecli.capture.masks import take_pixels
@@ -41,19 +42,14 @@ class RadiometricCalibration:
     automatic: bool = False
 
     def with_stated_curve(
-        self, images: Sequence[Path]
+        self, images: Sequence[ImageFacts]
     ) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
-        """Return this calibration with the curve that all images state, if it is automatic, and warnings.
-
-        Raises:
-            InputError: an image cannot be read.
-        """
+        """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
         if self.curve != 1:
             return self, []
-        stated = {path: stated_curve(path) for path in images}
-        curves = {found.curve for found in stated.values()}
-        by = ", ".join(sorted({found.by for found in stated.values() if found.curve != 1}))
-        unread = [path for path, found in stated.items() if found.unread]
+        curves = {image.curve.curve for image in images}
+        by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
+        unread = [image.path for image in images if image.curve.unread]
         warnings = [capture_warnings.profile_unread(unread[0].name)] if unread and self.automatic else []
         if self.automatic and len(curves) == 1:
             (curve,) = curves
@@ -70,8 +66,8 @@ AS_STORED = RadiometricCalibration()
 """Stored values are linear light."""
 
 
-class Lineariser:
-    """Linearise the pixels of a mask (H, W). Ambient image and common flat field are read once."""
+class PixelReader:
+    """Read the pixels of a mask (H, W) from images. The ambient image and a common flat field are read once."""
 
     def __init__(
         self,
@@ -89,30 +85,34 @@ class Lineariser:
                 f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image",
                 path=flats[0].parent,
             )
-        self._ambient = None if radiometry.ambient is None else self._linear(radiometry.ambient)
+        self._ambient: NDArray[np.float32] | None = None
+        if radiometry.ambient is not None:
+            self._ambient = self._read(radiometry.ambient, "the other images")[1]
         self._flat = self._read_flat(flats[0]) if len(flats) == 1 else None
 
-    def __call__(self, pixels: NDArray[Any], path: Path, index: int) -> NDArray[np.float32]:
-        """Return linear light (P, C) from the mask's pixels (P, C), as stored in image `index`. Raises InputError."""
-        linear = decode_transfer(to_linear(pixels, path), self.radiometry.curve)
-        if self._ambient is not None:
-            linear = np.maximum(linear - self._ambient, 0)
+    def read(self, path: Path, index: int, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
+        """Return the mask's pixels (P, C) of image `index`: as stored, and as linear light. Raises InputError.
+
+        Args:
+            like: the image of the expected size, for messages.
+        """
+        stored, linear = self._read(path, like)
         if len(self.radiometry.flat_field) > 1:
             linear = linear / self._read_flat(self.radiometry.flat_field[index])
         elif self._flat is not None:
             linear = linear / self._flat
-        return linear
+        return stored, linear
 
     def _read_flat(self, path: Path) -> NDArray[np.float32]:
-        linear = self._linear(path)
-        if self._ambient is not None:
-            linear = np.maximum(linear - self._ambient, 0)
+        _, linear = self._read(path, "the other images")
         mean = linear.mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
         return np.asarray(np.maximum(linear / mean, _DARKEST_FLAT), np.float32)
 
-    def _linear(self, path: Path) -> NDArray[np.float32]:
-        expected = ExpectedSize(self._window.shape or self.mask.shape, "the other images")
-        stored = self._window.of(decode_image(path, expected))
-        return decode_transfer(to_linear(take_pixels(stored, self.mask), path), self.radiometry.curve)
+    def _read(self, path: Path, like: str) -> tuple[NDArray[Any], NDArray[np.float32]]:
+        """Return the pixels as stored, and linear without ambient light."""
+        image = decode_image(path, ExpectedSize(self._window.shape or self.mask.shape, like))
+        stored = take_pixels(self._window.of(image), self.mask)
+        linear = decode_transfer(to_linear(stored, path), self.radiometry.curve)
+        return stored, linear if self._ambient is None else np.maximum(linear - self._ambient, 0)

@@ -33,6 +33,23 @@ class StoredPixels:
     intensity: NDArray[np.float64]
     stated_white_level: int | None = None
 
+    def observe(self) -> NDArray[np.float32]:
+        """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
+
+        A gray image is equal in all channels.
+        """
+        weights = 1 / (3 * self.intensity)
+        if self.linear.shape[1] == 1:
+            weights = weights.sum(keepdims=True)
+        return self.linear @ weights.astype(np.float32)
+
+    def colours(self) -> NDArray[np.float32]:
+        """Return linear RGB (P, 3), each channel divided by its intensity."""
+        # In float32 and in place: 24 megapixels take noticeably longer in any other way.
+        colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
+        colours /= self.intensity.astype(np.float32)
+        return colours
+
 
 @dataclass(frozen=True, eq=False)
 class Observations:
@@ -73,19 +90,8 @@ def collect_observations(
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8
         saturation.add(position, image.values, image.path, stated=image.stated_white_level)
-        observations[:, position] = observe(image.linear, image.intensity)
+        observations[:, position] = image.observe()
         del image  # before the next one is decoded
         if progress is not None:
             progress()
     return Observations(observations, saturation.finish(), any_8_bit)
-
-
-def observe(linear: NDArray[np.float32], intensity: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return observations (P,) from linear pixels (P, C) under a light of RGB intensity (3,).
-
-    Each channel is divided by its intensity, then the mean is taken. A gray image is equal in all channels.
-    """
-    weights = 1 / (3 * intensity)
-    if linear.shape[1] == 1:
-        weights = weights.sum(keepdims=True)
-    return linear @ weights.astype(np.float32)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.formats.exposure import check_exposures
-from splinecli.capture.formats.orientation import UPRIGHT, common_orientation
+from splinecli.capture.formats.exif import UPRIGHT, check_exposures, common_orientation
+from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
@@ -95,11 +95,11 @@ def open_capture(
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
         warnings.append(capture_warnings.ambient_subtracted(files.ambient.name))
-    radiometry, of_curve = radiometry.with_stated_curve(files.images)
+    radiometry, of_curve = radiometry.with_stated_curve(source.facts)
     warnings += of_curve
     # Earlier versions read such images as linear, or those with a colour profile as sRGB.
     decoded = (radiometry.curve or "sRGB",) if radiometry.automatic and radiometry.curve != 1 else ()
-    orientation = common_orientation(files.images)
+    orientation = common_orientation(source.facts)
     if orientation != UPRIGHT:
         warnings.append(capture_warnings.exif_orientation(orientation))
     return replace(
@@ -107,7 +107,7 @@ def open_capture(
         radiometry=radiometry,
         warnings=tuple(warnings),
         white_level=white_level,
-        window=window.on(files.images[0]),
+        window=window.on(source.facts[0]),
         # Left out where they are not given, so that earlier stamps stay valid.
         stamp=(*stamp, *decoded, *(() if white_level is None else (white_level,))),
     )
@@ -172,13 +172,15 @@ def _read_lights(
         intensities = None
     elif files.light_intensities is not None:
         intensities = _read_intensities(files.light_intensities, files.images, in_folder)
+    facts = tuple(map(read_facts, files.images))
     known = equal or intensities is not None
     measured = intensities is not None
     if intensities is None:
-        check_exposures(files.images)
+        check_exposures(facts)
         intensities = np.ones((len(files.images), 3))
     return CaptureSource(
         files,
+        facts,
         directions,
         intensities,
         tuple(warnings),

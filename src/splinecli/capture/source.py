@@ -1,10 +1,10 @@
-"""A capture whose lights are read and whose images are not: from it, a Capture is read one image at a time."""
+"""An opened capture: lights and facts of images loaded, pixels still on disk and read one image at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_size import check_capture, common_size
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.header import stated_white_level
-from splinecli.capture.formats.image_size import ExpectedSize
+from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.read_ahead import read_ahead
 from splinecli.capture.ground_truth_check import check_ground_truth
@@ -23,8 +21,8 @@ from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.linearise import AS_STORED, Lineariser, RadiometricCalibration
-from splinecli.capture.masks import read_capture_mask, take_pixels
+from splinecli.capture.linearise import AS_STORED, PixelReader, RadiometricCalibration
+from splinecli.capture.masks import read_capture_mask
 from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
@@ -33,16 +31,18 @@ from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 
+Item = TypeVar("Item")
 Progress = Callable[[], object]
 """Called once after each image."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureSource:
-    """A capture whose lights are read and whose images are not.
+    """An opened capture: lights and facts of images loaded, pixels still on disk.
 
     Args:
         files: the files of the capture.
+        facts: what the header of each image states.
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         intensities_known: whether a file or the user gives the intensities.
@@ -59,6 +59,7 @@ class CaptureSource:
     """
 
     files: CaptureFiles
+    facts: tuple[ImageFacts, ...]
     light_directions: NDArray[np.float64]
     light_intensities: NDArray[np.float64]
     warnings: tuple[CaptureWarning, ...] = ()
@@ -120,7 +121,7 @@ class CaptureSource:
                 self.files.ground_truth, (whole.shape[0], whole.shape[1]), whole
             )
             ground_truth = self.window.of(ground_truth)
-        images = self.stored_pixels(indices, mask)
+        images = self.read_pixels(mask, indices, lambda pixels: pixels)
         saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
         found = collect_observations(images, saturation, progress)
         warnings = [*self.warnings, *found.warnings()]
@@ -144,23 +145,6 @@ class CaptureSource:
         )
         return StoredCapture(capture, found.saturation, self.intensities_known)
 
-    def colours(self, mask: NDArray[np.bool_], indices: Sequence[int]) -> Iterator[NDArray[np.float32]]:
-        """Yield the mask's (H, W) pixels (P, 3) RGB of some images.
-
-        The values are linear, each channel divided by its light's intensity.
-
-        Raises:
-            InputError: an image cannot be read or does not have the size of the mask.
-        """
-        linearise = Lineariser(self.radiometry, mask, len(self.files.images), self.window)
-        expected = self._expected(mask, 0)
-
-        def read(index: int) -> NDArray[np.float32]:
-            stored = self.window.of(decode_image(self.files.images[index], expected))
-            return self._colours(linearise, take_pixels(stored, mask), index)
-
-        return read_ahead(read, indices)
-
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.
 
@@ -169,17 +153,9 @@ class CaptureSource:
         """
         if self.files.mask is not None or self.files.boundaries:
             return self
-        whole = common_size(self.files.images)[0][:2]
-        expected = ExpectedSize(whole, self.files.images[0].name)
-        everywhere = self.window.of(np.ones(whole, np.bool_))
-        linearise = Lineariser(self.radiometry, everywhere, self.n_lights, self.window)
+        everywhere = self.window.of(np.ones(common_size(self.facts)[0][:2], np.bool_))
         total = np.zeros(everywhere.size, np.float32)
-
-        def read(index: int) -> NDArray[np.float32]:
-            stored = self.window.of(decode_image(self.files.images[index], expected))
-            return self._colours(linearise, stored.reshape(-1, stored.shape[2]), index)
-
-        for colours in read_ahead(read, range(self.n_lights)):
+        for colours in self.read_pixels(everywhere, range(self.n_lights), StoredPixels.colours):
             total += colours.mean(axis=1)
             if progress is not None:
                 progress()
@@ -203,7 +179,7 @@ class CaptureSource:
 
     def _read_mask_if_room(self, indices: Sequence[int]) -> NDArray[np.bool_]:
         """Return the mask (H, W). Raises InputError where the sizes of images differ or the memory is too small."""
-        size = common_size([self.files.images[index] for index in indices])
+        size = common_size([self.facts[index] for index in indices])
         shape = size[0][:2]
         if self.automatic_mask is None and self.files.mask is None and not self.files.boundaries:
             n_pixels = self.window.of(np.broadcast_to(np.True_, shape)).size
@@ -232,26 +208,21 @@ class CaptureSource:
             return None, distant_lights(self.lamps.positions, lamps, mask)
         return lamps, check_distances(lamps, mask, self.lamps.positions)
 
-    def stored_pixels(self, indices: Sequence[int], mask: NDArray[np.bool_]) -> Iterator[StoredPixels]:
-        """Yield the pixels of a mask (H, W) under these lights. Raises InputError for an image that cannot be read."""
-        linearise = Lineariser(self.radiometry, mask, len(self.files.images), self.window)
-        expected = self._expected(mask, indices[0])
+    def read_pixels(
+        self, mask: NDArray[np.bool_], indices: Sequence[int], use: Callable[[StoredPixels], Item]
+    ) -> Iterator[Item]:
+        """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads the next image.
 
-        def read(index: int) -> StoredPixels:
-            path = self.files.images[index]
-            pixels = take_pixels(self.window.of(decode_image(path, expected)), mask)
-            linear, intensity = linearise(pixels, path, index), self.light_intensities[index]
-            return StoredPixels(path, pixels, linear, intensity, stated_white_level(path))
+        Raises:
+            InputError: an image cannot be read, or does not have the size of the mask.
+        """
+        reader = PixelReader(self.radiometry, mask, len(self.facts), self.window)
+        like = self.files.images[indices[0]].name
+
+        def read(index: int) -> Item:
+            facts = self.facts[index]
+            stored, linear = reader.read(facts.path, index, like)
+            intensity = self.light_intensities[index]
+            return use(StoredPixels(facts.path, stored, linear, intensity, facts.white_level))
 
         return read_ahead(read, indices)
-
-    def _expected(self, mask: NDArray[np.bool_], index: int) -> ExpectedSize:
-        """Return the size that all images must have; messages name the image of this index."""
-        return ExpectedSize(self.window.shape or mask.shape, self.files.images[index].name)
-
-    def _colours(self, linearise: Lineariser, pixels: NDArray[Any], index: int) -> NDArray[np.float32]:
-        linear = linearise(pixels, self.files.images[index], index)
-        # In float32 and in place: 24 megapixels take noticeably longer in any other way.
-        colours = np.array(np.broadcast_to(linear, (len(linear), 3)), np.float32)
-        colours /= self.light_intensities[index].astype(np.float32)
-        return colours

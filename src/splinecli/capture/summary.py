@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
-from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.header import stated_white_level
 from splinecli.capture.formats.images import to_linear
-from splinecli.capture.linearise import Lineariser
-from splinecli.capture.observations import observe
+from splinecli.capture.linearise import AS_STORED
+from splinecli.capture.observations import StoredPixels
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
 from splinecli.capture.sample import Sample, closeup_window, grid_step
 from splinecli.capture.source import CaptureSource
+from splinecli.capture.window import WHOLE
 
 DARK = 0.05
 """An image is called dark if its 99 % quantile is below this share of the white level."""
@@ -109,55 +108,56 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         InputError: an image cannot be read, the mask, the ambient image or a flat field does not fit, or a lamp would
             be inside the object.
     """
-    images: list[ImageSummary] = []
-    mask: NDArray[np.bool_] | None = None
-    for position, path in enumerate(source.files.images):
-        stored = decode_image(path)
-        if mask is None:
-            mask = source.read_mask(stored.shape[:2])
-            n_images = len(source.files.images)
-            finder = SaturationFinder(int(np.count_nonzero(mask)), n_images, given=source.white_level)
-            step = grid_step(mask)
-            on_grid = np.zeros_like(mask)
-            on_grid[::step, ::step] = mask[::step, ::step]
-            seen_closely = closeup_window(mask)
-            taken = on_grid.copy()
-            taken[seen_closely] = mask[seen_closely]
-            # It refuses ambient images and flat fields that do not fit.
-            linearise = Lineariser(source.radiometry, taken, n_images, source.window)
-            shape = stored.shape[:2]
-            observations = np.zeros((int(np.count_nonzero(taken)), n_images), np.float32)
-        fits = shape == stored.shape[:2]
-        seen = source.window.of(stored) if fits else stored
-        pixels = seen[mask] if fits else seen.reshape(-1, seen.shape[2])
-        if fits:
-            finder.add(position, pixels, path, stated=stated_white_level(path))
-            linear = linearise(seen[taken], path, position)
-            observations[:, position] = observe(linear, source.light_intensities[position])
-        images.append(
-            ImageSummary(
-                path,
-                stored.shape,
-                str(stored.dtype),
-                float(np.quantile(to_linear(pixels, path), 0.99)),
-                # This share is used if the image has another size, because the finder cannot take it.
-                float(find_saturated(pixels).mean()),
-            )
+    shape = source.facts[0].size[0][:2]
+    mask = source.read_mask(shape)
+    n_images = len(source.facts)
+    finder = SaturationFinder(int(np.count_nonzero(mask)), n_images, given=source.white_level)
+    step = grid_step(mask)
+    on_grid, inside = np.zeros_like(mask), np.zeros_like(mask)
+    on_grid[::step, ::step] = mask[::step, ::step]
+    seen_closely = closeup_window(mask)
+    inside[seen_closely] = mask[seen_closely]
+    taken = on_grid | inside
+    observations = np.zeros((int(np.count_nonzero(taken)), n_images), np.float32)
+    images: dict[int, ImageSummary] = {}
+    for index, pixels in _pixels_of_all(source, mask, shape):
+        height, width = source.facts[index].size[0][:2]
+        if (height, width) == shape:
+            finder.add(index, pixels.values, pixels.path, stated=pixels.stated_white_level)
+            observations[:, index] = replace(pixels, linear=pixels.linear[taken[mask]]).observe()
+        images[index] = ImageSummary(
+            pixels.path,
+            (height, width, pixels.values.shape[1]),
+            str(pixels.values.dtype),
+            float(np.quantile(to_linear(pixels.values, pixels.path), 0.99)),
+            # This share is used if the image has another size, because the finder cannot take it.
+            float(find_saturated(pixels.values).mean()),
         )
         if progress is not None:
             progress()
-    assert mask is not None, "a capture has images"
-    level, summaries = _by_white_level(finder, images, shape)
+    level, summaries = _by_white_level(finder, [images[index] for index in range(n_images)], shape)
     sample = closeup = None
-    if all(image.shape[:2] == shape for image in images):
+    if all(image.shape[:2] == shape for image in summaries):
         sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
-        inside = np.zeros_like(mask)
-        inside[seen_closely] = True
         closeup = Sample(observations[inside[taken]], mask[seen_closely], 1)
     _, of_lamps = source.near_lamps(mask)
     return CaptureSummary(
         source, summaries, int(np.count_nonzero(mask)), level, sample, closeup, tuple(of_lamps)
     )
+
+
+def _pixels_of_all(
+    source: CaptureSource, mask: NDArray[np.bool_], shape: tuple[int, ...]
+) -> Iterator[tuple[int, StoredPixels]]:
+    """Yield the mask's pixels of the images of this shape, and then all pixels of the others, with their indices."""
+    sizes = [facts.size[0][:2] for facts in source.facts]
+    fitting = [index for index, size in enumerate(sizes) if size == shape]
+    yield from zip(fitting, source.read_pixels(mask, fitting, lambda pixels: pixels), strict=True)
+    as_stored = replace(source, radiometry=AS_STORED, window=WHOLE)
+    for index, size in enumerate(sizes):
+        if size != shape:
+            (pixels,) = as_stored.read_pixels(np.ones(size, np.bool_), [index], lambda pixels: pixels)
+            yield index, pixels
 
 
 def _by_white_level(

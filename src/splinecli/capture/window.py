@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.decoding import stored_size
+from splinecli.capture.formats.facts import ImageFacts
 from splinecli.errors import InputError, UsageError
 
 Numbers = TypeVar("Numbers", bound=np.generic)
@@ -70,17 +69,17 @@ class Window:
         part[...] = mask.repeat(self.step, 0).repeat(self.step, 1)[: part.shape[0], : part.shape[1]]
         return whole
 
-    def on(self, image: Path) -> Window:
+    def on(self, image: ImageFacts) -> Window:
         """Return the window on images of the size of this one. Raises InputError where the box is not inside."""
         if self.is_whole:
             return self
-        height, width = shape = stored_size(image)[0][:2]
+        height, width = shape = image.size[0][:2]
         if self.box is not None:
             left, top, box_width, box_height = self.box
             if left + box_width > width or top + box_height > height:
                 raise InputError(
                     f"--crop {','.join(map(str, self.box))} is not inside the image of {width} x {height} pixels",
-                    path=image,
+                    path=image.path,
                 )
         return replace(self, shape=shape)
 

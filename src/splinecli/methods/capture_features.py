@@ -256,6 +256,8 @@ def _of_factors(values: Doubles, lights: Doubles) -> tuple[float, float, float, 
 def _of_shape(mask: NDArray[np.bool_], places: PixelPlaces, normals: Floats) -> tuple[float, float]:
     """Return curl and rim of the normals (P, 3), averaged over blocks; see CaptureFeatures."""
     blocks = Blocks.over(mask, _BLOCKS)
+    if min(blocks.mask.shape) < 2:
+        return np.nan, np.nan
     sums = np.zeros((3, np.count_nonzero(blocks.mask)))
     for rows in parts_of_rows(len(normals)):
         number = blocks.numbers_at(*places.places(rows))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20
-"""Numbers of features of methods/capture_features.py."""
+_BEND_TURN = 11
+"""Numbers of features of methods/capture_features.py, and the place of CaptureFeatures.bend_turn."""
 
 _HIDDEN = 24
 _MOST = 4.0  # standard deviations of a feature from its mean
@@ -18,7 +21,8 @@ class CaptureHead(nn.Module):
     """Changes log-logistic distributions of errors (P, 2); networks/error_head.py describes the two numbers.
 
     Wrong lights and values add an error of their own, whatever the network expects. The new median is therefore the
-    scaled old one plus one that the features give. It is small on purpose: it learned from hundreds of captures only.
+    scaled old one, plus one that the features give, plus a share of the turn by encoded values. The head is small on
+    purpose: it learned from hundreds of captures only.
     """
 
     mean: Tensor
@@ -31,6 +35,7 @@ class CaptureHead(nn.Module):
         self.hidden = nn.Linear(_INPUTS, hidden)
         self.last = nn.Linear(hidden, 3)
         self.linear = nn.Linear(_INPUTS, 3)
+        self.bend = nn.Parameter(torch.tensor(math.log(0.6)))
         for layer in (self.last, self.linear):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -49,4 +54,7 @@ class CaptureHead(nn.Module):
         inputs = ((inputs - self.mean) / self.spread).nan_to_num(0.0).clamp(-_MOST, _MOST)
         found = self.linear(inputs) + self.last(self.hidden(inputs).tanh())
         median = torch.logaddexp(errors[:, 0] + found[:, 0], found[:, 1])
+        # However well all else fits: encoded values turn the normals by about so much.
+        bent = capture[..., _BEND_TURN] + math.log(math.pi / 180) + self.bend
+        median = torch.logaddexp(median, bent.expand(len(errors)))
         return torch.stack((median, errors[:, 1] + found[:, 2]), dim=1)

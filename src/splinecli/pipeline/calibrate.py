@@ -131,7 +131,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
 
         kind: Target = "ball" if options.gray_ball is not None else "card"
         radiometry = RadiometricCalibration(options.curve, automatic=options.transfer == AUTOMATIC)
-        radiometry, of_curve = radiometry.with_stated_curve(target_files.images)
+        radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
         warnings = [f"{target}: {warning}" for warning in of_curve]
         intensities = measure_light_intensities(target_files, lights.directions, kind, radiometry=radiometry)
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)

@@ -9,7 +9,7 @@ from splinecli.errors import SplinecliError
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
-    from splinecli.capture.capture_size import StoredSize
+    from splinecli.capture.formats.facts import StoredSize
     from splinecli.pipeline.capture_list import Member
     from splinecli.pipeline.infer_options import InferOptions
 
@@ -57,11 +57,9 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
     """
     import numpy as np
 
-    from splinecli.capture.formats.decoding import stored_size
-
     try:
         source = open_source()
-        size = stored_size(source.files.images[0])
+        size = source.facts[0].size
         n_lights = n_lights or source.n_lights
         n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
         n_bytes = infer_bytes(size, n_pixels, n_lights)

@@ -167,7 +167,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             new.write(name, content)
         report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [*new.sizes, SURFACE_REPORT]
+        report["files"] = [name for name in options.files if name in new.sizes or name == SURFACE_REPORT]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     return report
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource
 from splinecli.capture.masks import take_pixels
+from splinecli.capture.observations import StoredPixels
 
 LIT = 0.15
 """A light counts for a pixel if n.l is above this."""
@@ -53,7 +54,8 @@ def albedo_map(
         cosines, strengths = _shading(capture, normals, tile, range(capture.n_lights))
         counts[tile] = _agreeing(capture.observations[tile] / strengths, cosines)
     total, squares = np.zeros((len(normals), 3), np.float32), np.zeros(len(normals), np.float32)
-    for position, colours in enumerate(source.colours(capture.mask, capture.light_indices)):
+    images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours)
+    for position, colours in enumerate(images):
         cosines, strengths = _shading(capture, normals, slice(None), [position])
         cosine = cosines[:, 0] * counts[:, position]
         colours /= strengths

@@ -103,7 +103,8 @@ def _thumbnail(path: Path) -> str | None:
     import cv2
     import numpy as np
 
-    from splinecli.capture.formats.decoding import decode_image, stored_size
+    from splinecli.capture.formats.decoding import decode_image
+    from splinecli.capture.formats.facts import stored_size
     from splinecli.capture.formats.image_size import image_bytes
 
     try:

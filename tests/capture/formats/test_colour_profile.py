@@ -18,7 +18,7 @@ from PIL import Image, ImageCms
 
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.colour_profile import profile_curve
-from splinecli.capture.formats.header import StatedCurve, stated_curve
+from splinecli.capture.formats.facts import StatedCurve, read_facts
 from splinecli.transfer import TransferCurve, decode_transfer
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -130,18 +130,18 @@ def test_profiles_without_a_usable_curve(icc: bytes) -> None:
 def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     by = 'colour profile "Made up"'
-    assert stated_curve(write(path, profile(curv(563)))) == StatedCurve(2.1992, by)
-    assert stated_curve(write(path, profile(curv(256), name="M\x1bade up"))) == StatedCurve(1.0, by)
-    stated = stated_curve(write(path, b"no profile"))
+    assert read_facts(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
+    assert read_facts(write(path, profile(curv(256), name="M\x1bade up"))).curve == StatedCurve(1.0, by)
+    stated = read_facts(write(path, b"no profile")).curve
     assert stated.unread and stated.curve == (None if suffix == ".jpg" else 1.0)
-    assert not stated_curve(write(path, None)).unread
+    assert not read_facts(write(path, None)).curve.unread
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
 def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
     path = write(tmp_path / f"a{suffix}", bytes(12 << 20))  # in a PNG, 12 kB that expand
     tracemalloc.start()
-    assert stated_curve(path).unread
+    assert read_facts(path).curve.unread
     assert tracemalloc.get_traced_memory()[1] < 20e6
     tracemalloc.stop()
 
@@ -149,7 +149,7 @@ def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
 def test_many_parts_in_a_jpeg(tmp_path: Path) -> None:
     part = b"\xff\xe2" + struct.pack(">H", 65_535) + b"ICC_PROFILE\0\1\1"
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + (part + bytes(65_535 - 16)) * 100)
-    assert stated_curve(tmp_path / "a.jpg") == StatedCurve(None, "JPEG", unread=True)
+    assert read_facts(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
 
 
 def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) -> Path:

@@ -10,7 +10,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from splinecli.capture import open_capture
-from splinecli.capture.formats.exposure import Exposure, read_exposure
+from splinecli.capture.formats.exif import Exposure, find_exposure
+from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
 
 EXIF = 0x8769
@@ -38,8 +39,8 @@ def capture(folder: Path, *exposures: tuple[int, int] | None) -> Path:
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_reading(tmp_path: Path, suffix: str) -> None:
-    assert read_exposure(write(tmp_path / f"a.{suffix}")) == Exposure(1 / 60, 8.0, 100)
-    assert read_exposure(write(tmp_path / f"b.{suffix}", None)) is None
+    assert find_exposure(read_facts(write(tmp_path / f"a.{suffix}"))) == Exposure(1 / 60, 8.0, 100)
+    assert find_exposure(read_facts(write(tmp_path / f"b.{suffix}", None))) is None
 
 
 def test_mixed_exposures_are_refused(tmp_path: Path) -> None:

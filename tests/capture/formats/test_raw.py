@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.exposure import Exposure, read_exposure
-from splinecli.capture.formats.header import stated_curve, stated_white_level
+from splinecli.capture.formats.exif import Exposure, find_exposure
+from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
 from splinecli.capture.layouts.image_lists import list_images
 from splinecli.errors import InputError
@@ -241,19 +241,20 @@ def test_ambient_may_be_raw_and_masks_not(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("without_rawpy")
 def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
     stated = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
-    assert read_exposure(stated) == Exposure(*SHOT)
-    assert read_exposure(write_dng(tmp_path / "b.dng", mosaic(ramp()))) is None
+    assert find_exposure(read_facts(stated)) == Exposure(*SHOT)
+    assert find_exposure(read_facts(write_dng(tmp_path / "b.dng", mosaic(ramp())))) is None
     # The header of Olympus.
-    assert read_exposure(write_dng(tmp_path / "c.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")) is None
-    assert stated_curve(stated).curve == 1
+    other = write_dng(tmp_path / "c.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")
+    assert find_exposure(read_facts(other)) is None
+    assert read_facts(stated).curve.curve == 1
 
 
 @pytest.mark.usefixtures("needs_rawpy")
 def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_dng(tmp_path / "a.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")
-    assert read_exposure(path) == Exposure(*SHOT)
+    assert find_exposure(read_facts(path)) == Exposure(*SHOT)
     path.write_bytes(path.read_bytes()[:2000])
-    assert read_exposure(path) is None
+    assert find_exposure(read_facts(path)) is None
     assert capfd.readouterr() == ("", "")
 
 
@@ -270,7 +271,7 @@ def test_the_white_level_is_that_of_the_developed_values(tmp_path: Path, thumbna
                     struct.pack("<HHIHH", 258, 3, 1, 16, 0), struct.pack("<HHIHH", 258, 3, 1, 8, 0)
                 )
             )
-        assert stated_white_level(path) == 65535
+        assert read_facts(path).white_level == 65535
     (tmp_path / "lights.txt").write_text(LIGHTS)
     if not thumbnail:
         capture = read_capture(tmp_path)

@@ -19,7 +19,7 @@ from scipy.io import savemat
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.capture import open_capture
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.header import stated_curve, stated_white_level
+from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, limit_pixels
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
@@ -202,12 +202,12 @@ def test_headers_without_end(tmp_path: Path) -> None:
     refused(lambda: decode_image(jpeg), "the JPEG is truncated")
     plain = cv2.imencode(".png", np.zeros(SMALL, np.uint8))[1].tobytes()
     png.write_bytes(plain[:33] + chunk(b"tEXt", b"") * 1_000_000 + plain[33:])
-    assert stated_white_level(png) is None
+    assert read_facts(png).white_level is None
     refused(lambda: decode_image(png), "the PNG is truncated")
     png.write_bytes(plain[:33])
     with png.open("ab") as file:
         file.truncate(3 << 30)
-    assert stated_curve(png).curve == 1
+    assert read_facts(png).curve.curve == 1
     mat.write_bytes(bytes(126) + b"IM")
     with mat.open("ab") as file:
         file.truncate(3 << 30)

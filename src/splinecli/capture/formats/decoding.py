@@ -8,23 +8,18 @@ from __future__ import annotations
 
 import os
 import re
-import sys
-import tempfile
-import threading
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.header import JPEG, PNG, TIFF, stated_size
+from splinecli.capture.formats.facts import PNG, facts_in, open_image
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
-from splinecli.capture.formats.raw import decode_raw, is_raw, raw_size
-from splinecli.capture.formats.tiff import decode_tiff, tiff_size
-from splinecli.capture.paths import check_file
+from splinecli.capture.formats.native_stderr import native_stderr
+from splinecli.capture.formats.raw import decode_raw
+from splinecli.capture.formats.tiff import decode_tiff
 from splinecli.errors import InputError
 from splinecli.memory import is_out_of_memory
 
@@ -36,8 +31,6 @@ _DAMAGE = re.compile(
 )
 
 _LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previews and colour profiles
-
-_STDERR_LOCK = threading.Lock()
 
 
 def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[Any]:
@@ -63,10 +56,12 @@ def decode_with_alpha(
 ) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
     try:
-        size = stored_size(path)
-        check_stored_size(*size, path, expected)
-        _check_length(path, image_bytes(*size))
-        pixels = _decode(path)
+        with open_image(path) as (file, kind):
+            size = facts_in(file, kind, path).size
+            check_stored_size(*size, path, expected)
+            _check_length(path, os.fstat(file.fileno()).st_size, image_bytes(*size))
+            file.seek(0)
+            pixels = _decode(file, kind, path)
     except InputError:
         raise
     except Exception as error:  # decoders raise a dozen types for damaged files
@@ -92,23 +87,9 @@ def decode_with_alpha(
     return pixels, None
 
 
-def stored_size(path: Path) -> tuple[tuple[int, ...], int]:
-    """Return the shape (H, W, C) that the header of an image file states, and the bytes of each number.
-
-    Nothing is decoded.
-
-    Raises:
-        InputError: the file is missing, of another format, or has no whole header.
-    """
-    kind = _kind(path)
-    if kind == "RAW":
-        return raw_size(path, native_stderr)
-    return tiff_size(path) if kind == "TIFF" else stated_size(path)
-
-
-def _check_length(path: Path, n_bytes: int) -> None:
+def _check_length(path: Path, length: int, n_bytes: int) -> None:
     """Raise InputError for a file that is far longer than its image of so many bytes, because it is read as a whole."""
-    most, length = n_bytes + _LONGEST_METADATA, path.stat().st_size
+    most = n_bytes + _LONGEST_METADATA
     if length > most:
         raise InputError(
             f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
@@ -116,35 +97,18 @@ def _check_length(path: Path, n_bytes: int) -> None:
         )
 
 
-def _kind(path: Path) -> Literal["RAW", "TIFF", "PNG", "JPEG"]:
-    """Return the format of an image file. Raises InputError."""
-    check_file(path, "an image")
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(PNG))
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    if start and is_raw(path):
-        return "RAW"
-    if start.startswith(TIFF):
-        return "TIFF"
-    if start.startswith((PNG, JPEG)):
-        return "PNG" if start.startswith(PNG) else "JPEG"
-    raise InputError("found neither PNG, TIFF nor JPEG" if start else "the file is empty", path=path)
-
-
-def _decode(path: Path) -> NDArray[Any]:
-    """Return the pixels (H, W) or (H, W, C) of a file of any format, with alpha."""
-    kind = _kind(path)
-    try:
-        if kind == "RAW":
-            return decode_raw(path, native_stderr)
-        if kind == "TIFF":
-            return decode_tiff(path, lambda: _decode_with_opencv(path.read_bytes(), path))
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    (_check_png if kind == "PNG" else _check_jpeg)(data, path)
+def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
+    """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
+    if kind == "RAW":
+        return decode_raw(file.read(), path)
+    if kind == "TIFF":
+        pixels = decode_tiff(file, path)
+        if pixels is not None:
+            return pixels
+        file.seek(0)
+    data = file.read()
+    if kind != "TIFF":
+        (_check_png if kind == "PNG" else _check_jpeg)(data, path)
     return _decode_with_opencv(data, path)
 
 
@@ -223,37 +187,3 @@ def _check_jpeg(data: bytes, path: Path) -> None:
                 break
             position = following.start()
     raise InputError("the JPEG is truncated", path=path, hint="Copy or export it again")
-
-
-@contextmanager
-def native_stderr() -> Iterator[list[str]]:
-    """Catch what C libraries print to stderr; after the block, the list contains it.
-
-    This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may do it, and only
-    around decoding. What other threads print meanwhile is lost, unless they print elsewhere: see stderr_is_apart.
-    """
-    messages: list[str] = []
-    with _STDERR_LOCK, tempfile.TemporaryFile() as store:
-        try:
-            if sys.stderr is not None:
-                sys.stderr.flush()
-            original = os.dup(2)
-        except (OSError, ValueError):  # there is no stderr to protect
-            yield messages
-            return
-        try:
-            os.dup2(store.fileno(), 2)
-            yield messages
-        finally:
-            os.dup2(original, 2)
-            os.close(original)
-            store.seek(0)
-            messages.append(store.read(1 << 16).decode(errors="replace"))
-
-
-def stderr_is_apart() -> bool:
-    """Return whether Python's stderr is not file descriptor 2, so that nothing is lost while native_stderr catches."""
-    try:
-        return sys.stderr is None or sys.stderr.fileno() != 2
-    except (OSError, ValueError):  # a stream without a descriptor
-        return True

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.decoding import stored_size
+from splinecli.capture.formats.facts import stored_size
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import cut_out, read_mask
 from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.errors import InputError
 from splinecli.extras import import_extra
 
@@ -29,33 +30,29 @@ def is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
 
 
-Quiet = Callable[[], AbstractContextManager[object]]
-"""Catches what LibRaw prints. It is used only around reading, because it stops progress bars, too."""
-
-
-def raw_size(path: Path, quiet: Quiet) -> tuple[tuple[int, int, int], int]:
+def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
     """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises InputError."""
-    with _damage_as_input_error(path), quiet(), _import_rawpy(path).imread(str(path)) as raw:
+    with _damage_as_input_error(path), native_stderr(), _import_rawpy(path).imread(str(path)) as raw:
         return (raw.sizes.height, raw.sizes.width, 3), 2
 
 
-def decode_raw(path: Path, quiet: Quiet) -> NDArray[np.uint16]:
+def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
     """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or 1 (no filters).
 
     They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
     camera at one setting have the same scale. An orientation is ignored, as in all images.
 
     Args:
-        path: the file.
-        quiet: see Quiet.
+        content: the whole file.
+        path: its name, for messages.
 
     Raises:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
     """
     rawpy = _import_rawpy(path)
     with _damage_as_input_error(path):
-        with quiet():
-            raw = rawpy.imread(io.BytesIO(path.read_bytes()))
+        with native_stderr():  # not longer, because it stops progress bars, too
+            raw = rawpy.imread(io.BytesIO(content))
             raw.unpack()
         with raw:
             pixels = raw.postprocess(
@@ -83,7 +80,7 @@ def read_shot(path: Path) -> tuple[float, float, float]:
 
     LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. It raises LibRaw's errors.
     """
-    with _import_rawpy(path).imread(io.BytesIO(path.read_bytes())) as raw:
+    with native_stderr(), _import_rawpy(path).imread(io.BytesIO(path.read_bytes())) as raw:
         return raw.other.shutter_speed, raw.other.aperture, raw.other.iso_speed
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from splinecli.capture.formats.decoding import stderr_is_apart
+from splinecli.capture.formats.native_stderr import stderr_is_apart
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.header import is_image
+from splinecli.capture.formats.facts import is_image
 from splinecli.capture.paths import check_file, is_substitution
 from splinecli.errors import InputError
 

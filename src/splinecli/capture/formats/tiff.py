@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,30 +27,17 @@ _PLACES_OF_PARTS = (273, 279, 324, 325)  # tags with one value for each strip or
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
-def tiff_size(path: Path) -> tuple[tuple[int, int, int], int]:
-    """Return the shape (H, W, samples) of the first picture of a TIFF file, and the bytes of each sample.
-
-    Raises InputError for a damaged header.
-    """
-    with first_page(path) as page:
-        return (page.imagelength, page.imagewidth, page.samplesperpixel), -(-page.bitspersample // 8)
-
-
-def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples).
+def decode_tiff(file: BinaryIO, path: Path) -> NDArray[Any] | None:
+    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one that OpenCV decodes.
 
     Values grow with brightness: if zero is white in the file, the values are inverted, as in viewers. tifffile reads
-    every sample format. OpenCV decodes compressions for which tifffile has no decoder (LZW).
-
-    Args:
-        path: the file.
-        decode_with_opencv: decodes the file with OpenCV.
+    every sample format, but has no decoder for some compressions (LZW).
 
     Raises:
         InputError: the file is truncated, damaged, or of a kind without linear gray or RGB values.
     """
-    with first_page(path) as page:
-        _check_complete(page, path)
+    with first_page(file, path) as page:
+        _check_complete(page, os.fstat(file.fileno()).st_size, path)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
             raise InputError(
@@ -61,7 +49,7 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
     if pixels is None:
         if photometric == _WHITE_IS_ZERO:
             raise _damaged(path)
-        return decode_with_opencv()
+        return None
     if photometric == _WHITE_IS_ZERO:
         if pixels.dtype.kind == "u":
             return np.asarray(np.iinfo(pixels.dtype).max - pixels)
@@ -71,15 +59,16 @@ def decode_tiff(path: Path, decode_with_opencv: Callable[[], NDArray[Any]]) -> N
 
 
 @contextmanager
-def first_page(path: Path) -> Iterator[Any]:
-    """Yield the first page of a TIFF file. What tifffile raises for a damaged file becomes an InputError."""
+def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
+    """Yield the first page of an open TIFF file. What tifffile raises for a damaged file becomes an InputError."""
     import tifffile
 
     with _quiet_tifffile():
         try:
-            _check_tags(path)
-            with tifffile.TiffFile(path) as file:
-                yield file.pages.first
+            _check_tags(file, path)
+            file.seek(0)
+            with tifffile.TiffFile(file, name=path.name) as pages:
+                yield pages.pages.first
         except InputError:
             raise
         except Exception as error:  # struct, key, value and other errors
@@ -88,16 +77,15 @@ def first_page(path: Path) -> Iterator[Any]:
             raise _damaged(path) from None
 
 
-def _check_tags(path: Path) -> None:
+def _check_tags(file: BinaryIO, path: Path) -> None:
     """Raise InputError for a tag with millions of values, because tifffile reads tags as a whole."""
-    with path.open("rb") as file:
-        start = file.read(16)
-        order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
-        big = 43 in start[2:4]  # BigTIFF has wider numbers
-        number, length, entry = (8, 8, 20) if big else (4, 2, 12)
-        file.seek(int.from_bytes(start[8:16] if big else start[4:8], order))
-        count = int.from_bytes(file.read(length), order)
-        entries = file.read(min(count, 1 << 16) * entry)
+    start = file.read(16)
+    order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
+    big = 43 in start[2:4]  # BigTIFF has wider numbers
+    number, length, entry = (8, 8, 20) if big else (4, 2, 12)
+    file.seek(int.from_bytes(start[8:16] if big else start[4:8], order))
+    count = int.from_bytes(file.read(length), order)
+    entries = file.read(min(count, 1 << 16) * entry)
     for place in range(0, len(entries), entry):
         tag = int.from_bytes(entries[place : place + 2], order)
         values = int.from_bytes(entries[place + 4 : place + 4 + number], order)
@@ -124,13 +112,12 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
     return pixels if pixels.ndim in (2, 3) else None
 
 
-def _check_complete(page: Any, path: Path) -> None:
-    """Raise InputError where a part of the pixels lies beyond the end of the file, or is longer than its pixels.
+def _check_complete(page: Any, size: int, path: Path) -> None:
+    """Raise InputError where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels.
 
     A compressed part that is longer than its pixels would be may expand to a thousand times their size. So may a tile
     that is far larger than the picture.
     """
-    size = path.stat().st_size
     expanded = math.prod(page.chunks) * page.dtype.itemsize
     longest = 2 * expanded + _LONGEST_EMPTY_PART
     if expanded > 2 * math.prod(page.shape) * page.dtype.itemsize + _LARGEST_EMPTY_PART or any(

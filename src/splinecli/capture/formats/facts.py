@@ -1,0 +1,301 @@
+"""The facts of an image file, found in its header by one look: size, transfer curve, white level and EXIF tags.
+
+The parts before the pixels are walked here, with bounds, because Pillow reads hostile ones without end. Pillow reads
+the EXIF tags, and tifffile the tags of TIFF.
+"""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from splinecli.capture.formats.colour_profile import LARGEST_PROFILE, profile_curve
+from splinecli.capture.formats.raw import is_raw, raw_size
+from splinecli.capture.formats.tiff import first_page
+from splinecli.capture.paths import check_file
+from splinecli.errors import InputError
+from splinecli.transfer import SRGB, TransferCurve
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""The first bytes of the files. Those of a PNG are the longest."""
+
+StoredSize = tuple[tuple[int, ...], int]
+"""The shape (H, W, C) of an image as stored, and the bytes of each number."""
+
+ORIENTATION, _EXIF = 0x0112, 0x8769
+_KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
+"""EXIF tags of the exposure and of the focal length; see exif.py and calibration/view.py."""
+
+_MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF and DNG
+
+_MOST_PARTS = 10_000
+"""Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
+
+_RAW_WHITE = 65_535
+"""The white level of developed RAW files; see decode_raw."""
+
+
+@dataclass(frozen=True)
+class StatedCurve:
+    """What a file says of its transfer curve.
+
+    Args:
+        curve: see TransferCurve; linear where the file says nothing.
+        by: what says so, for people; empty for nothing.
+        unread: whether there is a colour profile whose curve cannot be read.
+    """
+
+    curve: TransferCurve = 1.0
+    by: str = ""
+    unread: bool = False
+
+
+@dataclass(frozen=True)
+class ImageFacts:
+    """What the header of an image file states.
+
+    Args:
+        path: the file.
+        kind: "PNG", "JPEG", "TIFF" or "RAW"; empty for none of them.
+        stated_size: None for a RAW file, and for a damaged one.
+        curve: that of a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
+        white_level: the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is
+            in the unit of the decoded values: full scale for a RAW file, whatever its tags say.
+        exif: orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads.
+        damage: why the file cannot be read. It is raised when the size is wanted.
+    """
+
+    path: Path
+    kind: str = ""
+    stated_size: StoredSize | None = None
+    curve: StatedCurve = StatedCurve()
+    white_level: int | None = None
+    exif: Mapping[int, Any] | None = field(default_factory=dict)
+    damage: InputError | None = None
+
+    @cached_property
+    def size(self) -> StoredSize:
+        """The size as stored. Raises InputError for a damaged file. Opening a RAW file takes long."""
+        if self.damage is not None:
+            raise self.damage
+        if self.kind == "RAW":
+            return raw_size(self.path)
+        if self.stated_size is None:
+            raise InputError(f"the {self.kind} is truncated", path=self.path, hint="Copy or export it again")
+        return self.stated_size
+
+
+def read_facts(path: Path) -> ImageFacts:
+    """Return the facts of an image file. It is opened once; nothing is decoded."""
+    try:
+        with open_image(path) as (file, kind):
+            return facts_in(file, kind, path)
+    except InputError as error:
+        return ImageFacts(path, damage=error)
+
+
+def stored_size(path: Path) -> StoredSize:
+    """Return the shape (H, W, C) that an image file states, and the bytes of each number. Raises InputError."""
+    return read_facts(path).size
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
+    """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises InputError."""
+    check_file(path, "an image")
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(PNG))
+            file.seek(0)
+            if start and is_raw(path):
+                kind = "RAW"
+            elif start.startswith((PNG, JPEG)):
+                kind = "PNG" if start == PNG else "JPEG"
+            elif start.startswith(TIFF):
+                kind = "TIFF"
+            else:
+                raise InputError(
+                    "found neither PNG, TIFF nor JPEG" if start else "the file is empty", path=path
+                )
+            yield file, kind
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+
+
+def is_image(content: bytes) -> bool:
+    """Return whether the content of a file begins as PNG, JPEG or TIFF."""
+    return content.startswith((PNG, JPEG, *TIFF))
+
+
+def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageFacts:
+    """Return the facts of an open image file. Raises InputError for a damaged TIFF."""
+    if kind == "RAW":
+        exif = _exif_tags(lambda tags: tags.load_from_fp(file))
+        return ImageFacts(path, kind, white_level=_RAW_WHITE, exif=exif)
+    read = {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind]
+    return read(file, path)
+
+
+def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
+    file.seek(len(PNG))
+    chunks: dict[bytes, bytes] = {}
+    for name, content in _png_chunks(file):
+        chunks.setdefault(name, content)
+    header, size = chunks.get(b"IHDR", b""), None
+    if next(iter(chunks), None) == b"IHDR" and len(header) >= 10:
+        width, height = (int.from_bytes(header[place : place + 4], "big") for place in (0, 4))
+        size = (height, width, {0: 1, 4: 2, 6: 4}.get(header[9], 3)), 2 if header[8] == 16 else 1
+    # 100000 times the exponent of the encoding: 1 means linear.
+    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (0, 100_000)
+    profile = None
+    if b"iCCP" in chunks:
+        try:
+            compressed = chunks[b"iCCP"].partition(b"\0")[2]
+            profile = zlib.decompressobj().decompress(compressed[1:], LARGEST_PROFILE)
+        except zlib.error:
+            profile = b""
+    # One number for each channel. Alpha, if there is one, comes last.
+    stated = chunks.get(b"sBIT", b"")
+    bits = set(stated[: 3 if len(stated) > 2 else 1])
+    return ImageFacts(
+        path,
+        "PNG",
+        size,
+        _curve(StatedCurve(SRGB, "PNG that says so") if encoded else StatedCurve(), profile),
+        _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None,
+        _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))),
+    )
+
+
+def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
+    """Yield name and content of the chunks before a PNG's pixels, from a file positioned after the signature."""
+    for _ in range(_MOST_PARTS):
+        if len(header := file.read(8)) < 8 or header[4:] in (b"IDAT", b"IEND"):
+            return
+        length = int.from_bytes(header[:4], "big")
+        content = file.read(min(length, LARGEST_PROFILE if header[4:] in (b"iCCP", b"eXIf") else 16))
+        file.seek(length - len(content) + 4, 1)
+        yield header[4:], content
+
+
+def _jpeg_facts(file: BinaryIO, path: Path) -> ImageFacts:
+    size, exif, parts = None, b"", dict[bytes, bytes]()
+    for marker, length in _jpeg_segments(file):
+        if _is_frame(marker) and len(frame := file.read(6)) == 6:
+            height, width = (int.from_bytes(frame[place : place + 2], "big") for place in (1, 3))
+            size = (height, width, frame[5]), 1
+        elif marker == 0xE1 and not exif and file.read(6) == b"Exif\0\0":
+            exif = file.read(max(length - 6, 0))
+        elif marker == 0xE2 and length > 14 and file.read(12) == b"ICC_PROFILE\0":
+            number = file.read(2)[:1]
+            parts[number] = file.read(length - 14)
+    profile = None
+    if parts:  # b"" counts as one that cannot be read
+        short = sum(map(len, parts.values())) <= LARGEST_PROFILE
+        profile = b"".join(parts[number] for number in sorted(parts)) if short else b""
+    return ImageFacts(
+        path,
+        "JPEG",
+        size,
+        _curve(StatedCurve(SRGB, "JPEG"), profile),
+        exif=_exif_tags(lambda tags: tags.load(exif)),
+    )
+
+
+def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
+    """Yield marker and length of the segments up to a JPEG's frame, with the file at each one's content."""
+    start, marker = 2, 0
+    for _ in range(_MOST_PARTS):
+        file.seek(start)
+        header = file.read(4)
+        if len(header) < 4 or header[0] != 0xFF or _is_frame(marker):
+            return
+        if header[1] == 0xFF:  # fill
+            start += 1
+            continue
+        marker, length = header[1], int.from_bytes(header[2:], "big")
+        yield marker, length - 2
+        start += 2 + length
+
+
+def _is_frame(marker: int) -> bool:
+    return 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
+
+
+def _tiff_facts(file: BinaryIO, path: Path) -> ImageFacts:
+    with first_page(file, path) as page:
+        bits = int(page.bitspersample)
+        size = (page.imagelength, page.imagewidth, page.samplesperpixel), -(-bits // 8)
+        tag, profile = page.tags.get(_PROFILE), None
+        if tag is not None:
+            value = tag.value if tag.count <= LARGEST_PROFILE else b""
+            profile = value if isinstance(value, bytes) else b""
+        white, largest = (_one_value(page.tags.valueof(code)) for code in (_WHITE_LEVEL, _MAX_SAMPLE_VALUE))
+        has_exif = _EXIF in page.tags or ORIENTATION in page.tags
+        place, order, big = page.offset, page.parent.byteorder, page.parent.is_bigtiff
+
+    def load(tags: Image.Exif) -> None:
+        tags.endian, tags.bigtiff = order, big
+        tags.load_from_fp(file, place)
+
+    level = None
+    if bits == 16 and white is not None and 0 < white < 65_535:
+        level = white
+    elif bits == 16 and largest is not None and largest == _level(largest.bit_length()):
+        level = largest  # of any other number it may be the largest value of this image
+    elif bits < 16:
+        level = _level(bits)
+    exif = _exif_tags(load) if has_exif else {}  # Pillow reads all tags, however long
+    return ImageFacts(path, "TIFF", size, _curve(StatedCurve(), profile), level, exif)
+
+
+def _one_value(tag: object) -> int | None:
+    """Return the tag's value where it is one whole number, or the same one for each channel."""
+    values = set(tag) if isinstance(tag, tuple) else {tag}
+    value = values.pop() if len(values) == 1 else None
+    return value if isinstance(value, int) else None
+
+
+def _level(bits: int) -> int | None:
+    return (1 << bits) - 1 if 8 <= bits < 16 else None
+
+
+def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
+    """Return the curve of a profile; what else the file states where it has none, or none that can be read."""
+    if profile is None:
+        return stated
+    found = profile_curve(profile)
+    if found is None:
+        return StatedCurve(stated.curve, stated.by, unread=True)
+    name, curve = found
+    return StatedCurve(curve, f'colour profile "{name}"')
+
+
+def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
+    """Return the tags that are kept, empty for damaged ones; None for a RAW file of its maker's own format."""
+    from PIL import Image
+
+    tags, found = Image.Exif(), dict[int, Any]()
+    with warnings.catch_warnings():  # Pillow warns of tags that it does not expect
+        warnings.simplefilter("ignore")
+        try:
+            load(tags)
+            if ORIENTATION in tags:
+                found[ORIENTATION] = tags[ORIENTATION]
+            inside = tags.get_ifd(_EXIF)
+            found |= {tag: inside[tag] for tag in _KEPT if tag in inside}
+        except SyntaxError:
+            return None
+        except Exception:  # damaged tags cause a dozen types of errors; decoding names the damage
+            pass
+    return found
