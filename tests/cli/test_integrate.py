@@ -56,6 +56,13 @@ def test_heights_and_mesh_of_a_sphere(run):
     assert f"out: {inside.sum()} pixels, from " in result.out
 
 
+@pytest.mark.parametrize("arguments", [["normals.png"], ["directx.png", "--convention", "directx"]])
+def test_formats_of_normal_maps(run, arguments):
+    assert run("integrate", *arguments, "-o", "out", "--format", "npy").code == 0
+    _, heights, inside = sphere()
+    assert np.nanmean(np.abs(np.load("out/depth.npy") - heights)) < 0.005 * np.ptp(heights[inside])
+
+
 @pytest.mark.parametrize("given", [[], ["--convention", "directx"]], ids=["found", "given"])
 @pytest.mark.parametrize("form", ["png", "png8", "npy", "tiff"])
 def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from small_pixel_sets import matte_pixels
 from splinecli.files import UNFINISHED
 from splinecli.publishing import UNDONE
 
@@ -63,19 +63,11 @@ def settings() -> dict[str, Any]:
 
 def write_set(folder: str, *, finished: bool = True) -> None:
     """Matte pixels in three scenes under 14 lights."""
-    from splinecli.pixel_sets.store import Pixels
     from splinecli.pixel_sets.writer import PixelSetWriter
 
-    random = np.random.default_rng(0)
     writer = PixelSetWriter(Path(folder))
-    for scene in "abc":
-        normals, lights = random.normal(size=(50, 3)), random.normal(size=(14, 3))
-        for vectors in (normals, lights):
-            vectors[:, 2] = np.abs(vectors[:, 2]) + 0.3
-            vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-        observations = (normals @ lights.T).clip(0)
-        arrays = [array.astype(np.float32) for array in (observations, normals, lights)]
-        writer.add(scene, scene, "a test", {"by": "hand"}, Pixels(*arrays, np.ones((5, 10), bool)))
+    for seed, scene in enumerate("abc"):
+        writer.add(scene, scene, "a test", {"by": "hand"}, matte_pixels(50, 14, seed=seed))
     if finished:
         writer.finish()
 
