@@ -28,7 +28,7 @@ rendered captures that are linear, it leaves 1.1 times as much or more."""
 DISTANCES = (1.0, 1.5, 2.0, 2.5, 3.2, 4.3, 6.0, 9.0)
 """The distances that are tried, in widths of the object. A minimum at the first or the last of them does not count."""
 
-NEAR_RATIO, NEAR_RATIO_ROUND = 0.8, 0.6
+NEAR_RATIO, NEAR_RATIO_ROUND = 0.84, 0.6
 """Lamps count as near if the best distance leaves less than the first share; on round objects, than the second."""
 
 ROUND = 0.85
