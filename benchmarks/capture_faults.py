@@ -23,7 +23,7 @@ from near_lamps import height_field, sphere
 from splinecli.capture import Capture, open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
-from splinecli.pipeline.input_checks import check_arrays, check_capture
+from splinecli.diagnosis.checks import check_arrays, check_capture
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.point_lights import render_point_lights

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
 from splinecli.capture.lights.draws import draw_lights
-from splinecli.capture.lights.light_advice import mirror_twin
-from splinecli.capture.lights.light_check import LightCheck, check_lights
 from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.light_frames import parse_light_frame
-from splinecli.capture.lights.light_order import UNKNOWN_ORDER
 from splinecli.capture.sample import sample_observations
+from splinecli.diagnosis.light_advice import mirror_twin
+from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.diagnosis.light_order import UNKNOWN_ORDER
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
 Array = NDArray[np.floating]

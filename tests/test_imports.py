@@ -20,7 +20,7 @@ ROOMS = [
     {"synthesis", "inference"},
     {"methods", "metrics"},
     {"networks", "devices"},
-    {"fits", "calibration"},
+    {"fits", "calibration", "diagnosis"},
     {"capture", "observation_map", "publishing", "surface"},
     {"normals", "files", "locks", "memory", "transfer", "solve_3x3", "exr"},
     {"extras"},

@@ -94,9 +94,9 @@ def estimate_normals(
 
     from splinecli.capture.arrays import capture_from_arrays
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
+    from splinecli.diagnosis.checks import check_arrays
     from splinecli.methods import MethodOptions, check_method, make_estimator
     from splinecli.pipeline.estimate import estimate_capture
-    from splinecli.pipeline.input_checks import check_arrays
 
     check_method(method)
     capture = capture_from_arrays(

@@ -7,7 +7,7 @@ import pytest
 
 from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.sample import Sample, leave_out_background
-from splinecli.pipeline.input_checks import check_arrays
+from splinecli.diagnosis.checks import check_arrays
 
 
 def ball_before(background: float, size: int = 80) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

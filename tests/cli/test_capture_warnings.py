@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import splinecli
-from splinecli.pipeline import input_checks
+from splinecli.diagnosis import checks
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
 
@@ -83,7 +83,7 @@ def test_lights_that_crowd(run, medallion, change, words):
 
 def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
     """Noise in place of photographs, on an object of few pixels. The usual limit is nearer to what the network says."""
-    monkeypatch.setattr(input_checks, "LEAST_EXPECTED", 0.3)
+    monkeypatch.setattr(checks, "LEAST_EXPECTED", 0.3)
     rng = np.random.default_rng(0)
     for path in medallion.glob("[01]*.png"):
         shape = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape

@@ -19,9 +19,10 @@ import tifffile
 
 from splinecli import inference
 from splinecli.capture import source
+from splinecli.diagnosis import checks
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.pipeline import distillation, input_checks, surface
+from splinecli.pipeline import distillation, surface
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
@@ -263,7 +264,7 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
     monkeypatch.setattr(clock.time, "perf_counter", lambda: now)
     for module, name, seconds in (
         (source.CaptureSource, "read", 1),
-        (input_checks, "check_capture", 10),
+        (checks, "check_capture", 10),
         (distillation, "distil_for", 100),
         (inference, "estimate_normals", 1000),
         (albedo, "albedo_map", 10_000),

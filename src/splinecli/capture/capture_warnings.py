@@ -62,6 +62,7 @@ REPEATED_IMAGES = "repeated_images"
 REFINED_LIGHTS = "refined_lights"
 ROUGH_LIGHTS = "rough_lights"
 SATURATED = "saturated"
+UNEQUAL_INTENSITIES = "unequal_intensities"
 UNTRAINED_LIGHTS = "untrained_lights"
 WHITE_LEVEL = "white_level"
 
@@ -177,51 +178,12 @@ def exif_orientation(orientation: int) -> CaptureWarning:
     )
 
 
-def lights_crowded(spread: float, *, in_cone: bool) -> CaptureWarning:
-    """Warn of lights that determine a normal badly."""
-    where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
-    return CaptureWarning(
-        LIGHTS_CROWDED,
-        f"The lights {where}, so noise and small errors of their directions grow about {1 / spread:.0f} times in the"
-        " normals. Add lights from other sides.",
-    )
-
-
-def low_confidence(expected_under_5: float) -> CaptureWarning:
-    """Warn of a capture that the network itself finds implausible."""
-    return CaptureWarning(
-        LOW_CONFIDENCE,
-        f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5 degrees. The"
-        " lights, the mask or the images are probably wrong: see docs/troubleshooting.md.",
-    )
-
-
 def not_distilled(angle_deg: float, expected_deg: float) -> CaptureWarning:
     """Warn of a capture that a perceptron could not learn, so that it took longer than expected."""
     return CaptureWarning(
         NOT_DISTILLED,
         f"The network estimated every pixel. A small one learned from a sample, but was {angle_deg:.1f} degrees away"
         f" from it, where it expects errors of {expected_deg:.1f} degrees.",
-    )
-
-
-def repeated_images(first: str, second: str, n_pairs: int) -> CaptureWarning:
-    more = f" (and {n_pairs - 1} more pairs)" if n_pairs > 1 else ""
-    return CaptureWarning(
-        REPEATED_IMAGES,
-        f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by its"
-        " own photograph.",
-    )
-
-
-def image_odd(name: str, left: float, brightness: float | None) -> CaptureWarning:
-    """Warn of an image that contradicts the others."""
-    how = "" if brightness is None else f" and is {brightness:.2f} times as bright as they predict"
-    return CaptureWarning(
-        IMAGE_ODD,
-        f"{name} contradicts the other images{how}: without it, {100 * left:.0f} % of what the lights cannot explain is"
-        " left. Its lamp was moved or failed, its exposure differs, or a shadow fell on the object. Photograph it"
-        " again, or leave it out.",
     )
 
 
@@ -255,24 +217,6 @@ def refined_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureW
         REFINED_LIGHTS,
         f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
         f" {moved_deg.max():.1f}. The images fit them better: {100 * fit_ratio:.0f} % of the misfit is left.",
-    )
-
-
-def rough_lights(moved_deg: NDArray[np.float64], fit_ratio: float) -> CaptureWarning:
-    """Warn of light directions (F,) that refinement would move by these angles."""
-    return CaptureWarning(
-        ROUGH_LIGHTS,
-        f"The light directions are probably rough: others, {moved_deg.mean():.1f} degrees away on average, leave"
-        f" {100 * fit_ratio:.0f} % of the misfit. Try --refine-lights.",
-    )
-
-
-def no_mask(share: float) -> CaptureWarning:
-    """Warn of a capture without a mask, a large share of whose pixels is dark background."""
-    return CaptureWarning(
-        NO_MASK,
-        f"There is no mask, and {100 * share:.0f} % of the pixels are near black: the normals of this background mean"
-        " nothing. Add --auto-mask, or give a mask.",
     )
 
 

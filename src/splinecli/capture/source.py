@@ -15,7 +15,6 @@ from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.read_ahead import read_ahead
-from splinecli.capture.ground_truth_check import check_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
@@ -129,9 +128,6 @@ class CaptureSource:
             warnings.append(capture_warnings.ground_truth_upside_down())
         lamps, of_lamps = self.near_lamps(mask)
         warnings += of_lamps
-        if ground_truth is not None:
-            chosen = self.light_directions[list(indices)]
-            warnings += check_ground_truth(found.values, chosen, ground_truth[mask])
         capture = Capture(
             name=self.files.name,
             observations=found.values,

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.frame_evidence import smooth_normals
 from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
 from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
+from splinecli.diagnosis.frame_evidence import smooth_normals
 from splinecli.methods.indirect_light import PixelPlaces
 from splinecli.methods.lamp_light import LightOf, parts_of_rows
 from splinecli.normals import angle_between_deg, unit

@@ -38,7 +38,7 @@ def estimate_capture(
     Args:
         capture: with the warnings from reading it.
         estimator: the method.
-        check: returns the warnings about the capture's lights and images; see pipeline/input_checks.py.
+        check: returns the warnings about the capture's lights and images; see diagnosis/checks.py.
         refine_lights: returns the capture with refined lights.
         distil: see distil_for.
         strict: raise InputError where a warning says that an input is probably wrong.
@@ -47,9 +47,9 @@ def estimate_capture(
         clock: is told of the stages.
     """
     from splinecli.capture.capture_warnings import ROUGH_LIGHTS
+    from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
     from splinecli.inference import estimate_normals
     from splinecli.pipeline.distillation import distil_for
-    from splinecli.pipeline.input_checks import check_confidence, refuse_if_strict
 
     clock = clock or Clock()
     clock.begin("check")

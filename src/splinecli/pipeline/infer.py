@@ -65,8 +65,8 @@ def _infer_into(
     folder: Path, target: Path, options: InferOptions, observer: Observer, estimator: Estimator | None
 ) -> dict[str, Any]:
     """Do the work of infer_capture in the folder of results, which the caller holds."""
+    from splinecli.diagnosis.checks import check_capture
     from splinecli.pipeline.estimate import estimate_capture
-    from splinecli.pipeline.input_checks import check_capture
     from splinecli.results.clock import Clock
     from splinecli.results.files import write_estimate
     from splinecli.results.report import report_of

@@ -69,10 +69,10 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
-    from splinecli.capture.lights.light_advice import candidate_rows
     from splinecli.capture.summary import summarise_capture
+    from splinecli.diagnosis.checks import StatedLights, check_sample
+    from splinecli.diagnosis.light_advice import candidate_rows
     from splinecli.files import write_bytes
-    from splinecli.pipeline.input_checks import StatedLights, check_sample
 
     source = options.reading.open(options.capture)
     if options.plot is not None:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, LIGHTS_UNCHECKED, CaptureWarning
-from splinecli.capture.lights.light_check import Candidate, LightCheck
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, LightFrame
-from splinecli.capture.lights.light_order import UNKNOWN_ORDER, ZENITH
+from splinecli.diagnosis.light_check import Candidate, LightCheck
+from splinecli.diagnosis.light_order import UNKNOWN_ORDER, ZENITH
 
 TOLD_APART = 0.5
 """Smallest difference of advantages that tells two frames apart."""

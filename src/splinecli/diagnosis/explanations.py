@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import ENCODED_VALUES, LAMPS_NEAR, CaptureWarning
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, lit_rows, predict
+from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_rows, shade
 from splinecli.capture.sample import Sample
 from splinecli.normals import unit
 
@@ -42,24 +42,28 @@ _DARK_SHARE, _SHADOW_SHARE, _FITS = 0.1, 0.1, 6
 _ENCODED_SHADOW_SHARE = 0.35  # encoded, 0.1 is 0.35: what is shadow in one reading is in the other, too
 
 
-def explain(
-    sample: Sample, light_directions: Array, *, linear: bool, has_positions: bool
-) -> list[CaptureWarning]:
-    """Return a warning about what explains a sample better than distant lights (F, 3) and linear values, or none.
+def encoded_values(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
+    """Warn of a sample whose values fit distant lights (F, 3) much better if they are decoded."""
+    _, values = _choose(sample.observations)
+    if not len(values):
+        return []
+    before, after = (
+        _misfits(values, light_directions, gamma, shadow=_ENCODED_SHADOW_SHARE)[0]
+        for gamma in (1.0, DISPLAY_EXPONENT)
+    )
+    if before < _MIN_MISFIT or after >= ENCODED_RATIO * before:
+        return []
+    text = (
+        "The images fit the lights much better if their values are decoded: they look display-encoded, but are read as"
+        f" linear (what the lights cannot explain falls to {100 * after / before:.0f} %). Add --transfer srgb or"
+        " --transfer gamma:2.2."
+    )
+    return [CaptureWarning(ENCODED_VALUES, text)]
 
-    Args:
-        linear: whether the values were taken as linear.
-        has_positions: whether positions of lamps are known.
-    """
-    ratio = decoding_ratio(sample.observations, light_directions) if linear else None
-    if ratio is not None and ratio < ENCODED_RATIO:
-        text = (
-            "The images fit the lights much better if their values are decoded: they look display-encoded, but are read"
-            f" as linear (what the lights cannot explain falls to {100 * ratio:.0f} %). Add --transfer srgb or"
-            " --transfer gamma:2.2."
-        )
-        return [CaptureWarning(ENCODED_VALUES, text)]
-    near = None if has_positions else near_distance(sample, light_directions)
+
+def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
+    """Warn of a sample that fits lamps in these directions (F, 3) much better if they are near."""
+    near = near_distance(sample, light_directions)
     if near is None:
         return []
     text = (
@@ -70,30 +74,15 @@ def explain(
     return [CaptureWarning(LAMPS_NEAR, text)]
 
 
-def decoding_ratio(observations: NDArray[np.floating], light_directions: Array) -> float | None:
-    """Return what a fit leaves of observations (P, F) if they are decoded first, as a share of that without.
-
-    Returns None where there are too few lights (F, 3) or lit pixels, or hardly anything is left.
-    """
-    chosen = _choose(observations)
-    if chosen is None:
-        return None
-    values = _scaled(observations[chosen])
-    before = _misfits(values, light_directions, shadow=_ENCODED_SHADOW_SHARE)[0]
-    after = _misfits(values, light_directions, DISPLAY_EXPONENT, shadow=_ENCODED_SHADOW_SHARE)[0]
-    return float(after / before) if before >= _MIN_MISFIT else None
-
-
 def near_distance(sample: Sample, light_directions: Array) -> tuple[float, float] | None:
     """Return the distance of the lamps in widths of the object at which a sample fits best, and the share it leaves.
 
     The surface counts as a plane, and all lamps (F, 3) as equally far from the middle of the image. Returns None where
     distant lamps explain the images about as well, or the images do not tell.
     """
-    chosen = _choose(sample.observations)
-    if chosen is None:
+    chosen, values = _choose(sample.observations)
+    if not len(chosen):
         return None
-    values = _scaled(sample.observations[chosen])
     before = _misfits(values, light_directions)
     if before[1] < _MIN_MISFIT:
         return None
@@ -118,20 +107,18 @@ def near_distance(sample: Sample, light_directions: Array) -> tuple[float, float
     return float(-2 * square / slope), ratios[best]
 
 
-def _choose(observations: NDArray[np.floating]) -> NDArray[np.intp] | None:
-    """Return rows of lit pixels of observations (P, F), evenly spread, or None for too few."""
-    n_pixels, n_lights = observations.shape
-    if n_lights < MIN_LIGHTS or n_pixels < _MIN_PIXELS:
-        return None
+def _choose(observations: NDArray[np.floating]) -> tuple[NDArray[np.intp], Array]:
+    """Return rows (p,) of lit pixels, evenly spread, and their values (p, F), scaled to 1; none for too few."""
+    n_lights = observations.shape[1]
+    none = np.zeros(0, np.intp), np.zeros((0, n_lights))
+    if n_lights < MIN_LIGHTS or len(observations) < _MIN_PIXELS:
+        return none
     chosen = lit_rows(observations, _DARK_SHARE, min(_MAX_PIXELS, _MAX_OBSERVATIONS // n_lights))
+    values = observations[chosen].astype(np.float64).clip(min=0)
+    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     # Three unknowns need more than three lit observations to leave a residual.
-    chosen = chosen[(_scaled(observations[chosen]) > _SHADOW_SHARE).sum(axis=1) >= 5]
-    return chosen if len(chosen) >= _MIN_PIXELS else None
-
-
-def _scaled(observations: NDArray[np.floating]) -> Array:
-    values = observations.astype(np.float64).clip(min=0)
-    return np.asarray(values / np.maximum(values.max(axis=1, keepdims=True), 1e-12))
+    enough = (values > _SHADOW_SHARE).sum(axis=1) >= 5
+    return (chosen[enough], values[enough]) if enough.sum() >= _MIN_PIXELS else none
 
 
 def _misfits(values: Array, lights: Array, gamma: float = 1.0, *, shadow: float = _SHADOW_SHARE) -> Array:
@@ -142,14 +129,10 @@ def _misfits(values: Array, lights: Array, gamma: float = 1.0, *, shadow: float 
         shadow: values up to this do not count.
     """
     lit = values > shadow
-    linear = values**gamma
     # The slope of the stored value over the linear one, so that both readings have the same errors.
-    slopes = lit / (gamma * np.maximum(values, shadow) ** (gamma - 1)) ** 2
-    weights = slopes
-    for _ in range(_FITS):
-        residuals = values - np.maximum(predict(linear, weights, lights), 0) ** (1 / gamma)
-        weights = slopes * absolute_weights(residuals)
-    differences = np.abs(residuals[lit])
+    slopes = lit / (gamma * np.maximum(values, shadow) ** (gamma - 1))
+    normals, _ = fit_robustly(values**gamma, slopes, lights, _FITS)
+    differences = np.abs(values - shade(normals, lights).clip(min=0) ** (1 / gamma))[lit]
     return np.array((differences.mean(), np.median(differences)))
 
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from scenes import spiral_lights
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.explanations import decoding_ratio, explain, near_distance
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
+from splinecli.diagnosis.explanations import encoded_values, near_distance, near_lamps
 from splinecli.normals import unit
 from splinecli.transfer import encode_srgb
 
@@ -43,7 +43,7 @@ def scene(shape: str, *, widths: float | None = None, shine: float = 0.0) -> Sam
 
 
 def found(sample: Sample) -> list[CaptureWarning]:
-    return explain(sample, LIGHTS, linear=True, has_positions=False)
+    return [*encoded_values(sample, LIGHTS), *near_lamps(sample, LIGHTS)]
 
 
 @pytest.mark.parametrize("shape", ["ball", "relief"])
@@ -57,9 +57,8 @@ def test_right_captures_are_not_doubted(shape: str, shine: float) -> None:
 def test_encoded_values(shape: str, shine: float) -> None:
     linear = scene(shape, shine=shine)
     encoded = Sample(encode_srgb(linear.observations) / 255, linear.mask, 1)
-    (warning,) = found(encoded)
+    (warning,) = encoded_values(encoded, LIGHTS)
     assert warning.code == "encoded_values" and "--transfer srgb" in warning.text
-    assert explain(encoded, LIGHTS, linear=False, has_positions=True) == []
 
 
 @pytest.mark.parametrize(("widths", "shine"), [(2.0, 0.0), (3.0, 0.0), (4.0, 0.0), (2.0, 0.1), (3.0, 0.1)])
@@ -71,13 +70,12 @@ def test_near_lamps(widths: float, shine: float) -> None:
     (warning,) = found(near)
     assert warning.code == "lamps_near"
     assert f"--light-distance {distance[0]:.1f} --object-width 1" in warning.text
-    assert explain(near, LIGHTS, linear=True, has_positions=True) == []
 
 
 def test_too_little_is_not_judged() -> None:
     few = Sample(scene("ball").observations[:30], np.ones((5, 6), np.bool_), 1)
-    assert decoding_ratio(few.observations, LIGHTS) is None and near_distance(few, LIGHTS) is None
+    assert found(few) == []
     black = Sample(np.zeros((400, 10)), np.ones((20, 20), np.bool_), 1)
-    assert decoding_ratio(black.observations, LIGHTS) is None and near_distance(black, LIGHTS) is None
-    five = scene("relief", widths=3).observations[:, :5], LIGHTS[:5]
-    assert decoding_ratio(*five) is None
+    assert found(black) == []
+    five = Sample(scene("relief", widths=3).observations[:, :5], np.ones((SIZE, SIZE), np.bool_), 1)
+    assert encoded_values(five, LIGHTS[:5]) == [] == near_lamps(five, LIGHTS[:5])

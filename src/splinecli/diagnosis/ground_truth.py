@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import GROUND_TRUTH_FRAME, GROUND_TRUTH_Z, CaptureWarning
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
-from splinecli.capture.robust_fit import fit_robustly, lit_rows, shadow_weights
+from splinecli.capture.sample import Sample
+from splinecli.diagnosis.frame_evidence import rough_normals
 from splinecli.normals import angle_between_deg
 
 MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
@@ -15,28 +16,24 @@ MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
 leaves at most the second of it. On metals with interreflection, the angle reaches 30 degrees in the right frame."""
 
 _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) for frame in PLANE_FRAMES]
-_MAX_PIXELS, _DARK_SHARE, _FITS = 1000, 0.1, 5
 
 
 def check_ground_truth(
-    observations: NDArray[np.floating], light_directions: NDArray[np.float64], truth: NDArray[np.floating]
+    sample: Sample, light_directions: NDArray[np.float64], truth: NDArray[np.floating]
 ) -> list[CaptureWarning]:
-    """Return a warning if a ground truth (P, 3) fits observations (P, F) only in another frame, or an empty list.
+    """Return a warning if a ground truth (H, W, 3) fits a sample only in another frame, or an empty list.
 
     Args:
         light_directions: (F, 3).
-        truth: unit normals, or zero where there is no ground truth.
+        truth: of the whole images; unit normals, or zero where there is no ground truth.
     """
-    known = np.flatnonzero(truth.any(axis=1))
-    chosen = known[lit_rows(observations[known], _DARK_SHARE, _MAX_PIXELS)] if len(known) else known
-    values = observations[chosen].astype(np.float64)
-    chosen, values = chosen[values.any(axis=1)], values[values.any(axis=1)]
-    if not len(chosen):
+    truth = truth[:: sample.step, :: sample.step]
+    known = sample.mask & truth.any(axis=2)
+    if not known.any():
         return []
-    values /= values.max(axis=1, keepdims=True)
-    normals, _ = fit_robustly(values, shadow_weights(values), light_directions, _FITS)
+    normals = rough_normals(sample.observations, light_directions, sample.mask).normals[known]
     angles = [
-        float(np.median(angle_between_deg(normals, truth[chosen] @ frame.matrix.T))) for frame in _FRAMES
+        float(np.median(angle_between_deg(normals, truth[known] @ frame.matrix.T))) for frame in _FRAMES
     ]
     best = int(np.argmin(angles))
     if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from scenes import spiral_lights
-from splinecli.capture.image_checks import repeated_images
-from splinecli.capture.lights.light_check import light_spread
+from splinecli.diagnosis.checks import light_spread, repeated_images
 
 Array = NDArray[np.float64]
 SIZE = 96

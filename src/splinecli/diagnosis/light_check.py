@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.frame_evidence import RoughNormals, rough_normals
 from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, PLANE_FRAMES, LightFrame
-from splinecli.capture.lights.light_order import (
+from splinecli.diagnosis.frame_evidence import RoughNormals, rough_normals
+from splinecli.diagnosis.light_order import (
     MIN_LIGHTS,
     UNKNOWN_ORDER,
     check_order,
     shift_steps,
     shift_words,
 )
-from splinecli.capture.lights.odd_image import OddImage, find_odd_image
+from splinecli.diagnosis.odd_image import OddImage, find_odd_image
 
 Array = NDArray[np.float64]
 
@@ -184,16 +184,6 @@ def _check_frame_and_order(
     if order is not None and best is not None and best.frame is None:
         order, best = best.name, None  # one of several orders that fit, told by the normals
     return LightCheck((first, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight)
-
-
-def light_spread(light_directions: Array) -> tuple[float, bool]:
-    """Return how well lights (F, 3) determine a normal, and whether they lie in a cone rather than near a plane.
-
-    The first is their smallest singular value over sqrt(F): the error of a normal is about the error of an observation
-    over it. It is 0 for lights in one plane, 0.58 for lights that are spread over the whole sphere.
-    """
-    values = np.linalg.svd(light_directions, compute_uv=False) / np.sqrt(len(light_directions))
-    return float(values[-1]), bool(values[-2] < 2 * values[-1])
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.capture.image_shifts import ImageShift, find_shifts
 from splinecli.capture.sample import Sample
+from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 
 SIDE, N_LIGHTS = 90, 10
 

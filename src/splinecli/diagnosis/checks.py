@@ -1,0 +1,392 @@
+"""The checks of a capture's lights and images against each other, which `infer` and `info` make, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture, CaptureSource
+from splinecli.capture import capture_warnings as codes
+from splinecli.capture.capture_warnings import PROBABLY_WRONG, CaptureWarning
+from splinecli.capture.lights.light_fit import Factors, find_factors
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.restore.light_intensities import estimate_light_intensities
+from splinecli.capture.restore.light_refinement import would_refine
+from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
+from splinecli.diagnosis import explanations
+from splinecli.diagnosis.ground_truth import check_ground_truth
+from splinecli.diagnosis.image_shifts import ImageShift, find_shifts, shift_warning
+from splinecli.diagnosis.light_advice import light_warnings
+from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.errors import InputError
+from splinecli.normals import angle_between_deg
+from splinecli.solve_3x3 import solve_each
+
+SMALLEST_SPREAD = 0.1
+"""Lights that determine normals worse than this carry a warning; see light_spread."""
+
+MOST_BACKGROUND = 0.5
+"""Share of near black pixels above which a capture without a mask carries a warning."""
+
+LEAST_EXPECTED = 0.1
+"""Smallest expected share of normals within 5 degrees without a warning."""
+
+SAME_IMAGE = 1e-12
+"""One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""
+
+UNEQUAL_MISFIT, UNEQUAL_RATIO = 0.08, 0.5
+"""Light intensities are unequal if equal ones leave more than the first, as a share of the brightness, and those that
+fit best leave less than the second share of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class StatedLights:
+    """What files or arguments say about the lights of F images.
+
+    Args:
+        names: of the images.
+        directions: (N, 3), all lights of the file, in its order.
+        indices: (F,), those of the images.
+        origin: the file.
+        frame: the frame in which it was read.
+        intensities_measured: whether the intensities are given.
+        intensities_known: whether they are given, or the user says that they are equal.
+        linear: whether the values of the images are taken as linear.
+        lamps: all near lamps, over the grid of the sample that is checked; None if the lights count as distant.
+        has_positions: whether positions of lamps are known.
+    """
+
+    names: Sequence[str]
+    directions: NDArray[np.float64]
+    indices: Sequence[int]
+    origin: Path
+    frame: LightFrame
+    intensities_measured: bool
+    intensities_known: bool
+    linear: bool
+    lamps: NearLamps | None
+    has_positions: bool
+
+    @classmethod
+    def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
+        """Return what the files of a capture say about the images with these indices."""
+        used = source.lamps is not None and source.lamps.used
+        return cls(
+            names=[source.files.images[index].name for index in indices],
+            directions=source.light_directions,
+            indices=indices,
+            origin=source.files.light_directions,
+            frame=source.light_frame,
+            intensities_measured=source.intensities_measured,
+            intensities_known=source.intensities_known,
+            linear=source.radiometry.curve == 1,
+            lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
+            has_positions=source.lamps is not None,
+        )
+
+    @classmethod
+    def of_arrays(cls, capture: Capture, sample: Sample, *, intensities_measured: bool) -> StatedLights:
+        """Return what the arguments of splinecli.estimate_normals say."""
+        lamps = capture.lamps
+        if lamps is not None:
+            shape = (sample.mask.shape[0], sample.mask.shape[1])
+            lamps = replace(lamps, pixel_size=lamps.pixel_size * sample.step, shape=shape)
+        return cls(
+            names=[f"images[{index}]" for index in range(capture.n_lights)],
+            directions=capture.light_directions,
+            indices=range(capture.n_lights),
+            origin=Path("light_directions"),
+            frame=USUAL_FRAME,
+            intensities_measured=intensities_measured,
+            intensities_known=intensities_measured,
+            linear=True,
+            lamps=lamps,
+            has_positions=lamps is not None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A capture as the checks see it; what several of them need is found once.
+
+    Args:
+        lights: what is stated about the lights.
+        sample, closeup: without dark background, not divided by estimated intensities.
+        background: its share.
+        truth: (H, W, 3), the ground truth of the whole images, or None.
+        strict: also warn of what the images do not tell.
+    """
+
+    lights: StatedLights
+    sample: Sample
+    closeup: Sample
+    background: float = 0.0
+    truth: NDArray[np.floating] | None = None
+    strict: bool = False
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """The directions (F, 3) of the images' lights."""
+        return self.lights.directions[list(self.lights.indices)]
+
+    @cached_property
+    def observations(self) -> NDArray[np.floating]:
+        """The sample's observations (p, F) as they would be if near lamps were distant.
+
+        The surface counts as a plane. What a matte surface explains is exchanged; what it does not explain, such as
+        the misfit of lights in a wrong order, stays.
+        """
+        if self.lights.lamps is None:
+            return self.sample.observations
+        lamps = self.lights.lamps.choose_lights(self.lights.indices)
+        near, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
+        observations = self.sample.observations / strengths
+        scaled_normals = solve_each(observations, near)
+        return np.asarray(observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals))
+
+    @cached_property
+    def factors(self) -> Factors | None:
+        return find_factors(self.observations, intensities_known=self.lights.intensities_measured)
+
+    @cached_property
+    def evened(self) -> Sample:
+        """The sample, divided by the intensities that fit best where nobody measured them.
+
+        They are not the fault of directions and values.
+        """
+        intensities = 1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
+        return replace(self.sample, observations=self.observations / intensities)
+
+    @cached_property
+    def light_check(self) -> LightCheck:
+        lights = self.lights
+        return check_lights(
+            self.observations, self.sample.mask, lights.directions, lights.indices, lights.names, self.factors
+        )
+
+    @cached_property
+    def shifts(self) -> list[ImageShift]:
+        return find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])
+
+
+Check = Callable[[Evidence], list[CaptureWarning]]
+
+
+def shifted_images(seen: Evidence) -> list[CaptureWarning]:
+    return [shift_warning(seen.shifts, seen.lights.names)] if seen.shifts else []
+
+
+def odd_image(seen: Evidence) -> list[CaptureWarning]:
+    """Warn of an image that contradicts the others, and is not only shifted."""
+    odd = seen.light_check.odd_image
+    if odd is None or odd.place in [shift.place for shift in seen.shifts]:
+        return []
+    how = "" if odd.brightness is None else f" and is {odd.brightness:.2f} times as bright as they predict"
+    text = (
+        f"{seen.lights.names[odd.place]} contradicts the other images{how}: without it, {100 * odd.left:.0f} % of what"
+        " the lights cannot explain is left. Its lamp was moved or failed, its exposure differs, or a shadow fell on"
+        " the object. Photograph it again, or leave it out."
+    )
+    return [CaptureWarning(codes.IMAGE_ODD, text)]
+
+
+def lights_in_question(seen: Evidence) -> list[CaptureWarning]:
+    return light_warnings(seen.light_check, seen.lights.frame, seen.lights.origin, strict=seen.strict)
+
+
+def missing_mask(seen: Evidence) -> list[CaptureWarning]:
+    if seen.background <= MOST_BACKGROUND:
+        return []
+    text = (
+        f"There is no mask, and {100 * seen.background:.0f} % of the pixels are near black: the normals of this"
+        " background mean nothing. Add --auto-mask, or give a mask."
+    )
+    return [CaptureWarning(codes.NO_MASK, text)]
+
+
+def crowded_lights(seen: Evidence) -> list[CaptureWarning]:
+    spread, in_cone = light_spread(seen.directions)
+    if spread >= SMALLEST_SPREAD:
+        return []
+    where = "lie in a narrow cone" if in_cone else "lie nearly in one plane with the object"
+    text = (
+        f"The lights {where}, so noise and small errors of their directions grow about {1 / max(spread, 1e-3):.0f}"
+        " times in the normals. Add lights from other sides."
+    )
+    return [CaptureWarning(codes.LIGHTS_CROWDED, text)]
+
+
+def same_images(seen: Evidence) -> list[CaptureWarning]:
+    pairs = repeated_images(seen.sample.observations)
+    if not pairs:
+        return []
+    first, second = (seen.lights.names[place] for place in pairs[0])
+    more = f" (and {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
+    text = (
+        f"{first} and {second} are the same image{more}, but their lights differ. Remove one, or replace it by its"
+        " own photograph."
+    )
+    return [CaptureWarning(codes.REPEATED_IMAGES, text)]
+
+
+def ground_truth(seen: Evidence) -> list[CaptureWarning]:
+    return [] if seen.truth is None else check_ground_truth(seen.evened, seen.directions, seen.truth)
+
+
+def encoded_values(seen: Evidence) -> list[CaptureWarning]:
+    return explanations.encoded_values(seen.evened, seen.directions) if seen.lights.linear else []
+
+
+def near_lamps(seen: Evidence) -> list[CaptureWarning]:
+    return [] if seen.lights.has_positions else explanations.near_lamps(seen.evened, seen.directions)
+
+
+def rough_lights(seen: Evidence) -> list[CaptureWarning]:
+    """Suggest to refine the lights where this makes them fit much better."""
+    if seen.lights.has_positions:
+        return []
+    refined = would_refine(seen.observations, seen.factors, seen.directions)
+    if refined is None:
+        return []
+    moved_deg = angle_between_deg(refined.directions, seen.directions)
+    text = (
+        f"The light directions are probably rough: others, {moved_deg.mean():.1f} degrees away on average, leave"
+        f" {100 * refined.fit_ratio:.0f} % of the misfit. Try --refine-lights."
+    )
+    return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
+
+
+def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
+    """Warn of intensities that are unequal, but that the images do not determine."""
+    if seen.lights.intensities_known or seen.factors is None:
+        return []
+    equal, free = (
+        float(replace(seen.factors, intensities_known=known).misfits(seen.directions[None])[0])
+        for known in (True, False)
+    )
+    if equal < UNEQUAL_MISFIT or free > UNEQUAL_RATIO * equal:
+        return []
+    observations = np.asarray(seen.observations, np.float32)
+    if estimate_light_intensities(observations, None, seen.directions) is not None:
+        return []
+    text = (
+        f"The lights look unequally bright: other intensities leave {100 * free / equal:.0f} % of the misfit, but the"
+        " images do not determine them, so they count as equal. Measure them with calibrate --gray-card, or give them"
+        " with --intensities FILE."
+    )
+    return [CaptureWarning(codes.UNEQUAL_INTENSITIES, text)]
+
+
+DOUBTED = frozenset(
+    {codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_CROWDED}
+)
+"""After these warnings, nothing that relies on the lights can be told."""
+
+EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
+
+CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
+    (shifted_images, frozenset()),
+    (odd_image, frozenset()),
+    (lights_in_question, frozenset()),
+    (missing_mask, frozenset()),
+    (crowded_lights, frozenset()),
+    (same_images, frozenset()),
+    (ground_truth, frozenset()),
+    (encoded_values, DOUBTED),
+    (near_lamps, EXPLAINED),
+    (rough_lights, EXPLAINED | {codes.LAMPS_NEAR}),
+    (unequal_intensities, EXPLAINED | {codes.LAMPS_NEAR}),
+)
+"""The checks, and the codes of earlier warnings after which each is skipped."""
+
+
+def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
+    """Return warnings about a capture that was read from this source; see check_sample."""
+    sample, closeup = _samples(capture)
+    lights = StatedLights.of_source(source, sample, capture.light_indices)
+    return check_sample(lights, sample, closeup, truth=capture.ground_truth, strict=strict)[1]
+
+
+def check_arrays(capture: Capture, *, intensities_measured: bool) -> list[CaptureWarning]:
+    """Return warnings about a capture that was made from arrays; see check_sample."""
+    sample, closeup = _samples(capture)
+    lights = StatedLights.of_arrays(capture, sample, intensities_measured=intensities_measured)
+    return check_sample(lights, sample, closeup)[1]
+
+
+def _samples(capture: Capture) -> tuple[Sample, Sample]:
+    """Return a sample and a closeup of a capture."""
+    sample = sample_observations(capture.observations, capture.mask)
+    if capture.estimated_intensities is not None:
+        # They were estimated under the lights that are in question.
+        sample = replace(sample, observations=sample.observations * capture.estimated_intensities)
+    return sample, take_closeup(capture.observations, capture.mask)
+
+
+def check_sample(
+    lights: StatedLights,
+    sample: Sample,
+    closeup: Sample,
+    *,
+    truth: NDArray[np.floating] | None = None,
+    strict: bool = False,
+) -> tuple[LightCheck, list[CaptureWarning]]:
+    """Return what a sample and a closeup of some images say about their lights, and all warnings.
+
+    Args:
+        sample: its observations are not divided by estimated intensities.
+        truth: (H, W, 3), the ground truth of the capture.
+        strict: also warn of what the images do not tell.
+    """
+    (sample, background), (closeup, _) = leave_out_background(sample), leave_out_background(closeup)
+    seen = Evidence(lights, sample, closeup, background, truth, strict)
+    warnings: list[CaptureWarning] = []
+    for check, unless in CHECKS:
+        if unless.isdisjoint(warning.code for warning in warnings):
+            warnings += check(seen)
+    return seen.light_check, warnings
+
+
+def light_spread(light_directions: NDArray[np.float64]) -> tuple[float, bool]:
+    """Return how well lights (F, 3) determine a normal, and whether they lie in a cone rather than near a plane.
+
+    The first is their smallest singular value over sqrt(F): the error of a normal is about the error of an observation
+    over it. It is 0 for lights in one plane, 0.58 for lights that are spread over the whole sphere.
+    """
+    values = np.linalg.svd(light_directions, compute_uv=False) / np.sqrt(len(light_directions))
+    return float(values[-1]), bool(values[-2] < 2 * values[-1])
+
+
+def repeated_images(observations: NDArray[np.floating]) -> list[tuple[int, int]]:
+    """Return the pairs of images among observations (P, F) that are equal up to a scale, and not uniform."""
+    values = observations.astype(np.float64)
+    values = values / np.maximum(np.linalg.norm(values, axis=0), 1e-300)
+    varied = np.ptp(values, axis=0) > 0
+    same = (1 - values.T @ values < SAME_IMAGE) & varied & varied[:, None]
+    return [(int(first), int(second)) for first, second in np.argwhere(np.triu(same, 1))]
+
+
+def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
+    """Warn of a capture of which the network expects hardly any normal to be right; None is a method without this."""
+    if expected_under_5 is None or expected_under_5 >= LEAST_EXPECTED:
+        return []
+    text = (
+        f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5 degrees. The lights,"
+        " the mask or the images are probably wrong: see docs/troubleshooting.md."
+    )
+    return [CaptureWarning(codes.LOW_CONFIDENCE, text)]
+
+
+def refuse_if_strict(warnings: Iterable[CaptureWarning], name: str, *, strict: bool) -> None:
+    """Raise InputError for the first warning that says that an input is probably wrong, if `strict`."""
+    wrong = next((warning for warning in warnings if warning.code in PROBABLY_WRONG), None)
+    if strict and wrong is not None:
+        raise InputError(
+            f"{name}: {wrong.text.removesuffix('.')}", hint="Leave --strict out to go on nevertheless"
+        )
