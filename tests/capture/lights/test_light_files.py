@@ -153,6 +153,11 @@ def test_gray_intensities_count_for_every_channel(tmp_path: Path, text: str) -> 
     ("text", "line", "message"),
     [
         ("1 1 1\n1 0 1\n1 1 1\n1 1 1", 2, "found the intensity 0, expected a number above 0."),
+        (
+            "1 1 1\n1 1e308 1\n1 1 1\n1 1 1",
+            2,
+            "found the intensity 1e+308, expected a number from 1e-12 to 1e+12.",
+        ),
         ("1 1 1 1\n1 1 -2 1\n1 1 1 1", 2, "found the intensity -2 in column 3, expected a number above 0."),
         ("1 1\n1 1\n1 1\n1 1", 1, "found 2 columns, expected 3 (R G B) or 1 (gray)."),
         ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", 2, 'found "inf", expected a finite number.'),
