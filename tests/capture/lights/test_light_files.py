@@ -143,6 +143,7 @@ def test_gray_intensities_count_for_every_channel(tmp_path: Path, text: str) -> 
         ("1 1\n1 1\n1 1\n1 1", ":1: found 2 columns, expected 3 (R G B) or 1 (gray)."),
         ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", ':2: found "inf", expected a finite number.'),
         ("1 1 1\n1 1 1", ": found 2 light intensities, expected 4, one for each image."),
+        ("1 1 1\n1 1e308 1\n1 1 1\n1 1 1", ":2: found the intensity 1e+308, expected a number from 1e-12 to"),
     ],
 )
 def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:

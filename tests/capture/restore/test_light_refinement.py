@@ -42,6 +42,15 @@ def test_matte_pixels_determine_lights_up_to_a_rotation(sigma_deg: float, matte_
     np.testing.assert_allclose(found.intensities, 1, atol=1e-6)
 
 
+def test_a_light_that_no_pixel_shows_stays(matte_pixels: Pixels) -> None:
+    _, lights, observations = matte_pixels
+    given, black = rough(lights, 4.0), observations.astype(np.float32)
+    black[:, 5] = 0
+    found = refine_lights(black, given)
+    assert found is not None and np.isfinite(found.directions).all()
+    assert angle_between_deg(found.directions, given)[5] < 0.1
+
+
 def test_unknown_intensities_are_refined_too(matte_pixels: Pixels) -> None:
     _, lights, observations = matte_pixels
     strengths = np.random.default_rng(3).uniform(0.85, 1.15, 12)

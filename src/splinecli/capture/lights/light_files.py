@@ -35,6 +35,7 @@ from splinecli.errors import InputError
 
 NPY = ".npy"
 
+_STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
 _FILE = "a text file with a line {} for each image"
 
 
@@ -165,15 +166,17 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
     A single number for each light is used for all three channels.
 
     Raises:
-        InputError: as for read_light_directions; also with the line, for an intensity that is not above zero.
+        InputError: as for read_light_directions; also with the line, for an intensity that is no usable number.
     """
     table = _drop_count_line(read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images)
     names = {3: "R G B", 1: "gray"}
     intensities, transposed = _one_light_a_row(table, names, "light intensities", n_images)
-    for light, channel in np.argwhere(intensities <= 0):
+    for light, channel in np.argwhere((intensities < 1 / _STRONGEST) | (intensities > _STRONGEST)):
+        value = intensities[light, channel]
         place = f" in column {light + 1}" if transposed else ""
         raise InputError(
-            f"found the intensity {intensities[light, channel]:g}{place}, expected a number above 0",
+            f"found the intensity {value:g}{place}, expected a number"
+            f" {'above 0' if value <= 0 else f'from {1 / _STRONGEST:g} to {_STRONGEST:g}'}",
             path=table.path,
             line=table.lines[channel if transposed else light],
         )

@@ -228,7 +228,8 @@ def _move_lights(
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T
     variance = (weights * residuals**2).sum() / weights.sum()
-    scale = _WORTH_PIXELS / (weights.sum(axis=0) * max(variance, 1e-12))
+    # A light that no pixel shows keeps its given vector.
+    scale = _WORTH_PIXELS / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
     curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
     gradient = ((weights * residuals).T @ normals) * scale[:, None]
     pull = np.einsum("fij,fj->fi", precision, given - lights)
