@@ -254,15 +254,6 @@ def test_distilled(capture, run):
     assert "method ls gives no confidence and cannot be distilled" in refused.err
 
 
-def test_three_lights_are_warned_about(capture, run):
-    result = run("infer", capture, "--light-indices", "1,2,3")
-    assert result.code == 0
-    assert "trained with 4 to 96 lights, not 3" in result.err
-    (warning,) = read_report(Path("out/sphere"))["warnings"]
-    assert warning["code"] == "untrained_lights"
-    assert "trained with 4" in warning["text"]
-
-
 def test_overwriting_keeps_other_files_and_drops_stale_ones(capture, run):
     run("infer", capture, "--method", "ls")
     Path("out/sphere/notes.txt").write_text("mine")

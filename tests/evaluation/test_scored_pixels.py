@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from splinecli.capture import Capture
 from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
-from splinecli.errors import InputError
 from splinecli.evaluation.scored_pixels import scored_rows
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
@@ -50,8 +47,3 @@ def test_a_part_of_the_pixels(capture: Capture) -> None:
         assert set(part) <= set(scored_rows(capture))
     np.testing.assert_array_equal(parts[0], parts[1])
     assert (parts[0] != parts[2]).any()
-
-
-def test_without_ground_truth(capture: Capture) -> None:
-    with pytest.raises(InputError, match="c: the capture has no ground truth"):
-        scored_rows(replace(capture, ground_truth=None))

@@ -48,20 +48,6 @@ def test_a_toml_file_over_a_preset(tmp_path: Path) -> None:
     )
 
 
-def test_presets_then_files_then_changes_in_their_order(tmp_path: Path) -> None:
-    file = write(tmp_path / "a.toml", "seed = 1\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n")
-    changes: list[dict[str, Any]] = [
-        {"seed": 2, "pixels": {"ambient_share": 0.1}},
-        {"seed": 3},
-        {"pixels": {"ambient_share": 0.2}},
-    ]
-    config = configure(None, file, changes)
-    assert (config.seed, config.batch_size) == (3, 64)
-    assert (config.pixels.wall_share, config.pixels.ambient_share) == (0.3, 0.2)
-    assert configure(None, file, changes[:1]).seed == 2
-    assert configure(None, file).seed == 1
-
-
 def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
     file = write(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
     assert configure(None, file).sources == {"/data/a": 2.0, "/data/b": 1.0}

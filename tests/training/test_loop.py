@@ -114,14 +114,6 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(
             )
 
 
-def test_a_folder_that_holds_a_run_is_left_alone(tiny: TrainingConfig, tmp_path: Path) -> None:
-    Trainer(tiny, tmp_path, CPU).save()
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(OutputError, match="already contains a run"):
-        Trainer(replace(tiny, steps=9), tmp_path, CPU)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
 def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_path: Path) -> None:
     first = Trainer(tiny, tmp_path / "first", CPU)
     first.run()

@@ -56,22 +56,6 @@ def test_five_steps_for_ne_net_then_one_for_li_net(tiny: TrainingConfig) -> None
     assert preset("paper").ne_net_updates == 5
 
 
-@pytest.mark.parametrize("part", ["both", "ne_net", "li_net"])
-def test_only_the_part_gets_gradients(
-    tiny: TrainingConfig, network: SplineNet, batch: PixelBatch, part: Part
-) -> None:
-    config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-4)
-    compute_losses(network, batch, config, part=part).total.backward()
-    for name in ("li_net", "ne_net"):
-        parameters = list(getattr(network, name).parameters())
-        if part in ("both", name):
-            assert all(p.grad is not None for p in parameters)
-            assert moved(getattr(network, name))
-        else:
-            assert all(p.grad is None for p in parameters)
-    assert all(p.requires_grad for p in network.parameters())
-
-
 def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny: TrainingConfig, tmp_path: Path) -> None:
     config = replace(
         tiny, updates="alternating", ne_net_updates=2, weight_decay=0.1, learning_rate=1e-2,
