@@ -7,7 +7,6 @@ from pathlib import Path
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.cli.options.values import parse_circle
-from splinecli.cli.reading_limits import limit_reading
 from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
 
@@ -20,7 +19,6 @@ def calibrate(
     gray_ball: Path | None = inputs.GRAY_BALL,
     gray_card: Path | None = inputs.GRAY_CARD,
     transfer: str = inputs.GRAY_TRANSFER,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
     compare: Path | None = outputs.COMPARE,
     output: Path = outputs.CALIBRATION_FOLDER,
     overwrite: bool = outputs.OVERWRITE,
@@ -38,7 +36,6 @@ def calibrate(
     With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
     light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
-    limit_reading(max_pixels_per_image)
     options = CalibrateOptions(
         balls=tuple(balls),
         circles=tuple(parse_circle(text) for text in circle or ()),

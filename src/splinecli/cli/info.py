@@ -7,7 +7,6 @@ from pathlib import Path
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.cli.options.values import LightForm, as_text
-from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import InputError
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
@@ -33,8 +32,6 @@ def info(
     light_frame: str | None = inputs.LIGHT_FRAME,
     lights_format: LightForm = inputs.LIGHTS_FORMAT,
     check_lights: bool = inputs.CHECK_LIGHTS,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
-    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     plot: Path | None = outputs.LIGHT_PLOT,
     overwrite: bool = outputs.OVERWRITE_PLOT,
     strict: bool = outputs.STRICT,
@@ -48,7 +45,6 @@ def info(
     """
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
 
-    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
     reading = InferOptions(
         lights=as_text(lights),
         intensities=as_text(intensities),

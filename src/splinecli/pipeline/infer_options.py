@@ -11,8 +11,7 @@ from splinecli.errors import UsageError
 from splinecli.exr import check_exr
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.normals import Convention
-from splinecli.pipeline.surface import check_decimation, check_surface_options
-from splinecli.surface.surface_files import DEFAULT_MESHES, MESH_FILES
+from splinecli.pipeline.surface import check_pixel_size
 from splinecli.transfer import AUTOMATIC, parse_transfer
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ Precision = Literal["auto", "float32", "bfloat16"]
 class InferOptions:
     """How `infer` reads a capture, estimates its normals, and what it writes.
 
-    Two records are equal if they give the same results. `output`, `device` and `batch_size` do not count.
+    Two records are equal if they give the same results. `output` and `device` do not count.
 
     Args:
         lights, mask, ground_truth: files that replace those of the capture.
@@ -38,7 +37,7 @@ class InferOptions:
         strict: fail where a warning says that the lights or images are probably wrong.
         light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.
             With `surface`, pixel_size is in millimetres and scales the surface, too.
-        refine_lights: refine rough light directions. light_error_deg: their usual error; None for the default.
+        refine_lights: refine rough light directions.
         auto_mask: find the object where the capture has no mask.
         crop: the box X,Y,W,H of the images that is read; None for whole images.
         scale: 1/N to read one of N rows and columns; None for all.
@@ -52,14 +51,11 @@ class InferOptions:
         light_indices: use these lights, counted from 0.
         method: a name that `splinecli.methods.method_names` lists.
         weights: a shipped name or a file. None for the method's own.
-        rotations, batch_size: of a network. None for the method's own.
         distil: learn the network on a sample of the pixels; False for the network on every pixel, None for the faster.
         output: results go to `output`/<capture name>/.
         formats: names of `splinecli.results.files.NORMALS`. With exr, albedo and depth are EXR files, too.
         maps: names of `splinecli.results.files.MAPS`.
         html: also write page.html. surface: also write the depth map and the mesh.
-        mesh_formats: of the surface: keys of `splinecli.surface.surface_files.MESH_FILES`.
-        decimate: the number of triangles that the mesh is reduced to. None keeps all.
         convention: direction of the green channel in PNG files.
 
     Raises:
@@ -74,7 +70,6 @@ class InferOptions:
     object_width: float | None = None
     camera_matrix: str | None = None
     refine_lights: bool = False
-    light_error_deg: float | None = None
     mask: str | None = None
     auto_mask: bool = False
     crop: str | None = None
@@ -92,9 +87,7 @@ class InferOptions:
     light_indices: tuple[int, ...] | None = None
     method: str = DEFAULT_METHOD
     weights: str | None = None
-    rotations: int | None = None
     distil: bool | None = None
-    batch_size: int | None = field(default=None, compare=False)
     device: Device = field(default="auto", compare=False)
     precision: Precision = "auto"
     output: str = field(default="out", compare=False)
@@ -102,8 +95,6 @@ class InferOptions:
     maps: tuple[str, ...] = ()
     html: bool = False
     surface: bool = False
-    mesh_formats: tuple[str, ...] = DEFAULT_MESHES
-    decimate: int | None = None
     convention: Convention = "opengl"
     strict: bool = False
 
@@ -111,7 +102,6 @@ class InferOptions:
         from splinecli.capture.lights.draws import check_draw_settings
         from splinecli.capture.lights.light_frames import parse_light_frame
         from splinecli.capture.record import check_light_indices
-        from splinecli.capture.restore.light_refinement import check_light_error
         from splinecli.capture.restore.white_level import check_white_level
         from splinecli.capture.window import parse_window
         from splinecli.results.files import MAPS, NORMALS
@@ -121,15 +111,8 @@ class InferOptions:
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         _ = self.lamps, parse_window(self.crop, self.scale)
-        check_light_error(self.light_error_deg, refines=self.refine_lights)
         check_method(self.method)
-        check_surface_options(self.decimate, self.pixel_size if self.surface else None)
-        for option, given in (
-            ("decimate", self.decimate),
-            ("mesh-format", self.mesh_formats != DEFAULT_MESHES),
-        ):
-            if given and not self.surface:
-                raise UsageError(f"--{option} concerns the mesh", hint="Add --surface, or leave it out")
+        check_pixel_size(self.pixel_size if self.surface else None)
         if self.n_lights is not None:
             check_draw_settings(self.n_lights, 1, self.seed)
         if self.light_indices is not None:
@@ -145,8 +128,6 @@ class InferOptions:
             _check_one_of("format", name, NORMALS)
         for name in self.maps:
             _check_one_of("map", name, MAPS)
-        for name in self.mesh_formats:
-            _check_one_of("mesh format", name, MESH_FILES)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as JSON values."""
@@ -165,7 +146,7 @@ class InferOptions:
     @property
     def method_options(self) -> MethodOptions:
         """The part of the options that concerns the method."""
-        return MethodOptions(self.weights, self.rotations, self.batch_size, self.device, self.precision)
+        return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
     @property
     def lamps(self) -> LampOptions:
@@ -195,7 +176,6 @@ class InferOptions:
             if name is not None:
                 check_file(Path(name), "a file", pipe=name == self.lights)
         self.radiometric_calibration()
-        check_decimation(self.decimate)
         check_exr(self.formats)
 
     def radiometric_calibration(self) -> RadiometricCalibration:
