@@ -7,6 +7,7 @@ from pathlib import Path
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.cli.options.values import parse_circle
+from splinecli.cli.records import record_from
 from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
 
@@ -36,18 +37,11 @@ def calibrate(
     With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
     light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
-    options = CalibrateOptions(
-        balls=tuple(balls),
+    options = record_from(
+        CalibrateOptions,
+        locals(),
         circles=tuple(parse_circle(text) for text in circle or ()),
         masks=tuple(mask or ()),
-        ball_diameter=ball_diameter,
-        camera_matrix=camera_matrix,
-        gray_ball=gray_ball,
-        gray_card=gray_card,
-        transfer=transfer,
-        compare=compare,
-        output=output,
-        overwrite=overwrite,
     )
     report = calibrate_lights(options, Messages(quiet=quiet))
     print_report(report, str(output / DIRECTIONS), as_json=as_json, quiet=quiet)

@@ -16,6 +16,7 @@ from splinecli.cli.options.values import (
     parse_pixel,
     parse_skip,
 )
+from splinecli.cli.records import record_from
 from splinecli.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,10 +60,14 @@ def evaluate(
     give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the command again to go on, or with more
     trials, methods or lights. A capture that cannot be scored is skipped with a message, and the exit code is then 3.
     """
+    given = locals()
+
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
     from splinecli.pipeline.evaluate import EvaluateOptions, evaluate_captures
 
-    options = EvaluateOptions(
+    options = record_from(
+        EvaluateOptions,
+        given,
         methods=tuple(
             name
             for text in method or [DEFAULT_METHOD]
@@ -71,20 +76,8 @@ def evaluate(
         method_options=MethodOptions(weights, rotations, device=device.value, precision=precision.value),
         n_lights=tuple(parse_light_count(text) for text in n_lights or []),
         light_noise_deg=tuple(light_noise_deg or [0.0]),
-        trials=trials,
-        seed=seed,
-        draws=None if draws is None else str(draws),
-        max_pixels=max_pixels,
         skip_first=dict(parse_skip(text) for text in skip_first or []),
-        refine_lights=refine_lights,
-        light_error_deg=light_error_deg,
-        as_stored=as_stored,
-        white_level=white_level,
-        jobs=jobs,
-        figures=figures,
         pixels=tuple(parse_pixel(text) for text in pixel or []),
-        output=str(output),
-        overwrite=overwrite,
         cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
     )
     talk = Messages(quiet=quiet)

@@ -16,11 +16,11 @@ from splinecli.cli.options.values import (
     LightForm,
     NormalConvention,
     Precision,
-    as_text,
     parse_cluster,
     parse_indices,
     split_commas,
 )
+from splinecli.cli.records import record_from
 from splinecli.errors import UsageError, printable
 
 if TYPE_CHECKING:
@@ -94,6 +94,8 @@ def infer(
     keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
     The exit code is that of the most serious failure.
     """
+    given = locals()
+
     from splinecli.pipeline.batch import infer_batch
     from splinecli.pipeline.capture_list import Shard
     from splinecli.pipeline.infer_options import InferOptions
@@ -103,42 +105,13 @@ def infer(
             raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
         if overwrite and update:
             raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
-        options = InferOptions(
-            lights=as_text(lights),
-            intensities=as_text(intensities),
-            refine_lights=refine_lights,
-            light_positions=as_text(light_positions),
-            light_distance=light_distance,
-            pixel_size=pixel_size,
-            object_width=object_width,
-            camera_matrix=as_text(camera_matrix),
-            mask=as_text(mask),
-            auto_mask=auto_mask,
-            crop=crop,
-            scale=scale,
-            ground_truth=as_text(ground_truth),
-            transfer=transfer,
-            ambient=as_text(ambient),
-            flat_field=as_text(flat_field),
-            white_level=white_level,
-            as_stored=as_stored,
-            n_lights=n_lights,
+        options = record_from(
+            InferOptions,
+            given,
             seed=seed if n_lights is not None else 0,
             light_indices=None if light_indices is None else _indices(light_indices),
-            method=method,
-            weights=weights,
-            distil=distil,
-            device=device.value,
-            precision=precision.value,
-            output=str(output),
             formats=tuple(split_commas(formats, "--format", choices.normal_formats())),
             maps=() if maps is None else tuple(split_commas(maps, "--maps", choices.maps())),
-            html=html,
-            surface=surface,
-            convention=convention.value,
-            light_frame=light_frame,
-            lights_format=lights_format.value,
-            strict=strict,
         )
         messages = Messages(quiet=quiet)
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
-from splinecli.cli.options.values import LightForm, as_text
+from splinecli.cli.options.values import LightForm
+from splinecli.cli.records import record_from
 from splinecli.errors import InputError
-from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
+from splinecli.pipeline.reading import Reading
 
 
 def info(
@@ -43,31 +44,11 @@ def info(
     Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
     the angles of the lights from the camera axis, and the memory and time that infer needs. Writes only the plot.
     """
+    given = locals()
+
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
 
-    reading = InferOptions(
-        lights=as_text(lights),
-        intensities=as_text(intensities),
-        light_positions=as_text(light_positions),
-        light_distance=light_distance,
-        pixel_size=pixel_size,
-        object_width=object_width,
-        camera_matrix=as_text(camera_matrix),
-        mask=as_text(mask),
-        crop=crop,
-        scale=scale,
-        ground_truth=as_text(ground_truth),
-        transfer=transfer,
-        ambient=as_text(ambient),
-        flat_field=as_text(flat_field),
-        white_level=white_level,
-        light_frame=light_frame,
-        lights_format=lights_format.value,
-        strict=strict,
-    )
-    options = InfoOptions(
-        capture=capture, reading=reading, plot=plot, overwrite=overwrite, check_lights=check_lights
-    )
+    options = record_from(InfoOptions, given, reading=record_from(Reading, given))
     messages = Messages(quiet=quiet)
     report = describe_capture(options, messages)
     print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)
