@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -76,3 +77,9 @@ class OutputError(SplinecliError):
     """An output cannot be written (exit code 5)."""
 
     exit_code = 5
+
+
+def check_one_of(what: str, value: str, allowed: Collection[str]) -> None:
+    """Raise UsageError for a value that is not allowed."""
+    if value not in allowed:
+        raise UsageError(f"no {what} named {value!r}; expected one of {', '.join(allowed)}")

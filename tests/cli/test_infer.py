@@ -85,13 +85,11 @@ def test_a_surface_in_the_albedo_s_colours(capture, run):
     np.testing.assert_array_equal(np.load("again/depth.npy"), depth)
 
 
-def test_a_decimated_surface_in_millimetres(capture, run):
-    arguments = ["--surface", "--mesh-format", "stl", "--decimate", 50, "--pixel-size", 0.1]
+def test_a_surface_in_millimetres(capture, run):
+    arguments = ["--surface", "--pixel-size", 0.1]
     assert run("infer", capture, "--method", "ls", *arguments).code == 0
     surface = read_report(Path("out/sphere"))["surface"]
-    assert (surface["unit"], surface["pixel_size_mm"], surface["normal_texture"]) == ("millimetre", 0.1, True)
-    assert surface["n_triangles"] <= 50
-    assert sorted(path.suffix for path in Path("out/sphere").glob("mesh.*")) == [".stl"]
+    assert (surface["unit"], surface["pixel_size_mm"]) == ("millimetre", 0.1)
     middle, rim = np.load("out/sphere/depth.npy")[11:13, 11:13].mean(), surface["range"][0]
     assert middle - rim == pytest.approx(0.1 * 12 / (2 * 2.5), rel=0.1)
     # One of two rows and columns are read: each pixel of the map is as wide as two of the photographs.
@@ -104,10 +102,7 @@ def test_a_decimated_surface_in_millimetres(capture, run):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--decimate", 50], "--decimate concerns the mesh. Add --surface, or leave it out"),
-        (["--mesh-format", "stl"], "--mesh-format concerns the mesh"),
         (["--pixel-size", 1], "--pixel-size concerns near lamps"),
-        (["--surface", "--decimate", 0], "--decimate is 0, expected"),
         (["--surface", "--pixel-size", 1e9], "the pixel size is 1e+09 mm, expected"),
     ],
 )

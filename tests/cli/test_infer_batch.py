@@ -192,9 +192,7 @@ def test_options_are_written_and_read_back(capture, run):
     assert pickle.loads(pickle.dumps(options)) == options
     assert infer_capture(capture, options)["options"] == options.as_dict()
     assert read_report(Path("elsewhere/sphere"))["options"] == options.as_dict()
-    assert options == InferOptions.from_dict(
-        {**options.as_dict(), "output": "x", "device": "cpu", "batch_size": 7}
-    )
+    assert options == InferOptions.from_dict({**options.as_dict(), "output": "x", "device": "cpu"})
     assert options != InferOptions.from_dict({**options.as_dict(), "seed": 4})
     for wrong in (
         {"formats": ("bmp",)},

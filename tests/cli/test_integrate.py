@@ -121,7 +121,7 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     np.savetxt("lamps.txt", BUMP_LAMPS)
     Path("camera.txt").write_text("100 0 15.5\n0 100 15.5\n0 0 1\n")
     folder = write_bump(Path("bump")) if "lamps.txt" in VIEWS[view] else capture
-    arguments = ["--method", "ls", "--maps", "albedo", "--surface", "--mesh-format", "ply,glb", "--json"]
+    arguments = ["--method", "ls", "--maps", "albedo", "--surface", "--json"]
     [report] = json.loads(run("infer", folder, *VIEWS[view].split(), *arguments).out)
     Path("camera.txt").unlink()
     places = (Path("out") / folder, Path("again"))
@@ -233,8 +233,6 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     result = run("infer", capture, "--method", "ls", "--mask", "line.png", "--surface")
     assert (result.code, "the mesh has no triangles" in result.err) == (3, True)
     assert not Path("out/sphere/report.json").exists()
-    line = ("infer", capture, "--method", "ls", "--mask", "line.png", "--surface", "--mesh-format", "stl")
-    assert run(*line).code == 0
 
     assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
     n_pixels = json.loads(Path("out/sphere/report.json").read_text())["n_pixels"]

@@ -24,7 +24,7 @@ def check(document: Any, name: str) -> None:
     "arguments",
     [
         ["--method", "ls", "--surface", "--maps", "albedo"],
-        ["--method", "spline-net-pixelwise", "--light-indices", "0,1,2,3", "--rotations", 1],
+        ["--method", "spline-net-pixelwise", "--light-indices", "0,1,2,3"],
     ],
 )
 def test_reports_of_infer(capture, run, arguments):

@@ -7,7 +7,7 @@ from pathlib import Path
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
 from splinecli.cli.options.values import parse_circle
-from splinecli.cli.reading_limits import limit_reading
+from splinecli.cli.records import record_from
 from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
 
@@ -20,7 +20,6 @@ def calibrate(
     gray_ball: Path | None = inputs.GRAY_BALL,
     gray_card: Path | None = inputs.GRAY_CARD,
     transfer: str = inputs.GRAY_TRANSFER,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
     compare: Path | None = outputs.COMPARE,
     output: Path = outputs.CALIBRATION_FOLDER,
     overwrite: bool = outputs.OVERWRITE,
@@ -38,19 +37,11 @@ def calibrate(
     With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
     light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
-    limit_reading(max_pixels_per_image)
-    options = CalibrateOptions(
-        balls=tuple(balls),
+    options = record_from(
+        CalibrateOptions,
+        locals(),
         circles=tuple(parse_circle(text) for text in circle or ()),
         masks=tuple(mask or ()),
-        ball_diameter=ball_diameter,
-        camera_matrix=camera_matrix,
-        gray_ball=gray_ball,
-        gray_card=gray_card,
-        transfer=transfer,
-        compare=compare,
-        output=output,
-        overwrite=overwrite,
     )
     report = calibrate_lights(options, Messages(quiet=quiet))
     print_report(report, str(output / DIRECTIONS), as_json=as_json, quiet=quiet)

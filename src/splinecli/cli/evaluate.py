@@ -16,7 +16,7 @@ from splinecli.cli.options.values import (
     parse_pixel,
     parse_skip,
 )
-from splinecli.cli.reading_limits import limit_reading
+from splinecli.cli.records import record_from
 from splinecli.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,12 +37,9 @@ def evaluate(
     light_error_deg: float | None = inputs.LIGHT_ERROR,
     as_stored: bool = inputs.AS_STORED,
     white_level: float | None = inputs.WHITE_LEVEL,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
-    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     max_pixels: int | None = inputs.MAX_PIXELS,
     skip_first: list[str] | None = inputs.SKIP_FIRST,
     rotations: int | None = computing.ROTATIONS,
-    batch_size: int | None = computing.BATCH_SIZE,
     device: Device = computing.DEVICE,
     precision: Precision = computing.PRECISION,
     jobs: int | None = computing.JOBS,
@@ -63,33 +60,24 @@ def evaluate(
     give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the command again to go on, or with more
     trials, methods or lights. A capture that cannot be scored is skipped with a message, and the exit code is then 3.
     """
+    given = locals()
+
     from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
     from splinecli.pipeline.evaluate import EvaluateOptions, evaluate_captures
 
-    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
-    options = EvaluateOptions(
+    options = record_from(
+        EvaluateOptions,
+        given,
         methods=tuple(
             name
             for text in method or [DEFAULT_METHOD]
             for name in (method_names() if text == "all" else [text])
         ),
-        method_options=MethodOptions(weights, rotations, batch_size, device.value, precision.value),
+        method_options=MethodOptions(weights, rotations, device=device.value, precision=precision.value),
         n_lights=tuple(parse_light_count(text) for text in n_lights or []),
         light_noise_deg=tuple(light_noise_deg or [0.0]),
-        trials=trials,
-        seed=seed,
-        draws=None if draws is None else str(draws),
-        max_pixels=max_pixels,
         skip_first=dict(parse_skip(text) for text in skip_first or []),
-        refine_lights=refine_lights,
-        light_error_deg=light_error_deg,
-        as_stored=as_stored,
-        white_level=white_level,
-        jobs=jobs,
-        figures=figures,
         pixels=tuple(parse_pixel(text) for text in pixel or []),
-        output=str(output),
-        overwrite=overwrite,
         cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
     )
     talk = Messages(quiet=quiet)

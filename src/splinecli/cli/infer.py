@@ -16,14 +16,12 @@ from splinecli.cli.options.values import (
     LightForm,
     NormalConvention,
     Precision,
-    as_text,
     parse_cluster,
     parse_indices,
     split_commas,
 )
-from splinecli.cli.reading_limits import limit_reading
+from splinecli.cli.records import record_from
 from splinecli.errors import UsageError, printable
-from splinecli.surface.surface_files import MESH_FILES
 
 if TYPE_CHECKING:
     from splinecli.pipeline.member import Outcome, Redo
@@ -45,7 +43,6 @@ def infer(
     lights: Path | None = inputs.LIGHTS,
     intensities: Path | None = inputs.INTENSITIES,
     refine_lights: bool = inputs.REFINE_LIGHTS,
-    light_error_deg: float | None = inputs.LIGHT_ERROR,
     light_positions: Path | None = inputs.LIGHT_POSITIONS,
     light_distance: float | None = inputs.LIGHT_DISTANCE,
     pixel_size: float | None = inputs.PIXEL_SIZE_OF_SURFACE,
@@ -63,25 +60,19 @@ def infer(
     light_frame: str | None = inputs.LIGHT_FRAME,
     lights_format: LightForm = inputs.LIGHTS_FORMAT,
     as_stored: bool = inputs.AS_STORED,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
-    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     output: Path = outputs.INFER_FOLDER,
     method: str = computing.METHOD,
     weights: str | None = computing.WEIGHTS,
     n_lights: int | None = inputs.NUMBER_OF_LIGHTS,
     seed: int = inputs.SEED,
     light_indices: str | None = inputs.LIGHT_INDICES,
-    rotations: int | None = computing.ROTATIONS,
     distil: bool | None = computing.DISTIL,
-    batch_size: int | None = computing.BATCH_SIZE,
     device: Device = computing.DEVICE,
     precision: Precision = computing.PRECISION,
     formats: str = outputs.NORMAL_FORMATS,
     maps: str | None = outputs.MAPS,
     html: bool = outputs.HTML,
     surface: bool = outputs.SURFACE,
-    mesh_formats: str = outputs.MESH_FORMATS,
-    decimate: int | None = outputs.DECIMATE,
     convention: NormalConvention = outputs.CONVENTION,
     overwrite: bool = outputs.OVERWRITE,
     update: bool = outputs.UPDATE,
@@ -103,6 +94,8 @@ def infer(
     keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.
     The exit code is that of the most serious failure.
     """
+    given = locals()
+
     from splinecli.pipeline.batch import infer_batch
     from splinecli.pipeline.capture_list import Shard
     from splinecli.pipeline.infer_options import InferOptions
@@ -112,48 +105,13 @@ def infer(
             raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
         if overwrite and update:
             raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
-        limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
-        options = InferOptions(
-            lights=as_text(lights),
-            intensities=as_text(intensities),
-            refine_lights=refine_lights,
-            light_error_deg=light_error_deg,
-            light_positions=as_text(light_positions),
-            light_distance=light_distance,
-            pixel_size=pixel_size,
-            object_width=object_width,
-            camera_matrix=as_text(camera_matrix),
-            mask=as_text(mask),
-            auto_mask=auto_mask,
-            crop=crop,
-            scale=scale,
-            ground_truth=as_text(ground_truth),
-            transfer=transfer,
-            ambient=as_text(ambient),
-            flat_field=as_text(flat_field),
-            white_level=white_level,
-            as_stored=as_stored,
-            n_lights=n_lights,
+        options = record_from(
+            InferOptions,
+            given,
             seed=seed if n_lights is not None else 0,
             light_indices=None if light_indices is None else _indices(light_indices),
-            method=method,
-            weights=weights,
-            rotations=rotations,
-            distil=distil,
-            batch_size=batch_size,
-            device=device.value,
-            precision=precision.value,
-            output=str(output),
             formats=tuple(split_commas(formats, "--format", choices.normal_formats())),
             maps=() if maps is None else tuple(split_commas(maps, "--maps", choices.maps())),
-            html=html,
-            surface=surface,
-            mesh_formats=tuple(split_commas(mesh_formats, "--mesh-format", list(MESH_FILES))),
-            decimate=decimate,
-            convention=convention.value,
-            light_frame=light_frame,
-            lights_format=lights_format.value,
-            strict=strict,
         )
         messages = Messages(quiet=quiet)
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"

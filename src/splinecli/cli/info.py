@@ -6,11 +6,11 @@ from pathlib import Path
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
-from splinecli.cli.options.values import LightForm, as_text
-from splinecli.cli.reading_limits import limit_reading
+from splinecli.cli.options.values import LightForm
+from splinecli.cli.records import record_from
 from splinecli.errors import InputError
-from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
+from splinecli.pipeline.reading import Reading
 
 
 def info(
@@ -33,8 +33,6 @@ def info(
     light_frame: str | None = inputs.LIGHT_FRAME,
     lights_format: LightForm = inputs.LIGHTS_FORMAT,
     check_lights: bool = inputs.CHECK_LIGHTS,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
-    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     plot: Path | None = outputs.LIGHT_PLOT,
     overwrite: bool = outputs.OVERWRITE_PLOT,
     strict: bool = outputs.STRICT,
@@ -46,32 +44,11 @@ def info(
     Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
     the angles of the lights from the camera axis, and the memory and time that infer needs. Writes only the plot.
     """
+    given = locals()
+
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
 
-    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
-    reading = InferOptions(
-        lights=as_text(lights),
-        intensities=as_text(intensities),
-        light_positions=as_text(light_positions),
-        light_distance=light_distance,
-        pixel_size=pixel_size,
-        object_width=object_width,
-        camera_matrix=as_text(camera_matrix),
-        mask=as_text(mask),
-        crop=crop,
-        scale=scale,
-        ground_truth=as_text(ground_truth),
-        transfer=transfer,
-        ambient=as_text(ambient),
-        flat_field=as_text(flat_field),
-        white_level=white_level,
-        light_frame=light_frame,
-        lights_format=lights_format.value,
-        strict=strict,
-    )
-    options = InfoOptions(
-        capture=capture, reading=reading, plot=plot, overwrite=overwrite, check_lights=check_lights
-    )
+    options = record_from(InfoOptions, given, reading=record_from(Reading, given))
     messages = Messages(quiet=quiet)
     report = describe_capture(options, messages)
     print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)

@@ -7,7 +7,7 @@ from pathlib import Path
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import computing, inputs, outputs
 from splinecli.cli.options.values import NormalConvention, split_commas
-from splinecli.cli.reading_limits import limit_reading
+from splinecli.cli.records import record_from
 from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
 from splinecli.surface.surface_files import SURFACE_FILES
 
@@ -18,7 +18,6 @@ def integrate(
     camera_matrix: Path | None = inputs.CAMERA_MATRIX,
     convention: NormalConvention | None = inputs.NORMALS_CONVENTION,
     colours: Path | None = inputs.COLOURS,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
     stiffness: float = computing.STIFFNESS,
     largest_step: float | None = computing.LARGEST_STEP,
     pixel_size: float | None = inputs.PIXEL_SIZE_MM,
@@ -38,20 +37,10 @@ def integrate(
     Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object,
     depth.png and surface.json.
     """
-    limit_reading(max_pixels_per_image)
-    options = IntegrateOptions(
-        normals=normals,
-        output=output,
-        mask=mask,
-        camera_matrix=camera_matrix,
-        stiffness=stiffness,
-        largest_step=largest_step,
-        pixel_size=pixel_size,
-        decimate=decimate,
-        colours=colours,
+    options = record_from(
+        IntegrateOptions,
+        locals(),
         formats=tuple(split_commas(formats, "--format", list(SURFACE_FILES))),
-        convention=None if convention is None else convention.value,
-        overwrite=overwrite,
     )
     report = integrate_normal_map(options, Messages(quiet=quiet))
     print_report(report, summary_line(options, report), as_json=as_json, quiet=quiet)

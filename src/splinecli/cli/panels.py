@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-SPEED = ("--device", "--precision", "--batch-size")
-LIMITS = ("--max-pixels-per-image", "--images-elsewhere")
+SPEED = ("--device", "--precision")
 VALUES = ("--transfer", "--ambient", "--flat-field", "--white-level")
 PART = ("--crop", "--scale")
 REFINED = ("--refine-lights", "--light-error-deg")
@@ -12,27 +11,25 @@ REPEAT = ("--overwrite", "--json", "--quiet")
 
 PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     "infer": {
-        "Input": ("--mask", "--auto-mask", *PART, "--ground-truth", *VALUES, "--as-stored", *LIMITS),
+        "Input": ("--mask", "--auto-mask", *PART, "--ground-truth", *VALUES, "--as-stored"),
         "Lights": (
             "--lights",
             "--light-frame",
             "--lights-format",
             "--intensities",
-            *REFINED,
+            "--refine-lights",
             *LAMPS,
             "--n-lights",
             "--seed",
             "--light-indices",
         ),
-        "Method": ("--method", "--weights", "--rotations"),
+        "Method": ("--method", "--weights"),
         "Output": (
             "--output",
             "--format",
             "--maps",
             "--html",
             "--surface",
-            "--mesh-format",
-            "--decimate",
             "--convention",
             "--strict",
             "--update",
@@ -45,7 +42,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Processes and machines": ("--workers", "--cluster", "--shard"),
     },
     "info": {
-        "Input": ("--mask", *PART, "--ground-truth", *VALUES, *LIMITS),
+        "Input": ("--mask", *PART, "--ground-truth", *VALUES),
         "Lights": (
             "--lights",
             "--light-frame",
@@ -57,7 +54,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Output": ("--plot", "--strict", *REPEAT),
     },
     "calibrate": {
-        "Input": ("--circle", "--mask", "--ball-diameter", "--camera-matrix", "--max-pixels-per-image"),
+        "Input": ("--circle", "--mask", "--ball-diameter", "--camera-matrix"),
         "Light intensities": ("--gray-ball", "--gray-card", "--transfer"),
         "Output": ("--output", "--compare", *REPEAT),
     },
@@ -68,13 +65,12 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--pixel-size",
             "--convention",
             "--colours",
-            "--max-pixels-per-image",
         ),
         "Method": ("--stiffness", "--largest-step"),
         "Output": ("--output", "--format", "--decimate", *REPEAT),
     },
     "evaluate": {
-        "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level", *LIMITS),
+        "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level"),
         "Lights": ("--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg", *REFINED),
         "Method": ("--method", "--weights", "--rotations"),
         "Output": ("--output", "--figures", "--pixel", *REPEAT),
@@ -82,7 +78,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Processes and machines": ("--workers", "--cluster"),
     },
     "prepare": {
-        "Input": ("--as-stored", "--update", "--white-level", *LIMITS),
+        "Input": ("--as-stored", "--update", "--white-level"),
         "Scenes": ("--scenes", "--mesh", "--size", "--n-lights", "--seed"),
         "Output": ("--output", *REPEAT),
         "Speed": ("--workers",),

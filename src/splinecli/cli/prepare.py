@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import distribution, inputs, outputs, training
 from splinecli.cli.options.values import parse_cluster
-from splinecli.cli.reading_limits import limit_reading
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -21,8 +20,6 @@ def prepare(
     sources: list[Path] | None = training.SOURCES,
     as_stored: bool = inputs.AS_STORED,
     white_level: float | None = inputs.WHITE_LEVEL,
-    max_pixels_per_image: int = inputs.MAX_PIXELS_PER_IMAGE,
-    images_elsewhere: bool = inputs.IMAGES_ELSEWHERE,
     update: bool = outputs.UPDATE,
     scenes: int = training.SCENES,
     mesh: list[Path] | None = training.MESHES,
@@ -47,7 +44,6 @@ def prepare(
     from splinecli.pipeline.batch import worst_exit_code
     from splinecli.pipeline.prepare import PrepareOptions, prepare_pixel_set
 
-    limit_reading(max_pixels_per_image, images_elsewhere=images_elsewhere)
     options = PrepareOptions(
         output=output,
         captures=tuple(folder for source in sources or [] for folder in find_captures(source)),

@@ -66,7 +66,6 @@ class Work:
         folder: the working folder of the command, which its relative paths start from.
         probe: a file in the output folder. Workers that do not see it have another storage.
         versions: of the packages that must be the same.
-        max_pixels, images_elsewhere: the limits on what is read; see cli/reading_limits.py.
     """
 
     settings: Any
@@ -75,25 +74,16 @@ class Work:
     folder: str
     probe: str
     versions: dict[str, str]
-    max_pixels: int
-    images_elsewhere: bool
 
     @classmethod
     def of_this_process(
         cls, settings: Any, prepare: Callable[[Any], object], do: Callable[..., Any], probe: Path
     ) -> Work:
-        """Return the work of a command under the folder and the limits of this process."""
-        from splinecli.capture.formats.image_size import most_pixels
-        from splinecli.capture.layouts.image_lists import images_elsewhere_allowed
-
-        limits = most_pixels(), images_elsewhere_allowed()
-        return cls(settings, prepare, do, str(Path.cwd()), str(probe), _versions(), *limits)
+        """Return the work of a command under the folder of this process."""
+        return cls(settings, prepare, do, str(Path.cwd()), str(probe), _versions())
 
     def enter(self) -> None:
         """Make this worker ready. Raises UsageError or InputError if it does not fit, and what `prepare` raises."""
-        from splinecli.capture.formats.image_size import limit_pixels
-        from splinecli.capture.layouts.image_lists import allow_images_elsewhere
-
         for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
             if found != expected:
                 raise UsageError(
@@ -112,8 +102,6 @@ class Work:
                     "the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE
                 )
             time.sleep(0.1)
-        limit_pixels(self.max_pixels)
-        allow_images_elsewhere(self.images_elsewhere)
         keep_freed_memory()
         self.prepare(self.settings)
 

@@ -14,9 +14,6 @@ from splinecli.pipeline.infer_options import InferOptions
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
 
-_SINGULAR = {"formats": "format", "mesh_formats": "mesh-format"}
-"""Fields of InferOptions whose option has another name."""
-
 
 @dataclass(frozen=True)
 class EarlierResults:
@@ -86,7 +83,7 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 def _differences(earlier: InferOptions, options: InferOptions) -> str:
     """Return words for the options that differ, such as "another --method"."""
     names = [
-        "--" + _SINGULAR.get(option.name, option.name).replace("_", "-")
+        "--" + option.name.replace("formats", "format").replace("_", "-")
         for option in fields(options)
         if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
     ]

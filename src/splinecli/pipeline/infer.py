@@ -167,7 +167,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
         + (", or leave --surface out" if options.surface else "")
         + (", or neither albedo in --maps nor --html" if albedo else ""),
     )
-    if options.surface and "glb" in options.mesh_formats:
+    if options.surface:
         from splinecli.surface.mesh import check_triangles
 
         check_triangles(capture.mask)
@@ -179,7 +179,7 @@ def _light_refinement(source: CaptureSource, options: InferOptions) -> Callable[
     from splinecli.capture.restore.light_refinement import refine_capture
 
     known = source.intensities_known
-    return partial(refine_capture, error_deg=options.light_error_deg, intensities_known=known)
+    return partial(refine_capture, intensities_known=known)
 
 
 def _further_files(
@@ -230,7 +230,7 @@ def _surface(
 ) -> Callable[[NewFiles], None]:
     """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
     from splinecli.pipeline.surface import make_surface, share_of_iterations, view_of_report
-    from splinecli.surface.surface_files import DEPTH_FORMATS, encode_surface
+    from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 
     camera_matrix, pixel_size = view_of_report(report)
     with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
@@ -239,12 +239,10 @@ def _surface(
             estimate.capture.mask,
             camera_matrix,
             colours,
-            n_triangles=options.decimate,
             pixel_size_mm=pixel_size,
             progress=share_of_iterations(advance),
         )
-    exr = ("exr",) if "exr" in options.formats else ()
-    formats = (*options.mesh_formats, *DEPTH_FORMATS, *exr)
+    formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
 
     def write(new: NewFiles) -> None:
         for name, content in encode_surface(surface, formats):

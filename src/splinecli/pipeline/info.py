@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
 from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
-from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.pipeline.reading import Reading
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
@@ -45,15 +45,14 @@ class InfoOptions:
 
     Args:
         capture: the folder of the capture.
-        reading: how `infer` would read it. What concerns the method and the results does not count. With its `strict`,
-            what could not be checked is a warning, too.
+        reading: how `infer` would read it. With its `strict`, what could not be checked is a warning, too.
         plot: a PNG file that a plot of the lights is written to.
         overwrite: replace an earlier plot.
         check_lights: also list the readings of the light file that were compared.
     """
 
     capture: Path
-    reading: InferOptions = field(default_factory=InferOptions)
+    reading: Reading = field(default_factory=Reading)
     plot: Path | None = None
     overwrite: bool = False
     check_lights: bool = False

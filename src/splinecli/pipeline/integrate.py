@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from splinecli.errors import InputError, UsageError
 from splinecli.exr import check_exr
+from splinecli.extras import import_extra
 from splinecli.files import read_json
 from splinecli.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
     STIFFNESS,
-    check_decimation,
-    check_surface_options,
+    check_pixel_size,
     make_surface,
     share_of_iterations,
     view_of_report,
@@ -79,7 +79,9 @@ class IntegrateOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        check_surface_options(self.decimate, self.pixel_size)
+        check_pixel_size(self.pixel_size)
+        if self.decimate is not None and self.decimate < 1:
+            raise UsageError(f"--decimate is {self.decimate}, expected a number of triangles of at least 1")
         for name in self.formats:
             if name not in SURFACE_FILES:
                 raise UsageError(f"no format named {name!r}; expected one of {', '.join(SURFACE_FILES)}")
@@ -106,7 +108,8 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
     from splinecli.files import check_free
     from splinecli.publishing import held_folder
 
-    check_decimation(options.decimate)
+    if options.decimate is not None:
+        import_extra("fast_simplification", "mesh")
     check_exr(options.formats)
     with held_folder(options.folder, observer.warn):
         check_free(options.folder, options.files, overwrite=options.overwrite)

@@ -119,7 +119,7 @@ def _failure(member: Member, error: Exception) -> Outcome:
             raise OutputError(f"cannot be written ({reason})", path=error.filename) from error
         return failed(name, InputError(f"cannot be read ({reason})", path=error.filename or member.folder))
     if is_out_of_memory(error):
-        hint = "Use smaller images, or lower --batch-size"
+        hint = "Close other programs, or use smaller images"
         return failed(name, SplinecliError("there is not enough memory", path=member.folder, hint=hint))
     defect = SplinecliError(
         f"{name}: {type(error).__name__}: {error}. This is a defect of splinecli",

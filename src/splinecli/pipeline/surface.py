@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
-from splinecli.extras import import_extra
 from splinecli.surface.surface_files import Surface
 
 if TYPE_CHECKING:
@@ -101,23 +100,15 @@ def view_of_report(
         camera_matrix = np.array(lamps["camera_matrix"], np.float64).reshape(3, 3)
     if pixel_size_mm is None and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
-    check_surface_options(None, pixel_size_mm)
+    check_pixel_size(pixel_size_mm)
     return (
         None if camera_matrix is None else window.camera(camera_matrix),
         None if pixel_size_mm is None else pixel_size_mm * window.step,
     )
 
 
-def check_decimation(n_triangles: int | None) -> None:
-    """Raise UsageError, before the work, if meshes are to be decimated and the library for it is not installed."""
-    if n_triangles is not None:
-        import_extra("fast_simplification", "mesh")
-
-
-def check_surface_options(decimate: int | None, pixel_size: float | None) -> None:
-    """Raise UsageError for a number of triangles or a pixel size (mm) out of range."""
-    if decimate is not None and decimate < 1:
-        raise UsageError(f"--decimate is {decimate}, expected a number of triangles of at least 1")
+def check_pixel_size(pixel_size: float | None) -> None:
+    """Raise UsageError for a pixel size (mm) out of range."""
     if pixel_size is not None and not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
         raise UsageError(
             f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"

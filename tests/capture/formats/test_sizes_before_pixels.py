@@ -8,7 +8,7 @@ import resource
 import struct
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -20,12 +20,11 @@ from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.capture import open_capture
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, limit_pixels
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
 from splinecli.capture.lights.light_files import read_light_directions
 from splinecli.errors import InputError
-from splinecli.memory import LARGEST_IMAGE
 
 HUGE = 30_000
 SMALL = (16, 18)
@@ -261,19 +260,12 @@ def test_light_files_with_too_much_text(tmp_path: Path) -> None:
     refused(lambda: read_light_directions(tmp_path / "words.txt"), "found 400000 columns, expected 3")
 
 
-@pytest.fixture
-def smaller_limit() -> Iterator[None]:
-    limit_pixels(100)
-    yield
-    limit_pixels(LARGEST_IMAGE)
-
-
-@pytest.mark.usefixtures("smaller_limit")
-def test_the_limit_can_be_chosen(tmp_path: Path) -> None:
+def test_the_largest_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splinecli.capture.formats.image_size.LARGEST_IMAGE", 100)
     for name, size in (("small.png", (10, 10)), ("large.png", (10, 11))):
         cv2.imwrite(str(tmp_path / name), np.ones(size, np.uint8))
     assert decode_image(tmp_path / "small.png").shape == (10, 10, 1)
-    match = "found an image of 11 x 10 pixels.*expected at most 0.0001 megapixels.*--max-pixels-per-image"
+    match = "found an image of 11 x 10 pixels.*expected at most 0.0001 megapixels.*a smaller copy"
     with pytest.raises(InputError, match=match):
         decode_image(tmp_path / "large.png")
 

@@ -12,8 +12,6 @@ from pathlib import Path
 from splinecli.errors import InputError
 from splinecli.memory import LARGEST_IMAGE, available_memory
 
-_max_pixels = LARGEST_IMAGE
-
 
 @dataclass(frozen=True)
 class ExpectedSize:
@@ -38,17 +36,6 @@ class ExpectedSize:
             )
 
 
-def limit_pixels(count: int) -> None:
-    """Set the largest number of pixels of an image for this process."""
-    global _max_pixels
-    _max_pixels = count
-
-
-def most_pixels() -> int:
-    """Return the largest number of pixels of an image for this process."""
-    return _max_pixels
-
-
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
@@ -64,11 +51,11 @@ def check_stored_size(
         expected.check(shape, path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
-    if n_pixels > _max_pixels:
+    if n_pixels > LARGEST_IMAGE:
         raise InputError(
-            f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {_max_pixels / 1e6:g} megapixels",
+            f"{takes} {_gigabytes(n_bytes)} of memory; expected at most {LARGEST_IMAGE / 1e6:g} megapixels",
             path=path,
-            hint="If the size is right, raise --max-pixels-per-image",
+            hint="If the size is right, use a smaller copy of the image",
         )
     check_memory(n_bytes, takes, path)
 

@@ -19,24 +19,11 @@ PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)
 IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)
 """Suffixes of images of an object."""
 
-_elsewhere_allowed = False
-
 _DIGITS = re.compile(r"([0-9]+)")
 
 
 class NoImagesError(InputError):
     """A folder contains no images."""
-
-
-def allow_images_elsewhere(allowed: bool) -> None:
-    """Set for this process whether a filenames.txt may name images outside of its folder."""
-    global _elsewhere_allowed
-    _elsewhere_allowed = allowed
-
-
-def images_elsewhere_allowed() -> bool:
-    """Return whether they may in this process."""
-    return _elsewhere_allowed
 
 
 def natural_key(path: Path) -> tuple[list[int | str], str]:
@@ -119,12 +106,12 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         if not name:
             continue
         image = path.parent / name
-        if not _elsewhere_allowed and (Path(name).is_absolute() or ".." in Path(name).parts):
+        if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(
                 f'the image "{name}" is outside of this folder',
                 path=path,
                 line=line,
-                hint="Add --images-elsewhere if you trust this file",
+                hint="Copy the image into the folder, or set a link to it there, and name that",
             )
         try:
             exists = find_mode(image) is not None

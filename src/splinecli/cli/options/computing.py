@@ -49,12 +49,6 @@ DEVICE = Option(Device.auto, help="Device to compute on. auto is a CUDA GPU if t
 PRECISION = Option(
     Precision.auto, help="Number format. auto is bfloat16 if the hardware supports it, else float32."
 )
-BATCH_SIZE = Option(
-    None,
-    metavar="N",
-    min=1,
-    help="Number of pixels per batch. A smaller number needs less memory. [default: 512 to 8,192, by method]",
-)
 JOBS = Option(
     None, metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]"
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typer import Argument, Option
 
 from splinecli.cli.options.values import LightForm, complete_curves, complete_list
-from splinecli.memory import LARGEST_IMAGE
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 
@@ -118,18 +117,6 @@ AS_STORED = Option(
     False,
     "--as-stored",
     help="Use the stored values: do not restore saturated pixels or estimate light intensities.",
-)
-
-# Limits.
-
-MAX_PIXELS_PER_IMAGE = Option(
-    LARGEST_IMAGE,
-    metavar="N",
-    min=1,
-    help="Refuse larger images, before they are read into memory.",
-)
-IMAGES_ELSEWHERE = Option(
-    False, "--images-elsewhere", help="Let filenames.txt name images outside of its folder."
 )
 
 # Draws of lights, and the captures of evaluate.

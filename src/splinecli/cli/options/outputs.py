@@ -8,7 +8,7 @@ from typer import Option
 
 from splinecli.cli import choices
 from splinecli.cli.options.values import NormalConvention, complete_list
-from splinecli.surface.surface_files import DEFAULT_FORMATS, DEFAULT_MESHES, MESH_FILES, SURFACE_FILES
+from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 from splinecli.training.defaults import CHECKPOINT_SECONDS
 
 # The place of the results.
@@ -66,13 +66,6 @@ SURFACE = Option(
     False,
     "--surface",
     help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.",
-)
-MESH_FORMATS = Option(
-    ",".join(DEFAULT_MESHES),
-    "--mesh-format",
-    metavar="LIST",
-    help=f"With --surface: files of the mesh, any of {', '.join(MESH_FILES)}.",
-    autocompletion=complete_list(*MESH_FILES),
 )
 DECIMATE = Option(
     None,

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from splinecli.calibration.circle import Circle
     from splinecli.pipeline.connection import ClusterOptions
 
@@ -155,8 +153,3 @@ def parse_light_count(text: str) -> int | None:
         return int(text)
     except ValueError:
         raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
-
-
-def as_text(path: Path | None) -> str | None:
-    """Return a path as the records of options hold it, which are written as JSON."""
-    return None if path is None else str(path)

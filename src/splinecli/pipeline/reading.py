@@ -1,0 +1,132 @@
+"""How a capture is read, as one frozen record that `infer` and `info` share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+from splinecli.capture.lights.light_angles import LightForm
+from splinecli.errors import check_one_of
+from splinecli.transfer import AUTOMATIC, parse_transfer
+
+if TYPE_CHECKING:
+    from splinecli.capture import CaptureSource, RadiometricCalibration
+    from splinecli.capture.lights.lamp_files import LampOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """Which files make a capture, and how they are read.
+
+    Args:
+        lights, mask, ground_truth: files that replace those of the capture.
+        intensities: a file of light intensities, or "equal".
+        lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
+        light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
+        strict: fail where a warning says that the lights or images are probably wrong.
+        light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.
+        crop: the box X,Y,W,H of the images that is read; None for whole images.
+        scale: 1/N to read one of N rows and columns; None for all.
+        transfer: the curve of the images: auto, linear, srgb or gamma:G.
+        ambient: an image without any of the lights.
+        flat_field: a folder of images of an evenly white surface.
+        white_level: stored value from which a pixel counts as saturated, such as 4095. None to find it.
+
+    Raises:
+        UsageError: a value is unknown, or two options contradict each other.
+    """
+
+    lights: str | None = None
+    intensities: str | None = None
+    light_positions: str | None = None
+    light_distance: float | None = None
+    pixel_size: float | None = None
+    object_width: float | None = None
+    camera_matrix: str | None = None
+    mask: str | None = None
+    crop: str | None = None
+    scale: str | None = None
+    ground_truth: str | None = None
+    light_frame: str | None = None
+    lights_format: LightForm = "xyz"
+    transfer: str = AUTOMATIC
+    ambient: str | None = None
+    flat_field: str | None = None
+    white_level: float | None = None
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        from splinecli.capture.lights.light_frames import parse_light_frame
+        from splinecli.capture.restore.white_level import check_white_level
+        from splinecli.capture.window import parse_window
+
+        _ = self.lamps, parse_window(self.crop, self.scale)
+        parse_transfer(self.transfer)
+        parse_light_frame(self.light_frame)
+        check_white_level(self.white_level)
+        check_one_of("light format", self.lights_format, get_args(LightForm))
+
+    @property
+    def scales_surface(self) -> bool:
+        """Whether the pixel size also scales a surface."""
+        return False
+
+    @property
+    def lamps(self) -> LampOptions:
+        """The part of the options that concerns near lamps. Raises UsageError."""
+        from splinecli.capture.lights.lamp_files import LampOptions
+
+        return LampOptions(
+            positions=self.light_positions,
+            distance=self.light_distance,
+            pixel_size=self.pixel_size,
+            scales_surface=self.scales_surface,
+            object_width=self.object_width,
+            camera_matrix=self.camera_matrix,
+        )
+
+    def check_files(self) -> None:
+        """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
+        from splinecli.capture.paths import check_file
+        from splinecli.capture.reader import EQUAL
+
+        intensities = None if self.intensities == EQUAL else self.intensities
+        named = (self.lights, self.light_positions, intensities, self.camera_matrix, self.mask)
+        for name in (*named, self.ground_truth, self.ambient):
+            if name is not None:
+                check_file(Path(name), "a file", pipe=name == self.lights)
+        self.radiometric_calibration()
+
+    def radiometric_calibration(self) -> RadiometricCalibration:
+        """Return how the images' values become linear light. Raises InputError."""
+        from splinecli.capture import RadiometricCalibration
+        from splinecli.capture.layouts.image_lists import check_not_empty, list_images
+
+        flats: tuple[Path, ...] = ()
+        if self.flat_field is not None:
+            folder = Path(self.flat_field)
+            flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
+            check_not_empty(flats, folder)
+        dark = None if self.ambient is None else Path(self.ambient)
+        return RadiometricCalibration(parse_transfer(self.transfer), dark, flats, self.transfer == AUTOMATIC)
+
+    def open(self, folder: Path) -> CaptureSource:
+        """Open the capture in the folder under these options. Raises InputError."""
+        from splinecli.capture import open_capture
+        from splinecli.capture.lights.light_frames import parse_light_frame
+        from splinecli.capture.window import parse_window
+
+        return open_capture(
+            folder,
+            lights=self.lights,
+            intensities=self.intensities,
+            mask=self.mask,
+            ground_truth=self.ground_truth,
+            radiometry=self.radiometric_calibration(),
+            white_level=self.white_level,
+            light_frame=parse_light_frame(self.light_frame),
+            lights_format=self.lights_format,
+            lamps=self.lamps,
+            window=parse_window(self.crop, self.scale),
+        )
