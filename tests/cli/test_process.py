@@ -54,3 +54,17 @@ __main__.run()
 """
     done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_an_interruption_is_told_once(capfd, monkeypatch):
+    """The thread that ends the process after a SIGTERM may come when the command has told of it."""
+    from splinecli.cli import main, signals
+
+    monkeypatch.setattr(
+        main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
+    )
+    try:
+        assert main.main([]) == signals.report_interruption() == 130
+    finally:
+        main.TOLD.clear()
+    assert capfd.readouterr().err == "splinecli: interrupted.\n"

@@ -18,7 +18,7 @@ from splinecli.cli.app import app
 from splinecli.cli.closed_pipes import UntilClosed
 from splinecli.cli.console import print_lines
 from splinecli.cli.failures import explain, is_defect
-from splinecli.cli.signals import INTERRUPTED
+from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.errors import printable
 
 
@@ -41,12 +41,13 @@ def _run_command(args: Sequence[str] | None) -> int:
             args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False
         )
     except KeyboardInterrupt:
-        return fail("interrupted.", INTERRUPTED)
+        result = INTERRUPTED
     except Exception as error:
         if is_defect(error):
             print_lines(traceback.format_exc())
         return fail(*explain(error))
     if result == INTERRUPTED:
+        TOLD.set()
         return fail("interrupted.", INTERRUPTED)
     return result if isinstance(result, int) else 0
 

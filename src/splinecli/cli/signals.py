@@ -16,6 +16,9 @@ GRACE_SECONDS = 1.5
 """Time that the command has to clean up."""
 
 
+TOLD = threading.Event()
+"""Set when the command tells of the interruption itself, so that it is told once."""
+
 _IMPORT_SECONDS = 0.05
 """Time between two looks at whether an import is done."""
 
@@ -46,9 +49,10 @@ def ignore_signals() -> None:
 
 
 def report_interruption() -> int:
-    """Print that the process was interrupted, without Python's streams, and return the exit code."""
+    """Print that the process was interrupted, unless the command has, and return the exit code."""
     with suppress(OSError):  # stderr is closed
-        os.write(2, b"splinecli: interrupted.\n")
+        if not TOLD.is_set():
+            os.write(2, b"splinecli: interrupted.\n")
     return INTERRUPTED
 
 
