@@ -50,14 +50,13 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
     return (
         f"The images fit the lights of {light_file.name} much better {check.order}"
         f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against"
-        f" {100 * check.given_misfit:.0f} %). {_remedy(check.order)}"
+        f" {100 * check.given_misfit:.0f} %). "
+        + (
+            "Replace each elevation by 90 degrees minus it."
+            if check.order == ZENITH
+            else "Check that its lines are in the order of the images."
+        )
     )
-
-
-def _remedy(order: str | None) -> str:
-    if order == ZENITH:
-        return "Replace each elevation by 90 degrees minus it."
-    return "Check that its lines are in the order of the images."
 
 
 def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
