@@ -19,9 +19,9 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
-from splinecli.diagnosis import explanations
+from splinecli.diagnosis.explanations import encoded_values, near_lamps
 from splinecli.diagnosis.ground_truth import check_ground_truth
-from splinecli.diagnosis.image_shifts import ImageShift, find_shifts, shift_warning
+from splinecli.diagnosis.image_shifts import ImageShift, find_shifts, shift_warnings
 from splinecli.diagnosis.light_advice import light_warnings
 from splinecli.diagnosis.light_check import LightCheck, check_lights
 from splinecli.errors import InputError
@@ -178,10 +178,6 @@ class Evidence:
 Check = Callable[[Evidence], list[CaptureWarning]]
 
 
-def shifted_images(seen: Evidence) -> list[CaptureWarning]:
-    return [shift_warning(seen.shifts, seen.lights.names)] if seen.shifts else []
-
-
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
     """Warn of an image that contradicts the others, and is not only shifted."""
     odd = seen.light_check.odd_image
@@ -194,10 +190,6 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         " the object. Photograph it again, or leave it out."
     )
     return [CaptureWarning(codes.IMAGE_ODD, text)]
-
-
-def lights_in_question(seen: Evidence) -> list[CaptureWarning]:
-    return light_warnings(seen.light_check, seen.lights.frame, seen.lights.origin, strict=seen.strict)
 
 
 def missing_mask(seen: Evidence) -> list[CaptureWarning]:
@@ -233,18 +225,6 @@ def same_images(seen: Evidence) -> list[CaptureWarning]:
         " own photograph."
     )
     return [CaptureWarning(codes.REPEATED_IMAGES, text)]
-
-
-def ground_truth(seen: Evidence) -> list[CaptureWarning]:
-    return [] if seen.truth is None else check_ground_truth(seen.evened, seen.directions, seen.truth)
-
-
-def encoded_values(seen: Evidence) -> list[CaptureWarning]:
-    return explanations.encoded_values(seen.evened, seen.directions) if seen.lights.linear else []
-
-
-def near_lamps(seen: Evidence) -> list[CaptureWarning]:
-    return [] if seen.lights.has_positions else explanations.near_lamps(seen.evened, seen.directions)
 
 
 def rough_lights(seen: Evidence) -> list[CaptureWarning]:
@@ -291,15 +271,20 @@ DOUBTED = frozenset(
 EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
-    (shifted_images, frozenset()),
+    (lambda seen: shift_warnings(seen.shifts, seen.lights.names), frozenset()),
     (odd_image, frozenset()),
-    (lights_in_question, frozenset()),
+    (
+        lambda seen: light_warnings(
+            seen.light_check, seen.lights.frame, seen.lights.origin, strict=seen.strict
+        ),
+        frozenset(),
+    ),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (same_images, frozenset()),
-    (ground_truth, frozenset()),
-    (encoded_values, DOUBTED),
-    (near_lamps, EXPLAINED),
+    (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), frozenset()),
+    (lambda seen: encoded_values(seen.evened, seen.directions) if seen.lights.linear else [], DOUBTED),
+    (lambda seen: [] if seen.lights.has_positions else near_lamps(seen.evened, seen.directions), EXPLAINED),
     (rough_lights, EXPLAINED | {codes.LAMPS_NEAR}),
     (unequal_intensities, EXPLAINED | {codes.LAMPS_NEAR}),
 )
