@@ -37,7 +37,7 @@ SAME_IMAGE = 1e-12
 
 UNEQUAL_MISFIT, UNEQUAL_RATIO = 0.1, 0.4
 """Light intensities are unequal if equal ones leave more than the first, as a share of the brightness, and those that
-fit best leave less than the second share of it. Of right captures of metal, they leave 0.58 of it or more."""
+fit best leave less than the second share of it. Of right captures of metal, they leave 0.54 of it or more."""
 
 
 Check = Callable[[Evidence], list[CaptureWarning]]
