@@ -64,6 +64,8 @@ def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     assert f"degrees with {negated} negated: it is probably in this frame" in result.err
     assert codes() == [code]
     assert f"with {negated} negated" in refused(run, "--method", "ls")
+    evaluation = run("evaluate", medallion, "--method", "ls", "--n-lights", 8, "--trials", 1)
+    assert f"degrees with {negated} negated: it is probably in this frame" in evaluation.out + evaluation.err
 
 
 @pytest.mark.parametrize(

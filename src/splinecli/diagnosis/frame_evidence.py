@@ -58,11 +58,13 @@ class RoughNormals:
 
     def curl(self) -> float:
         """Return the median |curl| of the slopes over their median derivative: 0 for a surface."""
+        from scipy.ndimage import binary_erosion
+
         z = np.maximum(self.normals[..., 2], _LOWEST_Z)
         p, q = -self.normals[..., 0] / z, -self.normals[..., 1] / z
         p_x, p_y = _derivatives(p)
         q_x, q_y = _derivatives(q)
-        inside = _inner(self.mask & (self.normals[..., 2] > _LOWEST_Z))
+        inside = binary_erosion(self.mask & (self.normals[..., 2] > _LOWEST_Z))
         if inside.sum() < 50:
             return float("nan")
         size = np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)[inside]
@@ -124,11 +126,3 @@ def _derivatives(values: Array) -> tuple[Array, Array]:
         np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values) for axis in (0, 1)
     )
     return np.asarray(right), np.asarray(-downwards)
-
-
-def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the pixels whose four neighbours are in the mask."""
-    from scipy.ndimage import binary_erosion
-
-    eroded: NDArray[np.bool_] = binary_erosion(mask)
-    return eroded

@@ -19,14 +19,16 @@ _FRAMES = [LightFrame((*frame.signs[:2], z), frame.exchanged) for z in (1, -1) f
 
 
 def check_ground_truth(
-    sample: Sample, light_directions: NDArray[np.float64], truth: NDArray[np.floating]
+    sample: Sample, light_directions: NDArray[np.float64], truth: NDArray[np.floating] | None
 ) -> list[CaptureWarning]:
     """Return a warning if a ground truth (H, W, 3) fits a sample only in another frame, or an empty list.
 
     Args:
         light_directions: (F, 3).
-        truth: of the whole images; unit normals, or zero where there is no ground truth.
+        truth: of the whole images; unit normals, or zero where there is no ground truth. None gives no warning.
     """
+    if truth is None:
+        return []
     truth = truth[:: sample.step, :: sample.step]
     known = sample.mask & truth.any(axis=2)
     if not known.any():

@@ -79,16 +79,17 @@ def _shifts_against(
     return found
 
 
-def shift_warning(shifts: Sequence[ImageShift], names: Sequence[str]) -> CaptureWarning:
-    """Return the warning about images that are shifted, among images of these names."""
+def shift_warnings(shifts: Sequence[ImageShift], names: Sequence[str]) -> list[CaptureWarning]:
+    """Return a warning about images that are shifted, among images of these names; an empty list for none."""
+    if not shifts:
+        return []
     named = ", ".join(f"{names[shift.place]} {_in_words(shift)}" for shift in shifts[:_MOST_NAMED])
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
-    are = "is" if len(shifts) == 1 else "are"
-    return CaptureWarning(
-        IMAGES_SHIFTED,
-        f"{len(shifts)} of {len(names)} images {are} shifted against the others, in pixels: {named}{more}. The camera"
-        " or the object moved. Photograph from a tripod, or align the images first.",
+    text = (
+        f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
+        f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
     )
+    return [CaptureWarning(IMAGES_SHIFTED, text)]
 
 
 def _in_words(shift: ImageShift) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, LIGHTS_UNCHECKED, CaptureWarning
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, LightFrame
+from splinecli.diagnosis.evidence import StatedLights
 from splinecli.diagnosis.light_check import Candidate, LightCheck
 from splinecli.diagnosis.light_order import UNKNOWN_ORDER, ZENITH
 
@@ -16,15 +17,13 @@ TOLD_APART = 0.5
 """Smallest difference of advantages that tells two frames apart."""
 
 
-def light_warnings(
-    check: LightCheck, frame: LightFrame, light_file: Path, *, strict: bool = False
-) -> list[CaptureWarning]:
-    """Return the warnings about lights that were read in a frame.
+def light_warnings(check: LightCheck, lights: StatedLights, *, strict: bool = False) -> list[CaptureWarning]:
+    """Return the warnings about lights that were read in a frame, which the advice replaces.
 
     Args:
-        frame: the frame in which the light file was read, which the advice replaces.
         strict: also warn of what the images do not tell. It says nothing about most reliefs without an outline.
     """
+    frame, light_file = lights.frame, lights.origin
     warnings = []
     if check.order is not None:
         code = LIGHT_FRAME if check.order == ZENITH else LIGHT_ORDER
@@ -50,14 +49,13 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
     return (
         f"The images fit the lights of {light_file.name} much better {check.order}"
         f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against"
-        f" {100 * check.given_misfit:.0f} %). {_remedy(check.order)}"
+        f" {100 * check.given_misfit:.0f} %). "
+        + (
+            "Replace each elevation by 90 degrees minus it."
+            if check.order == ZENITH
+            else "Check that its lines are in the order of the images."
+        )
     )
-
-
-def _remedy(order: str | None) -> str:
-    if order == ZENITH:
-        return "Replace each elevation by 90 degrees minus it."
-    return "Check that its lines are in the order of the images."
 
 
 def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:

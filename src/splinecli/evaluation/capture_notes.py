@@ -6,6 +6,8 @@ import numpy as np
 
 from splinecli.capture import Capture
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
+from splinecli.capture.sample import sample_observations
+from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.evaluation.protocol import Protocol
 
 DAMAGED_IMAGES = {"bearPNG": 20}
@@ -27,6 +29,9 @@ def capture_notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str,
         f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN
     ]
     if capture.ground_truth is not None:
+        sample = sample_observations(capture.observations, capture.mask)
+        wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)
+        notes += [f"{name}: {warning}" for warning in wrong]
         without = capture.n_pixels - int(np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1)))
         if without:
             notes.append(

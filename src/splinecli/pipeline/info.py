@@ -69,7 +69,8 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
     from splinecli.capture.summary import summarise_capture
-    from splinecli.diagnosis.checks import StatedLights, check_sample
+    from splinecli.diagnosis.checks import check_sample
+    from splinecli.diagnosis.evidence import StatedLights
     from splinecli.diagnosis.light_advice import candidate_rows
     from splinecli.files import write_bytes
 

@@ -1,0 +1,150 @@
+"""What is stated about a capture's lights, and what its pixels show: what the checks see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture import Capture, CaptureSource
+from splinecli.capture.lights.light_fit import Factors, find_factors
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.sample import Sample
+from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
+from splinecli.diagnosis.light_check import LightCheck, check_lights
+from splinecli.solve_3x3 import solve_each
+
+
+@dataclass(frozen=True, eq=False)
+class StatedLights:
+    """What files or arguments say about the lights of F images.
+
+    Args:
+        names: of the images.
+        directions: (N, 3), all lights of the file, in its order.
+        indices: (F,), those of the images.
+        origin: the file.
+        frame: the frame in which it was read.
+        intensities_measured: whether the intensities are given.
+        intensities_known: whether they are given, or the user says that they are equal.
+        linear: whether the values of the images are taken as linear.
+        lamps: all near lamps, over the grid of the sample that is checked; None if the lights count as distant.
+        has_positions: whether positions of lamps are known.
+    """
+
+    names: Sequence[str]
+    directions: NDArray[np.float64]
+    indices: Sequence[int]
+    origin: Path
+    frame: LightFrame
+    intensities_measured: bool
+    intensities_known: bool
+    linear: bool
+    lamps: NearLamps | None
+    has_positions: bool
+
+    @classmethod
+    def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
+        """Return what the files of a capture say about the images with these indices."""
+        used = source.lamps is not None and source.lamps.used
+        return cls(
+            names=[source.files.images[index].name for index in indices],
+            directions=source.light_directions,
+            indices=indices,
+            origin=source.files.light_directions,
+            frame=source.light_frame,
+            intensities_measured=source.intensities_measured,
+            intensities_known=source.intensities_known,
+            linear=source.radiometry.curve == 1,
+            lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
+            has_positions=source.lamps is not None,
+        )
+
+    @classmethod
+    def of_arrays(cls, capture: Capture, sample: Sample, *, intensities_measured: bool) -> StatedLights:
+        """Return what the arguments of splinecli.estimate_normals say."""
+        lamps = capture.lamps
+        if lamps is not None:
+            shape = (sample.mask.shape[0], sample.mask.shape[1])
+            lamps = replace(lamps, pixel_size=lamps.pixel_size * sample.step, shape=shape)
+        return cls(
+            names=[f"images[{index}]" for index in range(capture.n_lights)],
+            directions=capture.light_directions,
+            indices=range(capture.n_lights),
+            origin=Path("light_directions"),
+            frame=USUAL_FRAME,
+            intensities_measured=intensities_measured,
+            intensities_known=intensities_measured,
+            linear=True,
+            lamps=lamps,
+            has_positions=lamps is not None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A capture as the checks see it; what several of them need is found once.
+
+    Args:
+        lights: what is stated about the lights.
+        sample, closeup: without dark background, not divided by estimated intensities.
+        background: its share.
+        truth: (H, W, 3), the ground truth of the whole images, or None.
+        strict: also warn of what the images do not tell.
+    """
+
+    lights: StatedLights
+    sample: Sample
+    closeup: Sample
+    background: float = 0.0
+    truth: NDArray[np.floating] | None = None
+    strict: bool = False
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """The directions (F, 3) of the images' lights."""
+        return self.lights.directions[list(self.lights.indices)]
+
+    @cached_property
+    def observations(self) -> NDArray[np.floating]:
+        """The sample's observations (p, F) as they would be if near lamps were distant.
+
+        The surface counts as a plane. What a matte surface explains is exchanged; what it does not explain, such as
+        the misfit of lights in a wrong order, stays.
+        """
+        if self.lights.lamps is None:
+            return self.sample.observations
+        lamps = self.lights.lamps.choose_lights(self.lights.indices)
+        near, strengths = lamps.light_at(lamps.plane_points(*np.nonzero(self.sample.mask)))
+        observations = self.sample.observations / strengths
+        scaled_normals = solve_each(observations, near)
+        return np.asarray(observations + np.einsum("pfc,pc->pf", self.directions - near, scaled_normals))
+
+    @cached_property
+    def factors(self) -> Factors | None:
+        return find_factors(self.observations, intensities_known=self.lights.intensities_measured)
+
+    @cached_property
+    def evened(self) -> Sample:
+        """The sample, divided by the intensities that fit best where nobody measured them.
+
+        They are not the fault of directions and values.
+        """
+        intensities = 1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
+        return replace(self.sample, observations=self.observations / intensities)
+
+    @cached_property
+    def light_check(self) -> LightCheck:
+        lights = self.lights
+        return check_lights(
+            self.observations, self.sample.mask, lights.directions, lights.indices, lights.names, self.factors
+        )
+
+    @cached_property
+    def shifts(self) -> list[ImageShift]:
+        return find_shifts(self.closeup) or (find_shifts(self.sample) if self.sample.step > 1 else [])

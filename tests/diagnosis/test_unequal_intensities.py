@@ -1,0 +1,29 @@
+"""Unequal light intensities that the images do not determine."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splinecli.capture import Capture
+from splinecli.diagnosis.checks import check_arrays
+
+
+def codes(intensities: np.ndarray) -> list[str]:
+    """Return the warnings about a plane with faint bumps and broad gloss under 12 lights of these intensities."""
+    rng = np.random.default_rng(0)
+    azimuth, zenith = np.arange(12) * 2.4, np.radians(np.linspace(15, 55, 12))
+    level = np.sin(zenith)
+    lights = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)), axis=1)
+    normals = np.concatenate((rng.normal(0, 0.3, (900, 2)), np.ones((900, 1))), axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    half = lights + (0, 0, 1)
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    shaded = (0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ half.T).clip(0) ** 12) * intensities
+    values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)
+    capture = Capture("glossy", values, lights, tuple(range(12)), np.ones((30, 30), np.bool_))
+    return [warning.code for warning in check_arrays(capture, intensities_measured=False)]
+
+
+def test_unequal_intensities_that_cannot_be_estimated_are_named() -> None:
+    assert "unequal_intensities" in codes(np.tile((0.6, 1.5, 1.0), 4))
+    assert "unequal_intensities" not in codes(np.ones(12))
