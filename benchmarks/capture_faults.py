@@ -24,13 +24,13 @@ from splinecli.capture import Capture, open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.diagnosis.checks import check_arrays, check_capture
+from splinecli.maths.transfer import encode_srgb
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.point_lights import render_point_lights
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import SceneConfig, draw_scene
-from splinecli.transfer import encode_srgb
 
 Array = NDArray[np.float64]
 WIDTHS = (2.0, 3.0, 4.0, 6.0)

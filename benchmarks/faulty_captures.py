@@ -22,10 +22,11 @@ from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.record import in_one_plane
 from splinecli.inference import estimate_normals
+from splinecli.light.lamp_light import LightOf
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
-from splinecli.methods.lamp_light import LightOf
-from splinecli.methods.refiner import Refiner
-from splinecli.normals import angle_between_deg, unit
+from splinecli.refinement.tiles import Refiner
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
@@ -36,7 +37,6 @@ from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import draw_patches
 from splinecli.synthesis.shapes import draw_rotation, draw_shape, turn
 from splinecli.synthesis.whole_capture import photograph_scene
-from splinecli.transfer import encode_srgb
 
 Floats = NDArray[np.floating]
 

@@ -22,14 +22,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.files import file_sha256
-from splinecli.methods.capture_features import capture_features
+from splinecli.confidence.features import capture_features
+from splinecli.light.indirect_light import PixelPlaces
+from splinecli.light.lamp_light import LampLight, Rows
 from splinecli.methods.estimator import CONFIDENT_DEG
-from splinecli.methods.indirect_light import PixelPlaces
-from splinecli.methods.lamp_light import LampLight, Rows
 from splinecli.networks.capture_head import CaptureHead
 from splinecli.networks.error_head import error_negative_log_likelihood, probability_within
 from splinecli.networks.weights import HEAD_FORMAT, SHIPPED, manifest, serialise, tensors_sha256
+from splinecli.system.files import file_sha256
 
 Floats = NDArray[np.floating]
 

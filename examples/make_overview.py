@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
 
-from splinecli.normals import encode_picture, unit
-from splinecli.transfer import encode_srgb
+from splinecli.maths.normals import encode_picture, unit
+from splinecli.maths.transfer import encode_srgb
 
 Array = NDArray[np.float32]
 

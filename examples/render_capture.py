@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import encode_picture, unit
+from splinecli.maths.normals import encode_picture, unit
 
 Array = NDArray[np.float64]
 

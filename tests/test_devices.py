@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from splinecli import devices, memory
-from splinecli.devices import (
+from splinecli.errors import UsageError
+from splinecli.system import devices, memory
+from splinecli.system.devices import (
     cgroup_quotas,
     choose_device,
     choose_precision,
     count_available_cores,
     use_available_cores,
 )
-from splinecli.errors import UsageError
-from splinecli.memory import available_memory
+from splinecli.system.memory import available_memory
 
 
 def test_unknown_device() -> None:

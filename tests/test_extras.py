@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import InputError, UsageError
-from splinecli.extras import import_extra
+from splinecli.system.extras import import_extra
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import OutputError
-from splinecli.files import parse_json, write_bytes, write_text
+from splinecli.system.files import parse_json, write_bytes, write_text
 
 
 def names_in(folder: Path) -> list[str]:
@@ -56,7 +56,7 @@ def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.M
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("splinecli.files.sync", fail)
+    monkeypatch.setattr("splinecli.system.files.sync", fail)
     with pytest.raises(OutputError, match="No space left"):
         write_bytes(tmp_path / "a" / "b" / "out.bin", b"content")
     assert names_in(tmp_path) == []

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import OutputError
-from splinecli.locks import LOCK, BusyError, locked
+from splinecli.system.locks import LOCK, BusyError, locked
 
 
 @pytest.fixture(params=["posix", "windows"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splinecli.metrics import angular_error_map_deg, summarise_errors
+from splinecli.maths.metrics import angular_error_map_deg, summarise_errors
 
 
 def tilted(degrees: float) -> list[float]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.normals import Convention, angle_between_deg, decode_picture, encode_picture, unit
+from splinecli.maths.normals import Convention, angle_between_deg, decode_picture, encode_picture, unit
 
 
 def random_normals(count: int, seed: int = 0) -> NDArray[np.float64]:

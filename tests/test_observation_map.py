@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from splinecli.observation_map import (
+from splinecli.maths.observation_map import (
     cell_directions,
     light_cells,
     map_scale,

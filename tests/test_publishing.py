@@ -11,11 +11,11 @@ import pytest
 
 from faults.sync_order import missing_syncs, record_calls
 from kills import content, killed_at
-from splinecli import files
 from splinecli.errors import OutputError
-from splinecli.files import UNFINISHED
-from splinecli.locks import LOCK
-from splinecli.publishing import UNDONE, NewFiles, held_folder, new_files
+from splinecli.system import files
+from splinecli.system.files import UNFINISHED
+from splinecli.system.locks import LOCK
+from splinecli.system.publishing import UNDONE, NewFiles, held_folder, new_files
 
 REPORT = "report.json"
 OLD = {REPORT: b"old", "a.txt": b"old a", "only old.txt": b"old", "pictures/1.png": b"old 1"}
@@ -78,7 +78,7 @@ def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path: Path
 
 def test_a_failure_keeps_the_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(tmp_path, OLD)
-    monkeypatch.setattr("splinecli.publishing.sync", fail)
+    monkeypatch.setattr("splinecli.system.publishing.sync", fail)
     with pytest.raises(OutputError, match="No space left on device"):
         publish(tmp_path)
     assert content(tmp_path) == OLD
@@ -227,7 +227,7 @@ def test_everything_is_on_the_disk_before_an_earlier_file_goes(tmp_path: Path) -
 
 def test_the_names_of_new_folders_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[Path] = []
-    monkeypatch.setattr("splinecli.files.sync", synced.append)
+    monkeypatch.setattr("splinecli.system.files.sync", synced.append)
     files.write_bytes(tmp_path / "a" / "b" / "c.txt", b"")
     assert {tmp_path, tmp_path / "a", tmp_path / "a" / "b"} <= set(synced)
     synced.clear()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splinecli.errors import UsageError
-from splinecli.transfer import decode_transfer, encode_srgb, parse_transfer
+from splinecli.maths.transfer import decode_transfer, encode_srgb, parse_transfer
 
 
 def test_srgb():

@@ -18,15 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
+from splinecli.confidence.correction import correct_errors
 from splinecli.errors import SplinecliError
-from splinecli.memory import return_freed_memory
+from splinecli.light.indirect_light import IndirectLight, find_indirect_light
+from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
+from splinecli.maths.metrics import AngularErrors, angular_error_map_deg, summarise_errors
 from splinecli.methods import Estimator
-from splinecli.methods.capture_confidence import correct_errors
-from splinecli.methods.estimator import TILE_PIXELS, Progress, confidence, refiner_of, tells_confidence
-from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
-from splinecli.methods.lamp_light import LampLight, Rows, parts_of_rows
+from splinecli.methods.estimator import TILE_PIXELS, confidence, refiner_of, tells_confidence
 from splinecli.methods.near_light import find_surface
-from splinecli.metrics import AngularErrors, angular_error_map_deg, summarise_errors
+from splinecli.system.memory import return_freed_memory
+from splinecli.system.progress import Progress
 
 Stage = Callable[[str], AbstractContextManager[Progress]]
 

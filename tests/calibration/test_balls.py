@@ -14,7 +14,7 @@ from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball
 from splinecli.calibration.circle import Circle
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 from splinecli.pictures.calibration import calibration_picture
 
 BALL = Circle(103.3, 88.7, 61.4)

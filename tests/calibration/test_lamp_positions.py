@@ -22,7 +22,7 @@ from splinecli.calibration.lamp_positions import intersect_rays, triangulate_lam
 from splinecli.calibration.mirror_ball import Highlight
 from splinecli.calibration.report import calibration_report, summary_lines
 from splinecli.calibration.view import DISTANT, SHORTEST_LENS, View
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 SHAPE = 160, 400
 BALLS = Circle(70, 90, 60), Circle(320, 75, 60)

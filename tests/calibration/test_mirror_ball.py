@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.mirror_ball import ball_centre, check_in_front, find_highlight, reflect
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 BALL = Circle(103.3, 88.7, 61.4)
 DISTANT = np.array(((1e6, 0, 104.5), (0, 1e6, 89.5), (0, 0, 1)))

@@ -14,7 +14,7 @@ from splinecli.calibration.circle import Circle
 from splinecli.calibration.mirror_ball import Highlight
 from splinecli.calibration.report import calibration_report, summary_lines
 from splinecli.calibration.view import View
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 
 def turned(directions: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture import CaptureWarning, open_capture, read_capture
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 WriteImage = Callable[..., Path]
 

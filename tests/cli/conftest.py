@@ -15,7 +15,7 @@ import pytest
 
 import scenes
 from splinecli.cli.main import main
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 SIZE = 24
 LIGHTS = np.array(

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from splinecli.exr import encode_exr
+from splinecli.system.exr import encode_exr
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

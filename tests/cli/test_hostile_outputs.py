@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from splinecli.evaluation.trials import TrialStore
-from splinecli.publishing import UNDONE, NewFiles
+from splinecli.system.publishing import UNDONE, NewFiles
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import tifffile
 
+from splinecli.maths.normals import angle_between_deg, decode_picture
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.normals import angle_between_deg, decode_picture
 
 
 def read_report(folder: Path) -> dict:

@@ -14,7 +14,7 @@ from PIL import Image
 from scenes import BUMP_LAMPS, write_bump
 from splinecli.capture.capture_size import results_bytes
 from splinecli.capture.formats import image_size
-from splinecli.normals import encode_picture
+from splinecli.maths.normals import encode_picture
 
 SHAPE = (40, 50)
 

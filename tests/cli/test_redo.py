@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from splinecli.files import UNFINISHED
-from splinecli.publishing import UNDONE
+from splinecli.system.files import UNFINISHED
+from splinecli.system.publishing import UNDONE
 
 
 def read_report(folder: Path) -> dict:

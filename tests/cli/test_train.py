@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from small_pixel_sets import matte_pixels
-from splinecli.files import UNFINISHED
-from splinecli.publishing import UNDONE
+from splinecli.system.files import UNFINISHED
+from splinecli.system.publishing import UNDONE
 
 
 @pytest.fixture(autouse=True)

@@ -11,8 +11,8 @@ from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.explanations import encoded_values, near_distance, near_lamps
-from splinecli.normals import unit
-from splinecli.transfer import encode_srgb
+from splinecli.maths.normals import unit
+from splinecli.maths.transfer import encode_srgb
 
 Array = NDArray[np.float64]
 SIZE = 48

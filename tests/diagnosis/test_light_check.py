@@ -16,7 +16,7 @@ from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame, pars
 from splinecli.diagnosis.light_check import LightCheck, check_lights
 from splinecli.diagnosis.light_order import UNKNOWN_ORDER
 from splinecli.errors import UsageError
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 SIZE = 64

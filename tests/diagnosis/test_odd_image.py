@@ -15,7 +15,7 @@ from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.light_frames import parse_light_frame
 from splinecli.diagnosis.light_check import check_lights
 from splinecli.diagnosis.odd_image import OddImage, find_odd_image
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 SIZE, ODD = 64, 4

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import shade, spiral_lights, write_capture
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 SIZE = 12  # pixels a side; the outermost ring is outside the mask
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splinecli.evaluation.light_noise import tilt_lights
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 
 def test_angles_have_the_wanted_root_mean_square() -> None:

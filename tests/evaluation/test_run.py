@@ -18,8 +18,8 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate, evaluate_all
 from splinecli.evaluation.trials import TrialStore
+from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator
-from splinecli.normals import unit
 
 WriteDome = Callable[..., Path]
 

@@ -115,7 +115,7 @@ class KilledCommand:
 
     def kill(self, step: int | None = None, seconds: float | None = None) -> Iterator[str]:
         """Kill the command at a step or after some time, and yield what is wrong afterwards."""
-        from splinecli.publishing import held_folder
+        from splinecli.system.publishing import held_folder
 
         self._reset()
         was_killed = self._run_killed(step, seconds)

@@ -20,7 +20,7 @@ from splinecli.errors import InputError
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.publishing import held_folder
+from splinecli.system.publishing import held_folder
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="POSIX processes, limits and mounts")
 

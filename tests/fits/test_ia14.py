@@ -14,8 +14,8 @@ from scipy.optimize import nnls
 from scenes import cap_directions, halfway
 from splinecli.fits.ia14 import fit, solve
 from splinecli.fits.quadratic_programme import minimise_nonnegative
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.normals import angle_between_deg
 
 Array = NDArray[np.float64]
 ON_CPU = MethodOptions(device="cpu")

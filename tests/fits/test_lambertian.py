@@ -8,7 +8,7 @@ from torch import Tensor
 
 from scenes import cap_directions, ring_lights
 from splinecli.fits.lambertian import fit_lambertian
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 
 def normals_under(limit_deg: float, count: int) -> Tensor:

@@ -10,8 +10,8 @@ from scipy.optimize import linprog
 
 from splinecli.fits import iw12, least_absolute, trimmed_least_squares
 from splinecli.fits.weighted_least_squares import RIDGE, weighted_least_squares
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
-from splinecli.normals import angle_between_deg
 
 ROBUST = ("iw12", "l1", "ls-trimmed")
 Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]

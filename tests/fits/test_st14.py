@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from scenes import cap_directions, halfway
 from splinecli.fits.st14 import solve
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.normals import angle_between_deg
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
+from splinecli.confidence.features import CaptureFeatures, capture_features
 from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.light.lamp_light import LampLight
+from splinecli.maths.normals import unit
+from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
-from splinecli.methods.capture_features import CaptureFeatures, capture_features
-from splinecli.methods.lamp_light import LampLight
 from splinecli.networks.capture_head import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
 from splinecli.networks.weights import capture_head, manifest
-from splinecli.normals import unit
-from splinecli.transfer import encode_srgb
 
 Doubles = NDArray[np.float64]
 

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from scenes import cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods.distilled import DistilledEstimator, distil
 from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, tells_confidence
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.methods.pupil_size import PupilSize, pupil_sizes
-from splinecli.methods.refiner import NetworkRefiner
+from splinecli.methods.student_size import StudentSize, student_sizes
 from splinecli.networks.refine_net import RefineNet
-from splinecli.normals import angle_between_deg, unit
+from splinecli.refinement.tiles import NetworkRefiner
 
 Floats = NDArray[np.floating]
 LIGHTS = spiral_lights(8, 50)
-SIZE = PupilSize(sample=1600, steps=160, width=64)
-SMALL = PupilSize(sample=800, steps=80, width=32)
+SIZE = StudentSize(sample=1600, steps=160, width=64)
+SMALL = StudentSize(sample=800, steps=80, width=32)
 
 
 @dataclass
@@ -171,10 +171,10 @@ def test_too_few_pixels() -> None:
 
 
 def test_sizes_grow_with_the_capture() -> None:
-    assert pupil_sizes(100_000)[0] == PupilSize(sample=10_000, steps=1000, width=192)
-    assert pupil_sizes(1_600_000)[0].sample == 20_000
-    assert pupil_sizes(8_000)[0].sample == 2000
+    assert student_sizes(100_000)[0] == StudentSize(sample=10_000, steps=1000, width=192)
+    assert student_sizes(1_600_000)[0].sample == 20_000
+    assert student_sizes(8_000)[0].sample == 2000
     for n_pixels in (1000, 100_000, 24_000_000):
-        usual, larger = pupil_sizes(n_pixels)
+        usual, larger = student_sizes(n_pixels)
         assert usual.sample < larger.sample < n_pixels
         assert usual.width < larger.width

@@ -19,12 +19,12 @@ from splinecli import inference
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.inference import estimate_normals
+from splinecli.light.indirect_light import IndirectLight, find_indirect_light
+from splinecli.light.lamp_light import LampLight, LightOf
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
-from splinecli.methods.estimator import Progress
-from splinecli.methods.indirect_light import IndirectLight, find_indirect_light
-from splinecli.methods.lamp_light import LampLight, LightOf
-from splinecli.methods.refiner import NetworkRefiner
-from splinecli.normals import angle_between_deg
+from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.system.progress import Progress
 
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)

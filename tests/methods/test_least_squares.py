@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scenes import cap_directions, spiral_lights
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.normals import angle_between_deg
 
 
 @pytest.mark.parametrize("count", [3, 4, 10, 96])

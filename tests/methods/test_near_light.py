@@ -13,9 +13,9 @@ from scenes import spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator, near_light
 from splinecli.methods.near_light import Blocks, find_surface
-from splinecli.normals import unit
 from splinecli.surface.camera import pixel_rays
 
 Floats = NDArray[np.float64]

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods.networks import NetworkEstimator, rotations_of
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
-from splinecli.normals import angle_between_deg
 
 COMPACT = NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)
 PAPER = NetworkConfig(size="paper", map_size=8)

@@ -15,16 +15,16 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate
 from splinecli.evaluation.scored_pixels import scored_rows
 from splinecli.inference import estimate_normals
-from splinecli.methods import refiner
+from splinecli.light.lamp_light import LampLight
+from splinecli.maths.normals import unit
 from splinecli.methods.estimator import UNKNOWN_ERROR
-from splinecli.methods.lamp_light import LampLight
 from splinecli.methods.networks import NetworkEstimator
-from splinecli.methods.refiner import NetworkRefiner
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.refine_net import REACH, RefineNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
-from splinecli.normals import unit
+from splinecli.refinement import tiles as refiner
+from splinecli.refinement.tiles import NetworkRefiner
 
 LIGHTS = spiral_lights(6, 60)
 

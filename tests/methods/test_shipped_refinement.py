@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scenes import directions_at
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.light.lamp_light import LampLight
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import refiner_of
-from splinecli.methods.lamp_light import LampLight
-from splinecli.methods.refiner import MARGIN, NetworkRefiner
-from splinecli.normals import angle_between_deg, unit
+from splinecli.refinement.tiles import MARGIN, NetworkRefiner
 
 SIZE = 64
 AZIMUTH = np.arange(10) * np.radians(36)

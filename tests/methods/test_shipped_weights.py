@@ -12,11 +12,11 @@ import torch
 
 from splinecli.capture import read_capture
 from splinecli.capture.lights.draws import draw_lights
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import CONFIDENT_DEG, confidence, tells_confidence
 from splinecli.networks.error_head import probability_within
 from splinecli.networks.weights import SHIPPED, manifest, resolve_weights
-from splinecli.normals import angle_between_deg, unit
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden/shipped_predictions.json"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import Estimator, MethodOptions, make_estimator, method_names
-from splinecli.normals import angle_between_deg
 
 Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 

@@ -10,8 +10,9 @@ from torch.nn.functional import normalize, pad
 
 from conftest import directions_at, spiral_lights
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.networks.detail import REACH, restore_detail
-from splinecli.networks.refine_features import CHANNELS, channels, refine_features
+from splinecli.networks.refine_channels import CHANNELS, channels
+from splinecli.refinement.detail import REACH, restore_detail
+from splinecli.refinement.features import refine_features
 
 SIDE = 48
 LIGHTS = torch.tensor(spiral_lights(10, 55), dtype=torch.float32)

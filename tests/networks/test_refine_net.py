@@ -7,15 +7,9 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.networks.refine_features import (
-    CHANNELS,
-    Turn,
-    refine_features,
-    split_features,
-    turn_features,
-    turn_maps,
-)
+from splinecli.networks.refine_channels import CHANNELS, split_features
 from splinecli.networks.refine_net import COARSEST, REACH, RefineNet
+from splinecli.refinement.features import Turn, refine_features, turn_features, turn_maps
 
 HEIGHT, WIDTH = 6, 9
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.pictures.error_map import TOP_DEG, colour_errors
 from splinecli.pictures.method_maps import method_maps
 

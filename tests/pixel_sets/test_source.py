@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.observation_map import cell_directions
+from splinecli.maths.observation_map import cell_directions
 from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
 from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
 from splinecli.pixel_sets.store import PixelSet

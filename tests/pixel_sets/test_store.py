@@ -17,7 +17,7 @@ from splinecli.errors import InputError, OutputError
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, open_pixel_set
 from splinecli.pixel_sets.writer import PixelSetWriter
-from splinecli.publishing import held_folder
+from splinecli.system.publishing import held_folder
 
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 MakeSet = Callable[..., PixelSet]

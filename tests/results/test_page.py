@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from browser import OpenPage
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.pictures.maps import albedo_picture
 from splinecli.results import page as page_module
 from splinecli.results.page import result_page
-from splinecli.transfer import decode_transfer, encode_srgb
 
 HOSTILE = """</script><script>document.title = "x"</script>'"<img src=x onerror=alert(1)>{{ 7 * 7 }}&amp;"""
 LONGEST_SIDE = 1600  # of a reduced map

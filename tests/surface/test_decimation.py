@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from glb_file import read_glb
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface import decimation
 from splinecli.surface.decimation import decimate, mesh_to_decimate
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh

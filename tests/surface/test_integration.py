@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface import integration
 from splinecli.surface.integration import integrate_normals
 

@@ -11,7 +11,8 @@ from scipy import stats
 from torch import Tensor
 
 from distributions import SHARE, N, assert_uniform, generator
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.transfer import decode_transfer
 from splinecli.synthesis.faults import (
     BITS,
     add_sensor_noise,
@@ -22,7 +23,6 @@ from splinecli.synthesis.faults import (
     quantise,
     restore,
 )
-from splinecli.transfer import decode_transfer
 
 
 def tilted_lights(pixels: int, lights: int) -> Tensor:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy import stats
 
-from splinecli.observation_map import cell_directions
+from splinecli.maths.observation_map import cell_directions
 from splinecli.synthesis.pixels import (
     PixelBatch,
     PixelGenerator,

@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from splinecli.observation_map import cell_directions
+from splinecli.maths.observation_map import cell_directions
 from splinecli.training.losses import (
     AXIS_LENGTH,
     Norm,

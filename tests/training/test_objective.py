@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from splinecli.maths.observation_map import cell_directions, sparse_map
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet, to_pixel_frame
-from splinecli.observation_map import cell_directions, sparse_map
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import TrainingConfig, preset

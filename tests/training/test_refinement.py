@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from splinecli.errors import UsageError
-from splinecli.networks.refine_features import CHANNELS
+from splinecli.networks.refine_channels import CHANNELS
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_weights
 from splinecli.pixel_sets.store import Pixels, PixelSet

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from splinecli.maths.observation_map import cell_directions
 from splinecli.networks.spline_net import SplineNet
-from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import TrainingConfig

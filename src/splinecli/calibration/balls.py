@@ -20,7 +20,7 @@ from splinecli.capture.formats.images import read_image, read_mask, to_linear
 from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 REFERENCES = ("ref", "reference")
 """Names, without suffix, of an image that shows the outline of the ball and belongs to no light."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.balls import BallCalibration, CalibratedLights
 from splinecli.calibration.lamp_positions import LampPositions
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 UNSURE_VISIBLE = 0.6
 """Smallest visible share of an outline without a warning."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.lights.lamp_files import read_camera_matrix
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface.camera import ray_basis
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.restore.white_level import WhiteLevel
-from splinecli.transfer import TransferCurve
+from splinecli.maths.transfer import TransferCurve
 
 
 @dataclass(frozen=True)

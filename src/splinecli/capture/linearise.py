@@ -20,7 +20,7 @@ from splinecli.capture.formats.images import to_linear
 from splinecli.capture.masks import take_pixels
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
-from splinecli.transfer import TransferCurve, decode_transfer
+from splinecli.maths.transfer import TransferCurve, decode_transfer
 
 _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
 SHADOW_SHARE = 0.05
 """Observations below this share of a pixel's largest one count as shadow."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from splinecli.capture.formats.text import read_text
 from splinecli.capture.paths import check_file, is_substitution
 from splinecli.errors import InputError
-from splinecli.files import file_sha256
+from splinecli.system.files import file_sha256
 
 if TYPE_CHECKING:
     from splinecli.capture.layouts.capture_files import CaptureFiles

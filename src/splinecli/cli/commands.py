@@ -16,7 +16,7 @@ from typer.core import TyperCommand, TyperGroup
 from splinecli.cli.choices import fill_in
 from splinecli.cli.failures import ParserError, batch_error_document, print_error_document
 from splinecli.cli.panels import sort_into_panels
-from splinecli.memory import check_address_space, keep_freed_memory
+from splinecli.system.memory import check_address_space, keep_freed_memory
 
 TERM_WIDTH = 30
 """Columns of the names of options in the help; a longer name has a line of its own."""

@@ -9,7 +9,7 @@ import typer
 
 from splinecli.cli.usage_errors import usage_message
 from splinecli.errors import OutputError, SplinecliError
-from splinecli.memory import is_out_of_memory
+from splinecli.system.memory import is_out_of_memory
 
 USAGE = 2
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."

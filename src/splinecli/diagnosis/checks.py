@@ -21,7 +21,7 @@ from splinecli.diagnosis.image_shifts import shift_warnings
 from splinecli.diagnosis.light_advice import light_warnings
 from splinecli.diagnosis.light_check import LightCheck
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 SMALLEST_SPREAD = 0.1
 """Lights that determine normals worse than this carry a warning; see light_spread."""

@@ -17,7 +17,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 from splinecli.diagnosis.light_check import LightCheck, check_lights
-from splinecli.solve_3x3 import solve_each
+from splinecli.maths.solve_3x3 import solve_each
 
 
 @dataclass(frozen=True, eq=False)

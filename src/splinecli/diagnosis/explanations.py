@@ -14,7 +14,7 @@ from splinecli.capture.capture_warnings import ENCODED_VALUES, LAMPS_NEAR, Captu
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_rows, shade
 from splinecli.capture.sample import Sample
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from splinecli.capture.capture_warnings import GROUND_TRUTH_FRAME, GROUND_TRUTH_
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.frame_evidence import rough_normals
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 MIN_ANGLE_DEG, MOST_LEFT = 20.0, 0.5
 """A ground truth is in another frame if its median angle to the rough normals is above the first, and another frame

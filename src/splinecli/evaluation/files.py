@@ -13,7 +13,7 @@ from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.tables import latex, markdown
-from splinecli.publishing import new_files
+from splinecli.system.publishing import new_files
 
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"

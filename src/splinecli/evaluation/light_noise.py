@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 LARGEST_SIGMA_DEG = 30.0
 """Largest standard deviation that an evaluation accepts."""

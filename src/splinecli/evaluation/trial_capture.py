@@ -18,8 +18,9 @@ from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Score, Trial
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import Estimator
-from splinecli.methods.estimator import Progress, refiner_of
+from splinecli.methods.estimator import refiner_of
 from splinecli.methods.near_light import find_surface
+from splinecli.system.progress import Progress
 
 _RETILTS = 100
 

@@ -15,9 +15,9 @@ from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
 from splinecli.capture.stamp import digest
 from splinecli.evaluation.protocol import Protocol
-from splinecli.files import parse_json, refusals_as_output_errors, write_text
 from splinecli.methods import Estimator
-from splinecli.publishing import is_plain
+from splinecli.system.files import parse_json, refusals_as_output_errors, write_text
+from splinecli.system.publishing import is_plain
 
 _LONGEST_LINE = 1 << 16  # characters
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splinecli.fits.shadows import lit_observations
 from splinecli.fits.weighted_least_squares import weighted_least_squares
-from splinecli.observation_map import dot
+from splinecli.maths.observation_map import dot
 
 SHADOW_SHARE = 0.1
 """Share of the pixel's quantile UNSHADED. Darker observations are left out as shadows, as the authors do."""

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.weighted_least_squares import weighted_sum
-from splinecli.observation_map import dot
-from splinecli.solve_3x3 import SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
+from splinecli.maths.observation_map import dot
+from splinecli.maths.solve_3x3 import SMALLEST_PIVOT, inverse_3x3, multiply_symmetric
 
 SHADOW_SHARE = 0.05
 ITERATIONS = 5

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.weighted_least_squares import weighted_least_squares
-from splinecli.observation_map import dot
+from splinecli.maths.observation_map import dot
 
 ITERATIONS = 50
 SMALLEST_RESIDUAL = 1e-7

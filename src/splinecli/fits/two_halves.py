@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.weighted_least_squares import RIDGE, weighted_sum
-from splinecli.observation_map import dot
+from splinecli.maths.observation_map import dot
 
 _TINY = 1e-9
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splinecli.observation_map import dot
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
+from splinecli.maths.observation_map import dot
+from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
 RIDGE = 1e-12
 """Weight of |b|^2. It matters only where the lights of positive weight lie in one plane."""

@@ -42,7 +42,7 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
     """Return the estimator of this name.
 
     Methods that run in PyTorch (all but "ls") limit its threads to the cores that the process may use; see
-    splinecli.devices.use_available_cores.
+    splinecli.system.devices.use_available_cores.
 
     Raises:
         UsageError: the name, the device or a number is not valid.
@@ -77,8 +77,8 @@ class _Solver:
     batch_size: int
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
-        from splinecli.devices import choose_device, use_available_cores
         from splinecli.methods.batched import BatchedEstimator
+        from splinecli.system.devices import choose_device, use_available_cores
 
         use_available_cores()
         solve = import_module(f"splinecli.fits.{self.module}").solve
@@ -96,9 +96,9 @@ class _Network:
     refines: bool = True
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
-        from splinecli.devices import choose_device, choose_precision, use_available_cores
         from splinecli.methods.networks import NetworkEstimator
         from splinecli.networks.weights import resolve_weights
+        from splinecli.system.devices import choose_device, choose_precision, use_available_cores
 
         use_available_cores()
         device = choose_device(options.device)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
-from splinecli.methods.estimator import Directions, Observations, Progress
+from splinecli.maths.observation_map import map_scale
+from splinecli.methods.estimator import Directions, Observations
 from splinecli.methods.least_squares import TOWARDS_CAMERA
-from splinecli.observation_map import map_scale
+from splinecli.system.progress import Progress
 
 Solve = Callable[[Tensor, Tensor], Tensor]
 """(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).

@@ -17,20 +17,20 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods.estimator import (
     UNKNOWN_ERROR,
     ConfidentEstimator,
     Directions,
     Observations,
-    Progress,
     refiner_of,
 )
 from splinecli.methods.least_squares import TOWARDS_CAMERA
-from splinecli.methods.perceptron import BATCH, Perceptron
 from splinecli.methods.pixel_sample import PixelSample, draw_sample
-from splinecli.methods.pupil_size import FEWEST_PIXELS, PupilSize
+from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize
 from splinecli.networks.error_head import median_error_deg
-from splinecli.normals import angle_between_deg
+from splinecli.networks.perceptron import BATCH, Perceptron
+from splinecli.system.progress import Progress
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 TURNED_PIXELS = 500_000
@@ -148,7 +148,7 @@ def distil(
     teacher: ConfidentEstimator,
     observations: Observations,
     light_directions: NDArray[np.floating],
-    size: PupilSize,
+    size: StudentSize,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -216,7 +216,7 @@ def distil(
     return DistilledEstimator(teacher, perceptron, sample, found, len(observations))
 
 
-def seconds_of_learning(light_directions: NDArray[np.floating], size: PupilSize, device: str) -> float:
+def seconds_of_learning(light_directions: NDArray[np.floating], size: StudentSize, device: str) -> float:
     """Measure a few steps of learning, and return the time of all. The network's time on the sample comes on top."""
     generator = torch.Generator().manual_seed(0)
     lights = torch.as_tensor(light_directions, dtype=torch.float32)

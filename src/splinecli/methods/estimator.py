@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.system.progress import Progress
+
 if TYPE_CHECKING:
-    from splinecli.methods.lamp_light import LightOf
+    from splinecli.light.lamp_light import LightOf
 
 Observations = NDArray[np.float32]
 """(P, F): linear, already divided by the light intensities."""
@@ -18,9 +19,6 @@ Observations = NDArray[np.float32]
 Directions = NDArray[np.floating]
 """(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
 the camera."""
-
-Progress = Callable[[int], object]
-"""A function that an estimator calls with the number of pixels that it has just finished."""
 
 
 class Estimator(Protocol):

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.methods.estimator import Directions, Observations, Progress
-from splinecli.normals import unit
-from splinecli.solve_3x3 import solve_each
+from splinecli.maths.normals import unit
+from splinecli.maths.solve_3x3 import solve_each
+from splinecli.methods.estimator import Directions, Observations
+from splinecli.system.progress import Progress
 
 TOWARDS_CAMERA = (0.0, 0.0, 1.0)
 """The normal of a pixel that is dark under every light."""

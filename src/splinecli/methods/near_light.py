@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.methods.lamp_light import LampLight, flat_depth, surface_points
+from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
 

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import ModelError, UsageError
+from splinecli.maths.observation_map import rotate_about_view_axis, sparse_map
 from splinecli.methods.batched import estimate_in_batches
-from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations, Progress
-from splinecli.methods.refiner import NetworkRefiner
+from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
-from splinecli.observation_map import rotate_about_view_axis, sparse_map
+from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.system.progress import Progress
 
 Precision = Literal["float32", "bfloat16"]
 

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from splinecli.errors import ModelError
+from splinecli.maths.observation_map import MAP_SIZE, Grid
 from splinecli.networks.set_branch import HEAD_WIDTH
 from splinecli.networks.starting_fits import STARTING_FITS
-from splinecli.observation_map import MAP_SIZE, Grid
 
 _CHOICES = {
     "size": ("paper", "compact"),

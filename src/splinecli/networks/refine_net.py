@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate, max_pool2d, pad
 
 from splinecli.networks.gaussian import gaussian_sum
 from splinecli.networks.layers import zeroed
-from splinecli.networks.refine_features import READ, split_features
+from splinecli.networks.refine_channels import READ, split_features
 
 WIDTHS = (32, 64, 96, 64)
 """Channels at the full resolution, and at a half, a quarter and an eighth of it."""

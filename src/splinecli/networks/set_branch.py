@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.fits.weighted_least_squares import weighted_sum
+from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 from splinecli.networks.layers import zeroed
-from splinecli.solve_3x3 import inverse_3x3, multiply_symmetric
 
 HEAD_WIDTH = 16
 """Channels of an attention head."""

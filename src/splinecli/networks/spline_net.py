@@ -21,19 +21,19 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.fits.lambertian import fit_lambertian
-from splinecli.networks.config import NetworkConfig
-from splinecli.networks.li_net import CompactLINet, PaperLINet
-from splinecli.networks.ne_net import CompactNENet, PaperNENet
-from splinecli.networks.refine_net import RefineNet
-from splinecli.networks.set_branch import SetBranch
-from splinecli.networks.starting_fits import fit_normals
-from splinecli.observation_map import (
+from splinecli.maths.observation_map import (
     cell_directions,
     map_scale,
     rotate_about_view_axis,
     sparse_map,
     unit_disc,
 )
+from splinecli.networks.config import NetworkConfig
+from splinecli.networks.li_net import CompactLINet, PaperLINet
+from splinecli.networks.ne_net import CompactNENet, PaperNENet
+from splinecli.networks.refine_net import RefineNet
+from splinecli.networks.set_branch import SetBranch
+from splinecli.networks.starting_fits import fit_normals
 
 RESIDUAL_LIMIT = 3.0
 

@@ -15,10 +15,10 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
-from splinecli.files import file_sha256, is_special, parse_json, write_bytes
 from splinecli.networks.capture_head import CaptureHead
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
+from splinecli.system.files import file_sha256, is_special, parse_json, write_bytes
 
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"

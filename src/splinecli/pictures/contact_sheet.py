@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import encode_picture
+from splinecli.maths.normals import encode_picture
 from splinecli.pictures.png import Picture
 from splinecli.pixel_sets.store import Entry, Pixels, PixelSet
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
+from splinecli.maths.transfer import encode_srgb
 from splinecli.pictures.png import Picture
-from splinecli.transfer import encode_srgb
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)
 """Light direction of the preview: low, from the upper left, which shows relief best."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import encode_picture
+from splinecli.maths.normals import encode_picture
 from splinecli.pictures.error_map import TITLE, TOP_DEG, colour_errors
 from splinecli.pictures.plotting import png_bytes
 from splinecli.pictures.png import Picture

@@ -12,7 +12,7 @@ from splinecli.pictures.plotting import png_bytes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from splinecli.observation_map import Grid
+    from splinecli.maths.observation_map import Grid
 
 _MAP_INCHES = 1.7
 _DPI = 150

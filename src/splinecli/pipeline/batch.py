@@ -53,8 +53,8 @@ def infer_batch(
         OutputError: the output folder cannot be written, or the disk is full.
         SplinecliError: the connection to a Dask scheduler was lost.
     """
-    from splinecli.files import check_writable
     from splinecli.results.index import Entry, check_index_free, has_index
+    from splinecli.system.files import check_writable
 
     members = list_captures(folders, shard)
     options.check_files()
@@ -215,9 +215,9 @@ def worst_exit_code(codes: Iterable[int]) -> int:
 
 def _write_index(entries: Sequence[Entry], output: Path, observer: Observer) -> None:
     """Write the page of all captures. Of those that changed it shows the results that were kept."""
-    from splinecli.files import write_text
-    from splinecli.publishing import held_folder
     from splinecli.results.index import INDEX, index_page, with_earlier
+    from splinecli.system.files import write_text
+    from splinecli.system.publishing import held_folder
 
     with held_folder(output, observer.warn, wait=True):
         write_text(output / INDEX, index_page(with_earlier(entries, output), output))

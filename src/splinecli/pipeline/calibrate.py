@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
+from splinecli.maths.transfer import AUTOMATIC, TransferCurve
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.transfer import AUTOMATIC, TransferCurve
 
 if TYPE_CHECKING:
     import numpy as np
@@ -86,7 +86,7 @@ class CalibrateOptions:
     @property
     def curve(self) -> TransferCurve:
         """The transfer curve of the gray target's images, as in RadiometricCalibration."""
-        from splinecli.transfer import parse_transfer
+        from splinecli.maths.transfer import parse_transfer
 
         return parse_transfer(self.transfer)
 
@@ -98,8 +98,8 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         InputError: an image or file cannot be used, or the numbers of images and lights differ.
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
     """
-    from splinecli.files import check_free
-    from splinecli.publishing import held_folder
+    from splinecli.system.files import check_free
+    from splinecli.system.publishing import held_folder
 
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
@@ -173,7 +173,7 @@ def _write(
 ) -> None:
     from splinecli.pictures.calibration import calibration_picture
     from splinecli.pictures.png import encode_png
-    from splinecli.publishing import new_files
+    from splinecli.system.publishing import new_files
 
     known = lamps if lamps is not None and lamps.known else None
     texts = {

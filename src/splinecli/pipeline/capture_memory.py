@@ -75,8 +75,8 @@ def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
 
     A GPU computes one at a time.
     """
-    from splinecli.devices import choose_device, count_available_cores
-    from splinecli.memory import available_memory
+    from splinecli.system.devices import choose_device, count_available_cores
+    from splinecli.system.memory import available_memory
 
     if choose_device(options.device).type == "cuda":
         return 1

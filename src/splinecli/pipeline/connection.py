@@ -15,10 +15,10 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from splinecli.devices import count_available_cores
 from splinecli.errors import UsageError
-from splinecli.extras import import_extra
-from splinecli.files import read_json
+from splinecli.system.devices import count_available_cores
+from splinecli.system.extras import import_extra
+from splinecli.system.files import read_json
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from splinecli.methods import Estimator
     from splinecli.methods.distilled import DistilledEstimator
     from splinecli.methods.estimator import ConfidentEstimator
-    from splinecli.methods.pupil_size import PupilSize
+    from splinecli.methods.student_size import StudentSize
 
 AUTOMATIC_FROM = 100_000
 """Pixels of the smallest capture for which a network is distilled unless the user asks for it."""
@@ -49,9 +49,9 @@ def distil_for(
         return _refuse(wanted, f"{capture.name}: captures under near lamps cannot be distilled")
     from splinecli.capture.capture_warnings import not_distilled
     from splinecli.methods.distilled import distil
-    from splinecli.methods.pupil_size import FEWEST_PIXELS, pupil_sizes
+    from splinecli.methods.student_size import FEWEST_PIXELS, student_sizes
 
-    sizes = pupil_sizes(capture.n_pixels)
+    sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     if wanted is None and not _is_faster(capture, estimator, sizes[0]):
@@ -75,7 +75,7 @@ def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarnin
     return None, []
 
 
-def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: PupilSize) -> bool:
+def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: StudentSize) -> bool:
     """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
     import numpy as np
 

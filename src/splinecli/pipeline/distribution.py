@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.extras import import_extra
-from splinecli.files import UNFINISHED, refusals_as_output_errors
-from splinecli.memory import available_memory, keep_freed_memory
 from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.observer import Observer
+from splinecli.system.extras import import_extra
+from splinecli.system.files import UNFINISHED, refusals_as_output_errors
+from splinecli.system.memory import available_memory, keep_freed_memory
 
 if TYPE_CHECKING:
     from distributed import Client, Future

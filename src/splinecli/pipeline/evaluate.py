@@ -12,7 +12,6 @@ from typing import Any
 from splinecli.capture import find_captures, open_capture
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.capture.restore.white_level import check_white_level
-from splinecli.devices import count_available_cores
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.capture_figures import (
     CaptureFigure,
@@ -26,11 +25,12 @@ from splinecli.evaluation.plan import check_skip_first, distinct_names, read_dra
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import Elsewhere, evaluate_all
 from splinecli.evaluation.trials import TrialStore
-from splinecli.files import check_writable
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.publishing import held_folder
+from splinecli.system.devices import count_available_cores
+from splinecli.system.files import check_writable
+from splinecli.system.publishing import held_folder
 
 DEFAULT_TRIALS = 100
 DEFAULT_LIGHTS = 10

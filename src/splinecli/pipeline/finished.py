@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from splinecli import __version__
 from splinecli.errors import SplinecliError
-from splinecli.locks import RefusedFolderError
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.system.locks import RefusedFolderError
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
@@ -37,9 +37,9 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
         InputError: the capture cannot be read.
         RefusedFolderError: both are one folder, which may have files of the user with the names of results.
     """
-    from splinecli.publishing import is_plain
     from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
     from splinecli.results.index import Entry
+    from splinecli.system.publishing import is_plain
 
     try:
         report = read_report(target)
@@ -73,7 +73,7 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
     `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
     """
     from splinecli.capture.stamp import digest
-    from splinecli.files import file_sha256
+    from splinecli.system.files import file_sha256
 
     if weights is not None and Path(weights).is_file():
         weights = loaded or file_sha256(Path(weights))

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
-    from splinecli.publishing import NewFiles
     from splinecli.results.clock import Clock
+    from splinecli.system.publishing import NewFiles
 
 
 def infer_capture(
@@ -53,7 +53,7 @@ def infer_capture(
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
     """Hold the folder of results of a capture (see held_folder) and yield it. Raises OutputError."""
-    from splinecli.publishing import held_folder, refuse_link
+    from splinecli.system.publishing import held_folder, refuse_link
 
     target = Path(options.output) / name
     refuse_link(target)

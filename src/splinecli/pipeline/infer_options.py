@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, get_args
 
 from splinecli.errors import UsageError, check_one_of
-from splinecli.exr import check_exr
+from splinecli.maths.normals import Convention
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
-from splinecli.normals import Convention
 from splinecli.pipeline.reading import Reading
 from splinecli.pipeline.surface import check_pixel_size
+from splinecli.system.exr import check_exr
 
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "bfloat16"]

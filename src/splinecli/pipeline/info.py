@@ -72,7 +72,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
     from splinecli.diagnosis.checks import check_sample
     from splinecli.diagnosis.evidence import StatedLights
     from splinecli.diagnosis.light_advice import candidate_rows
-    from splinecli.files import write_bytes
+    from splinecli.system.files import write_bytes
 
     source = options.reading.open(options.capture)
     if options.plot is not None:
@@ -150,7 +150,7 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
 
 
 def _check_plot(plot: Path, source: CaptureSource, *, overwrite: bool) -> None:
-    from splinecli.files import check_free
+    from splinecli.system.files import check_free
 
     if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
         raise UsageError(
@@ -203,13 +203,13 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
 
 def _seconds(summary: CaptureSummary) -> float:
     """Return the time of spline-net on a capture, distilled from the size where `infer` does so."""
-    from splinecli.methods.pupil_size import pupil_sizes
+    from splinecli.methods.student_size import student_sizes
     from splinecli.pipeline.distillation import AUTOMATIC_FROM
 
     count, lamps = summary.n_pixels, summary.source.lamps
     if count < AUTOMATIC_FROM or (lamps is not None and lamps.used):
         return count / PIXELS_PER_SECOND
-    return pupil_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
+    return student_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
 
 
 def _memory_mib(summary: CaptureSummary) -> float:

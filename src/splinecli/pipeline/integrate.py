@@ -9,10 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from splinecli.errors import InputError, UsageError
-from splinecli.exr import check_exr
-from splinecli.extras import import_extra
-from splinecli.files import read_json
-from splinecli.normals import Convention
+from splinecli.maths.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
     STIFFNESS,
@@ -28,6 +25,9 @@ from splinecli.surface.surface_files import (
     encode_surface,
     file_names,
 )
+from splinecli.system.exr import check_exr
+from splinecli.system.extras import import_extra
+from splinecli.system.files import read_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -105,8 +105,8 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
         UsageError: the stiffness or the largest step is negative.
     """
-    from splinecli.files import check_free
-    from splinecli.publishing import held_folder
+    from splinecli.system.files import check_free
+    from splinecli.system.publishing import held_folder
 
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
@@ -125,7 +125,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     from splinecli.capture.capture_size import BYTES_OF_SURFACE
     from splinecli.capture.formats.image_size import check_memory
     from splinecli.capture.lights.lamp_files import read_camera_matrix
-    from splinecli.publishing import new_files
+    from splinecli.system.publishing import new_files
 
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from splinecli.errors import InputError, OutputError, SplinecliError
-from splinecli.memory import is_out_of_memory
 from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.finished import find_earlier
 from splinecli.pipeline.infer import held_results, infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
+from splinecli.system.memory import is_out_of_memory
 
 if TYPE_CHECKING:
     from splinecli.methods import Estimator
@@ -106,7 +106,7 @@ def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, 
 
 def _failure(member: Member, error: Exception) -> Outcome:
     """Return what became of a capture that failed. Raises OutputError again, if other folders would fail, too."""
-    from splinecli.locks import RefusedFolderError
+    from splinecli.system.locks import RefusedFolderError
 
     name = member.name
     if isinstance(error, OutputError) and not isinstance(error, RefusedFolderError):

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.files import check_writable, write_bytes
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
@@ -16,7 +15,8 @@ from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name
 from splinecli.pixel_sets.rendered import ScenePlan, add_scene
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
-from splinecli.publishing import held_folder
+from splinecli.system.files import check_writable, write_bytes
+from splinecli.system.publishing import held_folder
 
 CONTACT_SHEET = "contact_sheet.png"
 

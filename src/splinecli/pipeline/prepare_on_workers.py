@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from splinecli.files import UNFINISHED
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import Observer
@@ -20,6 +19,7 @@ from splinecli.pixel_sets.rendered import (
     save_rendered,
 )
 from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.system.files import UNFINISHED
 
 
 @dataclass(frozen=True)

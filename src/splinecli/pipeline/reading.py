@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, get_args
 
 from splinecli.capture.lights.light_angles import LightForm
 from splinecli.errors import check_one_of
-from splinecli.transfer import AUTOMATIC, parse_transfer
+from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from splinecli.errors import InputError, OutputError
-from splinecli.extras import import_extra
-from splinecli.files import file_sha256, replacing
 from splinecli.pixel_sets.captures import free_name
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.principled import CLASSES
 from splinecli.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
+from splinecli.system.extras import import_extra
+from splinecli.system.files import file_sha256, replacing
 
 RENDERER = 3
 """Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both."""

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.observation_map import cell_directions, rotate_about_view_axis, sparse_map
+from splinecli.maths.observation_map import cell_directions, rotate_about_view_axis, sparse_map
 from splinecli.pixel_sets.dense_maps import fill_gaps
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph

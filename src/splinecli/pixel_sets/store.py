@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
-from splinecli.files import file_sha256, read_json
-from splinecli.memory import is_out_of_memory
+from splinecli.system.files import file_sha256, read_json
+from splinecli.system.memory import is_out_of_memory
 
 FORMAT = "splinecli-pixel-set-1"
 MANIFEST = "manifest.json"

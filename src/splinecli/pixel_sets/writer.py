@@ -11,8 +11,6 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.files import check_writable, file_sha256, write_text
-from splinecli.locks import LOCK
 from splinecli.pixel_sets.store import (
     ARRAYS,
     FORMAT,
@@ -23,7 +21,9 @@ from splinecli.pixel_sets.store import (
     parse_entries,
     read_manifest,
 )
-from splinecli.publishing import new_files
+from splinecli.system.files import check_writable, file_sha256, write_text
+from splinecli.system.locks import LOCK
+from splinecli.system.publishing import new_files
 
 
 class PixelSetWriter:

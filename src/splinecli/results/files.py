@@ -10,14 +10,14 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.files import read_json
 from splinecli.inference import NormalEstimate
-from splinecli.normals import Convention, describe, encode_picture
+from splinecli.maths.normals import Convention, describe, encode_picture
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
-from splinecli.publishing import NewFiles, is_plain, new_files
 from splinecli.results.clock import Clock
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.system.files import read_json
+from splinecli.system.publishing import NewFiles, is_plain, new_files
 
 NORMALS = {
     "png": "normals.png",
@@ -146,7 +146,7 @@ def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], conventi
     elif form == "npy":
         np.save(file, estimate.normal_map, allow_pickle=False)
     elif form == "exr":
-        from splinecli.exr import encode_exr
+        from splinecli.system.exr import encode_exr
 
         signs = np.array((1, 1 if convention == "opengl" else -1, 1), np.float32)
         colours = (estimate.normal_map * signs + 1) / 2 * estimate.capture.mask[..., None]
@@ -171,7 +171,7 @@ def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], new: NewF
     with new.open(ALBEDO) as file:
         np.save(file, albedo, allow_pickle=False)
     if exr:
-        from splinecli.exr import encode_exr
+        from splinecli.system.exr import encode_exr
 
         largest = np.finfo(np.float16).max
         content = encode_exr(albedo.clip(0, largest).astype(np.float16), {"colours": "linear RGB"})

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from splinecli.errors import InputError, OutputError
-from splinecli.memory import is_out_of_memory
 from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
 from splinecli.results.templates import render
+from splinecli.system.memory import is_out_of_memory
 
 INDEX = "index.html"
 

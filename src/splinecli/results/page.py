@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.pictures.error_map import TOP_DEG, colour_errors
 from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture
 from splinecli.pictures.png import Picture, encode_png

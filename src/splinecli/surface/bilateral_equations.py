@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
 
 Floats = NDArray[np.float64]

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
-from splinecli.extras import import_extra
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length, image_points, ray_basis
 from splinecli.surface.mesh import (
@@ -20,6 +19,7 @@ from splinecli.surface.mesh import (
     vertex_normals,
 )
 from splinecli.surface.normal_texture import normal_texture
+from splinecli.system.extras import import_extra
 
 TRIANGLES_LEFT = 4
 """Triangles before decimation, over those after it, at least."""

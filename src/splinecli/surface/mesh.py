@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface.camera import focal_length, image_points, pixel_rays
 
 

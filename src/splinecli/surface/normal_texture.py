@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface.mesh import fill_outside
 
 _TRIANGLES = 50_000  # at a time

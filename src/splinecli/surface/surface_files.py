@@ -95,7 +95,7 @@ def _encode(surface: Surface, form: str) -> dict[str, bytes]:
     elif form == "npy":
         np.save(buffer, surface.depth.astype(np.float32), allow_pickle=False)
     elif form == "exr":
-        from splinecli.exr import encode_exr
+        from splinecli.system.exr import encode_exr
 
         low = np.nanmin(surface.depth)
         heights = np.where(np.isfinite(surface.depth), surface.depth, low).astype(np.float32)

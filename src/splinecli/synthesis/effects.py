@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splinecli.observation_map import dot, rotate_about_view_axis
+from splinecli.maths.observation_map import dot, rotate_about_view_axis
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.random_numbers import draw_uniform
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from splinecli.capture.restore.saturation import restore_saturated
+from splinecli.maths.transfer import decode_transfer
 from splinecli.synthesis.random_numbers import draw_uniform
-from splinecli.transfer import decode_transfer
 
 DARK_SHARE = 0.4
 """Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.extras import import_extra
 from splinecli.synthesis.meshes import Floats, Mesh
+from splinecli.system.extras import import_extra
 
 Field = Callable[[Floats], Floats]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
-from splinecli.memory import is_out_of_memory
+from splinecli.system.memory import is_out_of_memory
 
 Floats = NDArray[np.floating]
 

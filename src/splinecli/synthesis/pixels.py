@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splinecli.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
+from splinecli.maths.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
 from splinecli.synthesis.effects import (
     Wall,

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.extras import import_extra
 from splinecli.synthesis.meshes import Floats, Mesh
+from splinecli.system.extras import import_extra
 
 OFFSET = 1e-4
 """Distance from the surface at which rays start. The frame has half-width 1, so rounding in float32 displaces hits by

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from splinecli.errors import ModelError
-from splinecli.files import write_bytes
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import load_strictly, read_json_entry, read_tensors, serialise, tensors_sha256
+from splinecli.system.files import write_bytes
 from splinecli.training.config import TrainingConfig
 
 FORMAT = "splinecli-checkpoint-2"

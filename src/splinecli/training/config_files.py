@@ -10,8 +10,8 @@ from typing import Any
 
 from splinecli.capture.formats.text import read_lines
 from splinecli.errors import InputError, ModelError, UsageError
-from splinecli.files import parse_json
 from splinecli.networks.weights import shipped_names
+from splinecli.system.files import parse_json
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 from splinecli.training.defaults import DEFAULT_PRESET
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from splinecli.devices import choose_precision
 from splinecli.errors import ModelError, OutputError
-from splinecli.files import check_writable, write_text
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
+from splinecli.system.devices import choose_precision
+from splinecli.system.files import check_writable, write_text
 from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS

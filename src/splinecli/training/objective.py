@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from splinecli.maths.observation_map import cell_directions
 from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.spline_net import PixelMaps, Rotation, SplineNet, to_pixel_frame
-from splinecli.observation_map import cell_directions
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig
 from splinecli.training.losses import (

@@ -14,17 +14,10 @@ from torch.nn.functional import pad
 
 from splinecli.fits.two_halves import alternating_signs
 from splinecli.networks.error_head import error_negative_log_likelihood
-from splinecli.networks.refine_features import (
-    Turn,
-    brightness,
-    channels,
-    refine_features,
-    split_features,
-    turn_features,
-    turn_maps,
-)
+from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import Entry, PixelSet
+from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
 from splinecli.synthesis.background import add_background
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved

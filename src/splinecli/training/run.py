@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from splinecli.devices import choose_device, use_available_cores
-from splinecli.files import check_writable
-from splinecli.publishing import held_folder
+from splinecli.system.devices import choose_device, use_available_cores
+from splinecli.system.files import check_writable
+from splinecli.system.publishing import held_folder
 from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import TrainingConfig
 from splinecli.training.config_files import Settings, configure, configure_resumed

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.errors import OutputError
-from splinecli.extras import import_extra
-from splinecli.files import refusals_as_output_errors, write_bytes, write_text
 from splinecli.pictures.observation_maps import observation_map_figure
 from splinecli.pictures.training_curves import training_curves
-from splinecli.publishing import refuse_link
+from splinecli.system.extras import import_extra
+from splinecli.system.files import refusals_as_output_errors, write_bytes, write_text
+from splinecli.system.publishing import refuse_link
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.validation import SampleMaps
 

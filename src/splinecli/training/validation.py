@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splinecli.maths.normals import angle_between_deg
 from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
-from splinecli.normals import angle_between_deg
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.training.losses import angular_loss
 from splinecli.training.objective import dense_truth_in_frame

@@ -17,7 +17,7 @@ from splinecli.capture import read_normal_map
 from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg, encode_picture, unit
+from splinecli.maths.normals import angle_between_deg, encode_picture, unit
 
 WriteImage = Callable[..., Path]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from splinecli.capture.lights.draws import draw_lights, read_draws
 from splinecli.errors import InputError, UsageError
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 
 def random_lights(n_lights: int, seed: int = 0) -> np.ndarray:

@@ -11,7 +11,7 @@ from splinecli.capture.lights.light_fit import find_factors
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.light_refinement import refine_capture, refine_lights, would_refine
 from splinecli.errors import UsageError
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 

@@ -16,7 +16,7 @@ from scenes import shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 SIDE = 60
 LIGHTS = spiral_lights(12, 50)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.transfer import GAMMAS, SRGB, TransferCurve, decode_transfer
+from splinecli.maths.transfer import GAMMAS, SRGB, TransferCurve, decode_transfer
 
 LARGEST_PROFILE = 1 << 22
 """Bytes of a profile. Those of cameras and screens have a few kilobytes."""

@@ -21,7 +21,7 @@ from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.formats.raw import decode_raw
 from splinecli.capture.formats.tiff import decode_tiff
 from splinecli.errors import InputError
-from splinecli.memory import is_out_of_memory
+from splinecli.system.memory import is_out_of_memory
 
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")

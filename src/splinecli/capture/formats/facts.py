@@ -20,7 +20,7 @@ from splinecli.capture.formats.raw import is_raw, raw_size
 from splinecli.capture.formats.tiff import first_page
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
-from splinecli.transfer import SRGB, TransferCurve
+from splinecli.maths.transfer import SRGB, TransferCurve
 
 if TYPE_CHECKING:
     from PIL import Image

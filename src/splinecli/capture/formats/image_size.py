@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splinecli.errors import InputError
-from splinecli.memory import LARGEST_IMAGE, available_memory
+from splinecli.system.memory import LARGEST_IMAGE, available_memory
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
-from splinecli.memory import is_out_of_memory
+from splinecli.system.memory import is_out_of_memory
 
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 """Pictures of normals."""

@@ -25,7 +25,7 @@ from splinecli.capture.formats.images import cut_out, read_mask
 from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-from splinecli.normals import SHORTEST_IN_PICTURE, Convention, decode_picture
+from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture
 
 _GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", *PICTURE_SUFFIXES)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.errors import InputError
-from splinecli.extras import import_extra
+from splinecli.system.extras import import_extra
 
 if TYPE_CHECKING:
     import rawpy

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
-from splinecli.memory import is_out_of_memory
+from splinecli.system.memory import is_out_of_memory
 
 _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
 _LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture

@@ -24,7 +24,7 @@ from splinecli.capture.lights.light_files import NPY, directions_of, read_light_
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import image_name, read_light_rows
 from splinecli.errors import InputError
-from splinecli.files import parse_json
+from splinecli.system.files import parse_json
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import fit_robustly, lit_rows, shade, shadow_weights
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 Lights = Array | Callable[[NDArray[np.integer]], Array]

@@ -19,7 +19,7 @@ from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
 from splinecli.capture.robust_fit import fit_robustly, lit_rows
 from splinecli.errors import UsageError
-from splinecli.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg, unit
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from splinecli.observation_map import map_scale
+from splinecli.maths.observation_map import map_scale
 
 BATCH = 256
 _LEARNING_RATE = 3e-3

@@ -11,20 +11,14 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.fits.two_halves import alternating_signs
-from splinecli.memory import return_freed_memory
-from splinecli.methods.estimator import Progress
-from splinecli.methods.lamp_light import LIT_AT_ONCE, LightOf
-from splinecli.networks.detail import FEWEST_LIGHTS, restore_detail
-from splinecli.networks.detail import REACH as DETAIL_REACH
-from splinecli.networks.refine_features import (
-    CHANNELS,
-    Turn,
-    brightness,
-    refine_features,
-    turn_features,
-    turn_maps,
-)
+from splinecli.light.lamp_light import LIT_AT_ONCE, LightOf
+from splinecli.networks.refine_channels import CHANNELS
 from splinecli.networks.refine_net import COARSEST, Part, RefineNet
+from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail
+from splinecli.refinement.detail import REACH as DETAIL_REACH
+from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
+from splinecli.system.memory import return_freed_memory
+from splinecli.system.progress import Progress
 
 MARGIN = 64
 """Pixels around a tile that are seen, a multiple of COARSEST.

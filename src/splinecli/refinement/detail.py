@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from splinecli.networks.gaussian import gaussian_sum, reach_of
-from splinecli.networks.refine_features import channels
+from splinecli.networks.refine_channels import channels
 
 FINE = 1.5
 """Detail is what a Gaussian filter with this sigma in pixels removes."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
 from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
 from splinecli.diagnosis.frame_evidence import smooth_normals
-from splinecli.methods.indirect_light import PixelPlaces
-from splinecli.methods.lamp_light import LightOf, parts_of_rows
-from splinecli.normals import angle_between_deg, unit
+from splinecli.light.indirect_light import PixelPlaces
+from splinecli.light.lamp_light import LightOf, parts_of_rows
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface.blocks import Blocks
 
 Doubles = NDArray[np.float64]

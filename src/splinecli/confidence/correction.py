@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.methods.capture_features import capture_features
+from splinecli.confidence.features import capture_features
+from splinecli.light.indirect_light import PixelPlaces
+from splinecli.light.lamp_light import LightOf, parts_of_rows
 from splinecli.methods.estimator import Estimator
-from splinecli.methods.indirect_light import PixelPlaces
-from splinecli.methods.lamp_light import LightOf, parts_of_rows
 
 Floats = NDArray[np.float32]
 

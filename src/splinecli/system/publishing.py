@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from splinecli.files import (
+from splinecli.system.files import (
     UNFINISHED,
     check_writable,
     create_hidden,
@@ -21,7 +21,7 @@ from splinecli.files import (
     sync,
     sync_names,
 )
-from splinecli.locks import RefusedFolderError, locked
+from splinecli.system.locks import RefusedFolderError, locked
 
 UNDONE = "an interrupted run left unfinished files, which are removed"
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.normals import unit
+from splinecli.maths.normals import unit
 from splinecli.surface.camera import focal_length, ray_basis
 
 Floats = NDArray[np.floating]

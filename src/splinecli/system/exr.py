@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.extras import import_extra
+from splinecli.system.extras import import_extra
 
 
 def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:

@@ -12,50 +12,9 @@ from torch import Tensor
 from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
 from splinecli.fits.two_halves import compare_halves
 from splinecli.fits.weighted_least_squares import weighted_sum
-from splinecli.observation_map import dot, map_scale
+from splinecli.maths.observation_map import dot, map_scale
+from splinecli.networks.refine_channels import MEDIAN_OFFSET, TENSOR, VECTORS, WIDTHS
 
-WIDTHS = {
-    "normal": 3,  # the estimated one
-    "robust": 3,  # the normal of the robust Lambertian fit, minus the estimated one
-    "plain": 3,  # the normal of least squares, minus the estimated one
-    "unexplained_light": 2,  # mean light direction, weighted by what a matte surface with this normal leaves
-    "mean_light": 2,
-    "light_moments": 3,  # xx, yy and xy of the light directions
-    "error_median": 1,  # of the error's distribution; see networks/error_head.py
-    "error_shape": 1,
-    "largest": 1,  # logarithm of the largest observation, relative to the capture
-    "mean": 1,  # of the observations, over the largest; the next two likewise
-    "deviation": 1,
-    "residual": 1,  # root mean square
-    "dark_share": 1,  # share of dark observations
-    "n_lights": 1,  # logarithm
-    "halves": 3,  # how two halves of the lights differ; the sign means nothing. See fits/two_halves.py
-    "noise": 1,  # of least squares. The net does not read it: it serves restore_detail of networks/detail.py
-}
-"""The features and their numbers of channels. Vectors have x and y first."""
-
-_VECTORS = ("normal", "robust", "plain", "unexplained_light", "mean_light", "halves")
-
-
-def channels(name: str) -> slice:
-    """Return the channels of a feature."""
-    names = list(WIDTHS)
-    start = sum(WIDTHS[other] for other in names[: names.index(name)])
-    return slice(start, start + WIDTHS[name])
-
-
-CHANNELS = sum(WIDTHS.values())
-READ = channels("noise").start
-"""Number of the channels that the net reads."""
-
-VECTORS = tuple((channels(name).start, channels(name).start + 1) for name in _VECTORS)
-"""Channels that hold the x and y of vectors, and turn with the image."""
-
-_FIRST = channels("light_moments").start
-TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)
-"""Channels that hold the xx, yy and xy of a tensor."""
-
-_MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
 _LARGEST_LOG = 4.0
 _HALVES_SCALE = 3.0  # brings these small numbers near the others
 
@@ -101,7 +60,7 @@ def refine_features(
         "unexplained_light": 4 / count * weighted_sum(unexplained, across),
         "mean_light": moments[..., :2].expand(len(observed), -1),
         "light_moments": moments[..., 2:].expand(len(observed), -1),
-        "error_median": error[:, :1] + _MEDIAN_OFFSET,
+        "error_median": error[:, :1] + MEDIAN_OFFSET,
         "error_shape": error[:, 1:] - 1,
         "largest": (scale / reference).log().clamp(-_LARGEST_LOG, _LARGEST_LOG) / 2,
         "mean": level,
@@ -118,13 +77,6 @@ def refine_features(
 def brightness(observations: Tensor) -> float:
     """Return the brightness of a capture: the median over its pixels (P, F) of the largest observation."""
     return max(float(observations.amax(dim=1).median()), 1e-12)
-
-
-def split_features(features: Tensor) -> tuple[Tensor, Tensor]:
-    """Return normals (B, 3, H, W) and error (B, 2, H, W) from maps of features (B, CHANNELS, H, W)."""
-    offset = features.new_tensor((-_MEDIAN_OFFSET, 1.0))[:, None, None]
-    error = features[:, channels("error_median").start : channels("error_shape").stop]
-    return features[:, channels("normal")], error + offset
 
 
 class Turn(NamedTuple):

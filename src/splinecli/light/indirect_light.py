@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.methods.lamp_light import LampLight, LightOf, Rows, parts_of_rows
-from splinecli.normals import unit
+from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
+from splinecli.maths.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
 

@@ -9,7 +9,7 @@ FEWEST_PIXELS = 64
 
 
 @dataclass(frozen=True)
-class PupilSize:
+class StudentSize:
     """How much is learned.
 
     Args:
@@ -23,11 +23,11 @@ class PupilSize:
     width: int
 
 
-def pupil_sizes(n_pixels: int) -> tuple[PupilSize, PupilSize]:
+def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     """Return the usual size for a capture of n_pixels, and the size where that one is not enough.
 
     Each pixel of the sample is learned some 25 times.
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.25), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
-    return PupilSize(usual, max(500, usual // 10), 192), PupilSize(larger, max(500, larger // 10), 320)
+    return StudentSize(usual, max(500, usual // 10), 192), StudentSize(larger, max(500, larger // 10), 320)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from splinecli.errors import UsageError
-from splinecli.memory import own_groups
+from splinecli.system.memory import own_groups
 
 if TYPE_CHECKING:
     import torch

@@ -1,0 +1,8 @@
+"""How a long computation tells its progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+Progress = Callable[[int], object]
+"""A function that is called with the number of pixels that were just finished."""
