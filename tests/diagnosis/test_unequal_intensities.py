@@ -16,7 +16,7 @@ def codes(intensities: np.ndarray) -> list[str]:
     lights = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)), axis=1)
     normals = np.concatenate((rng.normal(0, 0.3, (900, 2)), np.ones((900, 1))), axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    half = lights + np.array((0, 0, 1))
+    half = lights + np.array((0.0, 0.0, 1.0))
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     shaded = (0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ half.T).clip(0) ** 12) * intensities
     values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)

@@ -35,9 +35,9 @@ LEAST_EXPECTED = 0.1
 SAME_IMAGE = 1e-12
 """One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""
 
-UNEQUAL_MISFIT, UNEQUAL_RATIO = 0.1, 0.4
-"""Light intensities are unequal if equal ones leave more than the first, as a share of the brightness, and those that
-fit best leave less than the second share of it. Of right captures of metal, they leave 0.54 of it or more."""
+UNEQUAL_MISFIT, UNEQUAL_RATIO = (0.1, 0.4), 0.3
+"""Light intensities are unequal if equal ones leave a misfit in this range, as a share of the brightness, and those
+that fit best leave less than this share of it. Right captures of flat metal leave more than the range."""
 
 
 Check = Callable[[Evidence], list[CaptureWarning]]
@@ -115,7 +115,7 @@ def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
         float(replace(seen.factors, intensities_known=known).misfits(seen.directions[None])[0])
         for known in (True, False)
     )
-    if equal < UNEQUAL_MISFIT or free > UNEQUAL_RATIO * equal:
+    if not UNEQUAL_MISFIT[0] < equal < UNEQUAL_MISFIT[1] or free > UNEQUAL_RATIO * equal:
         return []
     observations = np.asarray(seen.observations, np.float32)
     if estimate_light_intensities(observations, None, seen.directions) is not None:
