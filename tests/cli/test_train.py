@@ -187,7 +187,8 @@ def test_refusals(run, golden, no_pictures):
     write_set("unfinished", finished=False)
     write_set("changed")
     normals = Path("changed/b/normals.npy")
-    normals.write_bytes(normals.read_bytes()[:-1] + b"?")
+    content = normals.read_bytes()
+    normals.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     Path("empty").mkdir()
     messages = []
     for code, arguments in (
