@@ -123,7 +123,8 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
     assert texts(capture.warnings) == (
-        "50.0 % of the pixels are black under every light; they get the normal (0, 0, 1).",
+        "50.0 % of the pixels are black under every light; they get the normal (0, 0, 1). Leave them out with a mask or"
+        " with --auto-mask.",
     )
     (capture_folder / "mask.png").unlink()
     with pytest.raises(InputError, match=r"8\.tif: found a value that is not finite"):
@@ -150,7 +151,10 @@ def test_pixels_that_no_light_reaches(
         pixels.flat[:n_black] = 0
         pixels[9, 9] = number == 8 and n_black < 100  # lit once: not black
         write_image(f"vase/img{number}.png", pixels)
-    message = f"{share} % of the pixels are black under every light; they get the normal (0, 0, 1)."
+    message = (
+        f"{share} % of the pixels are black under every light; they get the normal (0, 0, 1). Leave them out with a"
+        " mask or with --auto-mask."
+    )
     assert texts(read_capture(capture_folder).warnings) == (() if share is None else (message,))
 
 

@@ -244,6 +244,30 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     assert (refused.code, f"the surface of {n_pixels} pixels takes" in refused.err) == (3, True)
 
 
+@pytest.mark.parametrize(
+    ("where", "key", "value"),
+    [
+        ("options", "crop", 5),
+        ("options", "scale", 3),
+        ("options", "pixel_size", [1]),
+        ("options", "convention", None),
+        ("", "options", 7),
+        ("", "files", ["normals.npy", 5]),
+        ("", "file_sizes", 7),
+        ("", "near_lamps", {"camera": "perspective", "camera_matrix": [[0, 0, 0]] * 3}),
+    ],
+)
+def test_a_damaged_report_is_named(run, capture, where, key, value):
+    assert run("infer", capture, "--method", "ls", "--format", "npy").code == 0
+    path = Path("out", capture, "report.json")
+    report = json.loads(path.read_text())
+    (report[where] if where else report)[key] = value
+    path.write_text(json.dumps(report))
+    result = run("integrate", path.parent, "-o", "again")
+    assert (result.code, result.err.count("\n"), "Traceback" in result.err) == (3, 1, False)
+    assert "report.json" in result.err and "damaged" in result.err
+
+
 def test_refusals(run, golden):
     np.save("flat.npy", np.ones(SHAPE))
     dot = np.zeros((*SHAPE, 3), np.float32)

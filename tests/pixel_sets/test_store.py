@@ -211,7 +211,7 @@ def test_no_changed_byte_goes_unnoticed(make_set: MakeSet, array: str, entry: st
     path.write_bytes(whole)
     open_pixel_set(folder)
     path.unlink()
-    with pytest.raises(InputError, match="found no such file") as caught:
+    with pytest.raises(InputError, match="found no plain file") as caught:
         open_pixel_set(folder)
     assert caught.value.path == path
 
@@ -278,7 +278,7 @@ def test_an_overview_of_values_that_are_no_numbers(make_set: MakeSet) -> None:
         ("n_lights", "30", r"manifest\.json: a count of an entry is no whole number"),
         ("n_pixels", True, r"manifest\.json: a count of an entry is no whole number"),
         ("recipe", 5, r"manifest\.json: the recipe of an entry is no table"),
-        ("name", "d", r"d/observations\.npy: does not match the manifest: found no such file"),
+        ("name", "d", r"d/observations\.npy: does not match the manifest: found no plain file"),
     ],
 )
 def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message: str) -> None:

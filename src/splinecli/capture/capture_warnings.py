@@ -74,6 +74,7 @@ PROBABLY_WRONG = frozenset(
         IMAGE_ODD,
         IMAGES_SHIFTED,
         LAMP_DISTANCE,
+        LAMPS_NEAR,
         LIGHT_FRAME,
         LIGHT_ORDER,
         LOW_CONFIDENCE,
@@ -108,7 +109,10 @@ def saturated(share: float) -> CaptureWarning | None:
 
 def black_pixels(share: float) -> CaptureWarning | None:
     """Warn of too many pixels that no light reaches."""
-    text = "of the pixels are black under every light; they get the normal (0, 0, 1)."
+    text = (
+        "of the pixels are black under every light; they get the normal (0, 0, 1). Leave them out with a mask or with"
+        " --auto-mask."
+    )
     return _large_share(BLACK_PIXELS, share, BLACK_SHARE, text)
 
 

@@ -183,12 +183,16 @@ def _show_table(rows: Sequence[Row], statuses: Mapping[str, int], output: Path, 
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:
+    from splinecli.capture.capture_warnings import PROBABLY_WRONG
+
     errors, expected = report["angular_error_deg"], report["expected_under_5"]
     scored = ""
     if errors is not None:
         scored = f", MAE {errors['mean']:.2f} deg (median {errors['median']:.2f})"
     elif expected is not None:
-        condition = "" if report["capture_judged"] else " if the lights and the images are right"
+        doubted = any(warning["code"] in PROBABLY_WRONG for warning in report["warnings"])
+        judged = report["capture_judged"] and not doubted
+        condition = "" if judged else " if the lights and the images are right"
         scored = f", {expected:.0%} of them likely within 5 deg{condition}"
     counts = f"{report['n_pixels']} pixels, {report['n_lights']} lights"
     return f"{output / report['capture']}: {counts}, {report['method']}{scored}, {report['seconds']['total']:.1f} s"

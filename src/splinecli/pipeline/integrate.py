@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.maths.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
@@ -195,7 +195,7 @@ def _earlier_files(folder: Path) -> list[str]:
 
 
 def _find_normal_map(folder: Path) -> Path:
-    from splinecli.results.files import NORMALS, read_report
+    from splinecli.results.files import NORMALS, REPORT, UnfinishedError, read_report
 
     names = [NORMALS[name] for name in INPUT_FORMATS]
     try:
@@ -203,8 +203,10 @@ def _find_normal_map(folder: Path) -> Path:
         return folder / next(name for name in names if name in files)
     except StopIteration:
         problem = f"the folder has no normal map ({', '.join(names)})"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except UnfinishedError as error:
         problem = f"the folder has no whole results of infer: it {error}"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
     raise InputError(
         problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
     )
@@ -213,6 +215,7 @@ def _find_normal_map(folder: Path) -> Path:
 def _report_of(path: Path) -> dict[str, Any] | None:
     """Return the report of the `infer` that wrote a normal map; None for a normal map from elsewhere."""
     from splinecli.results.files import REPORT
+    from splinecli.surface.camera import ray_basis
 
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
@@ -221,10 +224,12 @@ def _report_of(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     try:
-        view_of_report(report)
+        camera_matrix, _ = view_of_report(report)
+        if camera_matrix is not None:
+            ray_basis(camera_matrix)
         if report["options"]["convention"] in get_args(Convention):
             return report
-    except (ValueError, KeyError, TypeError, UsageError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         pass
     raise InputError(
         "is damaged, or from another version: it does not say how the normal map beside it was made",

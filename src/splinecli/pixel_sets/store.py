@@ -185,7 +185,7 @@ def _check_arrays(entry: Entry, pixels: Pixels, folder: Path) -> None:
 def _map(path: Path) -> np.memmap[Any, Any]:
     """Map the array of a file into memory. Raises InputError."""
     if not path.is_file():
-        raise _mismatch(path, "no such file", "an array")
+        raise _mismatch(path, "no plain file", "an array")
     try:
         return np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # a damaged header fails in a dozen ways
@@ -198,5 +198,5 @@ def _mismatch(path: Path, found: str, expected: str) -> InputError:
     return InputError(
         f"does not match the manifest: found {found}, expected {expected}",
         path=path,
-        hint="Make the set again with 'splinecli prepare'",
+        hint="Remove the folder of the set, or choose another -o, and run 'splinecli prepare' again",
     )

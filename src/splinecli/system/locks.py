@@ -89,10 +89,18 @@ def _open_lock(path: Path) -> IO[str]:
     """Open a lock file, which is made as needed. Raises OutputError where there is something else, such as a pipe."""
     # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
+    refused = RefusedFolderError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
+    except (FileNotFoundError, PermissionError):
+        raise
+    except OSError:
+        if os.path.lexists(path):  # a link, a folder or a socket
+            raise refused from None
+        raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise RefusedFolderError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+        raise refused
     return os.fdopen(descriptor, "r+")
 
 
