@@ -26,7 +26,7 @@ from splinecli.light.lamp_light import LightOf
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
-from splinecli.refinement.tiles import Refiner
+from splinecli.refinement.tiles import NetworkRefiner
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
@@ -215,7 +215,7 @@ def make_captures(index: int, size: int) -> list[tuple[Capture, Floats]]:
 class Recorder:
     """A refiner that keeps what it was given."""
 
-    def __init__(self, refiner: Refiner) -> None:
+    def __init__(self, refiner: NetworkRefiner) -> None:
         self._refiner = refiner
         self.turns = refiner.turns
 

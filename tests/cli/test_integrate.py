@@ -35,7 +35,6 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     normals, _, inside = sphere()
     np.save("normals.npy", normals)
-    Path("report.json").write_text('{"files": ["normals.npy", "normals.png"]}')
     cv2.imwrite("normals.png", encode_picture(normals, inside)[..., ::-1])
     cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
 

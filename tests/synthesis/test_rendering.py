@@ -14,6 +14,7 @@ pytest.importorskip("embreex", reason="needs the extra 'render'")
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis import rendering
 from splinecli.synthesis.rendering import render_direct, render_indirect
 
 
@@ -31,6 +32,15 @@ class Matte:
 
     def albedo(self) -> Tensor:
         return self.reflectance
+
+
+@pytest.fixture(autouse=True)
+def _no_lobes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A matte surface has no sharp lobes that the renderer would soften."""
+    soften = rendering.soften
+    monkeypatch.setattr(
+        rendering, "soften", lambda found: found if isinstance(found, Matte) else soften(found)
+    )
 
 
 def matte(reflectance: float) -> dict[str, Matte]:

@@ -109,6 +109,8 @@ def rough_lights(seen: Evidence) -> list[CaptureWarning]:
 
 def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
     """Warn of intensities that are unequal, but that the images do not determine."""
+    if seen.lights.has_positions and seen.lights.lamps is None:
+        return []  # near lamps that count as distant look unequal
     if seen.lights.intensities_known or seen.factors is None:
         return []
     equal, free = (
@@ -142,7 +144,7 @@ CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (same_images, frozenset()),
-    (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), frozenset()),
+    (lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
     (lambda seen: encoded_values(seen.evened, seen.directions) if seen.lights.linear else [], DOUBTED),
     (lambda seen: [] if seen.lights.has_positions else near_lamps(seen.evened, seen.directions), EXPLAINED),
     (rough_lights, EXPLAINED | {codes.LAMPS_NEAR}),
