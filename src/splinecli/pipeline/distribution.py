@@ -38,8 +38,8 @@ _NO_WORKER_SECONDS = 60.0  # after which a cluster of this machine counts as los
 _PROBE_SECONDS = 3.0  # a network drive may show a new file a little later
 
 _ONE_AT_A_TIME = Lock()
-"""A worker process does one item at a time, whatever its number of threads: the working folder, the limits on what is
-read and PyTorch's threads belong to the process."""
+"""A worker process does one item at a time, whatever its number of threads: the working folder and
+PyTorch's threads belong to the process."""
 
 
 class LostError(SplinecliError):
