@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import os
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
@@ -99,28 +99,25 @@ def connected(options: ClusterOptions) -> Iterator[Client]:
 
 def _client(address: str) -> Client:
     """Return a client of the scheduler at the address. Raises UsageError."""
-    from distributed import Client
+    from distributed import Client, rpc
 
-    answers: SimpleQueue[Client | Exception] = SimpleQueue()
+    async def identify() -> Any:
+        async with rpc(address, timeout=_CONNECT_SECONDS) as server:
+            return await asyncio.wait_for(server.identity(), _ANSWER_SECONDS)
 
-    def connect() -> None:
-        try:
-            answers.put(Client(address, timeout=_CONNECT_SECONDS, set_as_default=False))
-        except Exception as error:
-            answers.put(error)
-
-    # In another thread: Dask waits for ever for a server that is no scheduler.
-    Thread(target=connect, daemon=True).start()
+    # A client waits for ever for a server that is no scheduler. One that fails to start can block Dask's event loop
+    # when Python deletes it. For this reason, the server says first what it is, in a thread: this one may have a loop.
     try:
-        answer = answers.get(timeout=_ANSWER_SECONDS)
-    except Empty:
-        answer = TimeoutError()
-    if isinstance(answer, Exception):
+        with ThreadPoolExecutor(1) as thread:
+            identity = thread.submit(asyncio.run, identify()).result()
+        if identity["type"] != "Scheduler":
+            raise ValueError(f"a {identity['type']} answers at {address}")
+        return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except Exception as error:
         raise UsageError(
             f"no Dask scheduler answers at {address}",
             hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
-        ) from answer
-    return answer
+        ) from error
 
 
 @contextmanager
