@@ -18,7 +18,8 @@ except BaseException:
     print("swallowed")
 """
 COMMAND = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 from splinecli import __main__
 from splinecli.cli import main
 def work():
