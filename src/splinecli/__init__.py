@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
+    from splinecli.capture.lights.found_lights import LightFinder
     from splinecli.inference import NormalEstimate
 
 __version__ = "0.2.0"
@@ -24,7 +25,7 @@ __all__ = ["__version__", "estimate_normals", "integrate_normals"]
 
 def estimate_normals(
     images: ArrayLike | Sequence[NDArray[Any]],
-    light_directions: ArrayLike,
+    light_directions: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     *,
     light_intensities: ArrayLike | None = None,
@@ -53,6 +54,7 @@ def estimate_normals(
         images: (F, H, W) gray or (F, H, W, 3) RGB, or a list of F such images, linear, row 0 at the top. uint8 and
             uint16 values are scaled by their full range; floating-point values are taken as they are.
         light_directions: (F, 3), from the object towards the lights, of any length; x right, y up, z to the camera.
+            None finds them from the images, as `infer --lights estimate` does; see capture.light_errors_deg.
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
             None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown: they are estimated if the images show
@@ -99,6 +101,11 @@ def estimate_normals(
     from splinecli.pipeline.estimate import estimate_capture
 
     check_method(method)
+    find: LightFinder | None = None
+    if light_directions is None:
+        from splinecli.light.unknown_lights import find_lights
+
+        find = find_lights
     capture = capture_from_arrays(
         images,
         light_directions,
@@ -107,6 +114,7 @@ def estimate_normals(
         pixel_size=pixel_size,
         white_level=white_level,
         as_stored=as_stored,
+        find_lights=find,
     )
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)

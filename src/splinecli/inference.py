@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.confidence.correction import correct_errors
+from splinecli.confidence.correction import add_light_error, correct_errors
 from splinecli.errors import SplinecliError
 from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows
@@ -151,6 +151,8 @@ def _estimate(
         with begin("refining") as advance:
             refiner.refine(capture.mask, capture.observations, light_of, normals, errors, progress=advance)
     judged = errors is not None and correct_errors(capture, estimator, light_of, normals, errors)
+    if errors is not None and capture.light_errors_deg is not None:
+        add_light_error(errors, capture.light_errors_deg)
     return normals, errors, judged
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splinecli.capture.formats.images import to_linear
+from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
 from splinecli.capture.lights.near_lamps import NearLamps
@@ -25,20 +26,22 @@ _KINDS = (np.uint8, np.uint16)
 
 def capture_from_arrays(
     images: ArrayLike | Sequence[NDArray[Any]],
-    light_directions: ArrayLike,
+    light_directions: ArrayLike | None,
     mask: ArrayLike | None = None,
     *,
     light_intensities: ArrayLike | None = None,
     pixel_size: float | None = None,
     white_level: float | None = None,
     as_stored: bool = False,
+    find_lights: LightFinder | None = None,
 ) -> Capture:
     """Return the capture of these images, restored as `infer` restores the capture of a folder.
 
     Args:
         images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by their full range;
             floating-point values are taken as they are.
-        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
+        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera. None to find them
+            with find_lights.
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one, as in a mask file.
             None takes all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
@@ -48,6 +51,7 @@ def capture_from_arrays(
             integer images; floating-point images then have none.
         as_stored: use the values alone. By default, saturated observations are restored and unknown light intensities
             are estimated.
+        find_lights: finds the lights from the images, where none are given.
 
     Raises:
         UsageError: a shape or a type does not fit.
@@ -55,7 +59,15 @@ def capture_from_arrays(
     """
     stack = _checked_images(images)
     shape, n_lights = stack[0].shape[:2], len(stack)
-    directions = _checked_directions(light_directions, n_lights)
+    if light_directions is None and pixel_size is not None:
+        raise UsageError(
+            "light_directions is None, but near lamps need positions", hint="Leave pixel_size out"
+        )
+    directions = (
+        placeholders(n_lights)
+        if light_directions is None
+        else _checked_directions(light_directions, n_lights)
+    )
     intensities = _checked_intensities(light_intensities, n_lights)
     inside = np.ones(shape, np.bool_) if mask is None else _inside(np.asarray(mask))
     if inside.shape != shape:
@@ -84,6 +96,8 @@ def capture_from_arrays(
         warnings = (*capture.warnings, *check_distances(lamps, inside, None))
         capture = replace(capture, lamps=lamps, warnings=warnings)
     stored = StoredCapture(capture, found.saturation, intensities_known=known)
+    if light_directions is None and find_lights is not None:
+        stored = stored.find_lights(find_lights)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
 
 

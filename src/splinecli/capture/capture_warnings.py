@@ -36,6 +36,7 @@ DISPLAY_ENCODED = "display_encoded"
 EIGHT_BIT = "eight_bit"
 ENCODED_VALUES = "encoded_values"
 ESTIMATED_INTENSITIES = "estimated_intensities"
+ESTIMATED_LIGHTS = "estimated_lights"
 EXIF_ORIENTATION = "exif_orientation"
 FEW_LIGHTS = "few_lights"
 GROUND_TRUTH_FRAME = "ground_truth_frame"
@@ -139,6 +140,15 @@ def estimated_intensities(intensities: NDArray[np.float64]) -> CaptureWarning:
         "The light intensities were estimated from the images: they are unequal, from"
         f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. Use --intensities FILE if you have"
         " measured them, or --intensities equal to assume equal ones.",
+    )
+
+
+def estimated_lights(errors_deg: NDArray[np.float64]) -> CaptureWarning:
+    """Say that the light directions were found from the images, and with which expected errors (F,) in degrees."""
+    return CaptureWarning(
+        ESTIMATED_LIGHTS,
+        f"The light directions were estimated from the images. They are expected to be wrong by {errors_deg.mean():.0f}"
+        f" degrees on average, the worst one by {errors_deg.max():.0f}; the normals turn with them.",
     )
 
 

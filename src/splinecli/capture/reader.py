@@ -15,6 +15,7 @@ from splinecli.capture.formats.exif import UPRIGHT, check_exposures, common_orie
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
+from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
 from splinecli.capture.lights.light_angles import LightForm, RowForm
 from splinecli.capture.lights.light_files import read_light_intensities
@@ -46,6 +47,7 @@ def open_capture(
     lights_format: LightForm = "xyz",
     lamps: LampOptions = NO_LAMP_OPTIONS,
     window: Window = WHOLE,
+    find_lights: LightFinder | None = None,
 ) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
 
@@ -61,6 +63,7 @@ def open_capture(
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: where near lamps are, if no files in the folder say so.
         window: the part of the images that is read.
+        find_lights: finds the lights from the images, in place of light files.
 
     Raises:
         InputError: the folder contains no capture (see find_capture_files), a light file is wrong, or the window is not
@@ -69,12 +72,13 @@ def open_capture(
     """
     check_white_level(white_level)
     equal = intensities is not None and str(intensities) == EQUAL
-    named = (lights, None if equal else intensities, mask, ground_truth)
-    overrides = Overrides(*(None if file is None else Path(file) for file in named))
+    given = (lights, None if equal else intensities, mask, ground_truth)
+    paths = (None if file is None else Path(file) for file in given)
+    overrides = Overrides(*paths, needs_lights=find_lights is None)
     if lamps.positions is not None and lights is not None:
         raise UsageError("--lights and --light-positions contradict each other", hint="Leave one out")
     form: RowForm = lights_format
-    near = find_lamps(Path(folder), overrides.lights, lamps)
+    near = None if find_lights is not None else find_lamps(Path(folder), overrides.lights, lamps)
     if near is not None and near.used and near.positions is not None:
         if lights_format != "xyz":
             raise UsageError(
@@ -90,7 +94,9 @@ def open_capture(
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
     stamp = stamp_files(files, radiometry.flat_field, () if near is None else near.stamp)
-    source = _read_lights(files, radiometry, light_frame, form, near, equal=equal)
+    source = replace(
+        _read_lights(files, radiometry, light_frame, form, near, equal=equal), find_lights=find_lights
+    )
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
@@ -154,8 +160,9 @@ def _read_lights(
     path, in_folder = files.light_directions, files.images
     warnings: list[CaptureWarning] = []
     intensities = None
-    named = read_lights(path, len(files.images), frame, form)
+    named = placeholders(len(in_folder)) if path is None else read_lights(path, len(in_folder), frame, form)
     if isinstance(named, NamedLights):
+        assert path is not None
         images, how = named.match(files.images)
         flats = radiometry.flat_field
         if len(flats) == len(files.images) > 1:  # they are in the order of the folder's images

@@ -45,6 +45,8 @@ class Capture:
             where no observation was restored.
         white_level: the stored value from which observations counted as saturated; None for floating-point images
             and for captures that are not read from images.
+        light_errors_deg: (F,) float64, the expected errors of light_directions where they were found from the images;
+            else None.
         lamps: where the lamps are, if they are near; then light_directions are those at the origin, the middle of the
             image on the object's mean plane. None for distant lights.
 
@@ -64,6 +66,7 @@ class Capture:
     restored: NDArray[np.bool_] | None = None
     white_level: WhiteLevel | None = None
     lamps: NearLamps | None = None
+    light_errors_deg: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
@@ -113,6 +116,7 @@ class Capture:
             else self.estimated_intensities[chosen],
             restored=None if self.restored is None else self.restored[:, chosen],
             lamps=None if self.lamps is None else self.lamps.choose_lights(chosen),
+            light_errors_deg=None if self.light_errors_deg is None else self.light_errors_deg[chosen],
         )
 
     def choose_pixels(self, positions: NDArray[np.integer]) -> Capture:

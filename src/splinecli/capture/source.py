@@ -16,6 +16,7 @@ from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.read_ahead import read_ahead
 from splinecli.capture.layouts.capture_files import CaptureFiles
+from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
@@ -42,7 +43,8 @@ class CaptureSource:
     Args:
         files: the files of the capture.
         facts: what the header of each image states.
-        light_directions: (F, 3) float64, unit; x right, y up, z to the camera.
+        light_directions: (F, 3) float64, unit; x right, y up, z to the camera. They mean nothing
+            where find_lights is given.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         intensities_known: whether a file or the user gives the intensities.
         intensities_measured: whether a file gives the intensities.
@@ -53,6 +55,7 @@ class CaptureSource:
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
         lamps: what is known of near lamps, or None.
         window: the part of the images that is read. All masks but those in files have its size.
+        find_lights: finds the lights from the images; None where files give them.
         stamp: JSON values that change when a file that is read for the capture, or the given white level, does. They
             are older than what was read: a file that changed meanwhile has another stamp the next time.
     """
@@ -70,6 +73,7 @@ class CaptureSource:
     light_frame: LightFrame = USUAL_FRAME
     lamps: LampFiles | None = None
     window: Window = WHOLE
+    find_lights: LightFinder | None = None
     stamp: tuple[Any, ...] = ()
 
     @property
@@ -139,7 +143,8 @@ class CaptureSource:
             white_level=found.saturation.white_level,
             lamps=None if lamps is None else lamps.choose_lights(indices),
         )
-        return StoredCapture(capture, found.saturation, self.intensities_known)
+        stored = StoredCapture(capture, found.saturation, self.intensities_known)
+        return stored if self.find_lights is None else stored.find_lights(self.find_lights)
 
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:
         """Return this capture with a mask made from all its images (see find_object), unless it has a mask already.

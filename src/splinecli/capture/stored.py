@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings
+from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
@@ -32,11 +33,30 @@ class StoredCapture:
         capture: the stored observations, linear, divided by the light intensities that the files give.
         saturation: which observations are saturated.
         intensities_known: whether a file, an option or the image format gives the light intensities.
+        found_intensities: (F,), those that were found together with the directions, or None.
     """
 
     capture: Capture
     saturation: Saturation
     intensities_known: bool
+    found_intensities: NDArray[np.float64] | None = None
+
+    def find_lights(self, find: LightFinder) -> StoredCapture:
+        """Return the capture under lights that are found from these observations.
+
+        Raises:
+            InputError: the images do not tell the lights, or the lights that are found cannot give normals.
+        """
+        capture = self.capture
+        found = find(capture.observations, capture.mask, self.intensities_known)
+        warning = capture_warnings.estimated_lights(found.errors_deg)
+        capture = replace(
+            capture,
+            light_directions=found.directions,
+            light_errors_deg=found.errors_deg,
+            warnings=(*capture.warnings, warning),
+        )
+        return replace(self, capture=capture, found_intensities=found.intensities)
 
     def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
         """Return the capture under some of its lights, with arrays of its own; see Capture.choose_lights.
@@ -46,7 +66,8 @@ class StoredCapture:
         capture, saturation = self.capture.choose_lights(positions), self.saturation.choose_images(positions)
         if saturation.white_level != capture.white_level:
             capture = replace(capture, white_level=saturation.white_level)
-        return replace(self, capture=capture, saturation=saturation)
+        found = None if self.found_intensities is None else self.found_intensities[list(positions)]
+        return replace(self, capture=capture, saturation=saturation, found_intensities=found)
 
     def choose_pixels(self, rows: NDArray[np.integer]) -> StoredCapture:
         """Return the capture with some of its pixels, with arrays of its own.
@@ -60,8 +81,8 @@ class StoredCapture:
 
     def estimate_intensities(self) -> NDArray[np.float64] | None:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
-        if self.intensities_known:
-            return None
+        if self.intensities_known or self.found_intensities is not None:
+            return self.found_intensities
         return estimate_light_intensities(
             self.capture.observations,
             self.saturation.flags,

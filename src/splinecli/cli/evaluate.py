@@ -33,6 +33,7 @@ def evaluate(
     seed: int = inputs.SEED,
     draws: Path | None = inputs.DRAWS,
     light_noise_deg: list[float] | None = inputs.LIGHT_NOISE,
+    lights: str | None = inputs.ESTIMATED_LIGHTS,
     refine_lights: bool = inputs.REFINE_LIGHTS,
     light_error_deg: float | None = inputs.LIGHT_ERROR,
     as_stored: bool = inputs.AS_STORED,

@@ -71,7 +71,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "evaluate": {
         "Input": ("--skip-first", "--max-pixels", "--as-stored", "--white-level"),
-        "Lights": ("--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg", *REFINED),
+        "Lights": ("--lights", "--n-lights", "--trials", "--seed", "--draws", "--light-noise-deg", *REFINED),
         "Method": ("--method", "--weights", "--rotations"),
         "Output": ("--output", "--figures", "--pixel", *REPEAT),
         "Speed": ("--jobs", *SPEED),

@@ -49,3 +49,13 @@ def correct_errors(
             own = torch.from_numpy(errors[rows])
             errors[rows] = head(own, torch.from_numpy(pixels.astype(np.float32)), whole).numpy()
     return True
+
+
+def add_light_error(errors: Floats, light_errors_deg: NDArray[np.float64]) -> None:
+    """Widen distributions of errors (P, 2) in place by the expected errors (F,) of lights that were estimated.
+
+    Such lights are wrong together: the normals turn with them, by about as much. The medians of both errors add up as
+    those of independent errors do.
+    """
+    turn = np.radians(light_errors_deg.mean())
+    errors[:, 0] = np.logaddexp(2 * errors[:, 0], 2 * np.log(turn)) / 2

@@ -152,6 +152,9 @@ CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
 )
 """The checks, and the codes of earlier warnings after which each is skipped."""
 
+WITHOUT_LIGHTS = (CHECKS[0][0], missing_mask, same_images)
+"""The checks that need no lights. Where the lights were found from the images, only these are made."""
+
 
 def check_capture(source: CaptureSource, capture: Capture, *, strict: bool = False) -> list[CaptureWarning]:
     """Return warnings about a capture that was read from this source; see check_sample."""
@@ -183,8 +186,8 @@ def check_sample(
     *,
     truth: NDArray[np.floating] | None = None,
     strict: bool = False,
-) -> tuple[LightCheck, list[CaptureWarning]]:
-    """Return what a sample and a closeup of some images say about their lights, and all warnings.
+) -> tuple[LightCheck | None, list[CaptureWarning]]:
+    """Return what a sample and a closeup of some images say about their lights (None if found in them), and warnings.
 
     Args:
         sample: its observations are not divided by estimated intensities.
@@ -195,9 +198,11 @@ def check_sample(
     seen = Evidence(lights, sample, closeup, background, truth, strict)
     warnings: list[CaptureWarning] = []
     for check, unless in CHECKS:
+        if lights.found and check not in WITHOUT_LIGHTS:
+            continue
         if unless.isdisjoint(warning.code for warning in warnings):
             warnings += check(seen)
-    return seen.light_check, warnings
+    return None if lights.found else seen.light_check, warnings
 
 
 def light_spread(light_directions: NDArray[np.float64]) -> tuple[float, bool]:

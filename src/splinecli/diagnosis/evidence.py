@@ -35,6 +35,7 @@ class StatedLights:
         linear: whether the values of the images are taken as linear.
         lamps: all near lamps, over the grid of the sample that is checked; None if the lights count as distant.
         has_positions: whether positions of lamps are known.
+        found: whether the lights were found from these images, so that the images cannot contradict them.
     """
 
     names: Sequence[str]
@@ -47,6 +48,7 @@ class StatedLights:
     linear: bool
     lamps: NearLamps | None
     has_positions: bool
+    found: bool = False
 
     @classmethod
     def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
@@ -56,13 +58,14 @@ class StatedLights:
             names=[source.files.images[index].name for index in indices],
             directions=source.light_directions,
             indices=indices,
-            origin=source.files.light_directions,
+            origin=source.files.light_directions or Path("light_directions"),
             frame=source.light_frame,
             intensities_measured=source.intensities_measured,
             intensities_known=source.intensities_known,
             linear=source.radiometry.curve == 1,
             lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
             has_positions=source.lamps is not None,
+            found=source.find_lights is not None,
         )
 
     @classmethod
@@ -83,6 +86,7 @@ class StatedLights:
             linear=True,
             lamps=lamps,
             has_positions=lamps is not None,
+            found=capture.light_errors_deg is not None,
         )
 
 

@@ -24,6 +24,7 @@ _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
 _COLUMNS = (
     "method", "capture", "n_lights", "light_noise_deg", "mae_deg", "std_deg", "trials", "seconds", "as_stored",
+    "found_light_error_deg",
 )  # fmt: skip
 
 
@@ -109,6 +110,7 @@ def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
         "as_stored": first.as_stored,
         "white_level": first.white_level,
         "light_error_deg": first.light_error_deg,
+        "lights_estimated": first.finds_lights,
     }
 
 
@@ -124,6 +126,9 @@ def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
             "trials": result.trials,
             "seconds": round(result.seconds, _SECOND_DIGITS),
             "as_stored": evaluation.protocol.as_stored,
+            "found_light_error_deg": None
+            if result.found_light_error_deg is None
+            else round(result.found_light_error_deg, _DEGREE_DIGITS),
         }
         for evaluation in evaluations
         for result in evaluation.results

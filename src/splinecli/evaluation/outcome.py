@@ -22,6 +22,7 @@ class Result:
         n_lights: number of lights in each draw.
         maes_deg: mean angular error (MAE) over the scored pixels, in degrees, of each trial.
         seconds: mean time to estimate the normals of a trial.
+        found_light_error_deg: mean error of the light directions that the trials estimated; None where they did not.
     """
 
     method: str
@@ -29,6 +30,7 @@ class Result:
     n_lights: int
     maes_deg: tuple[float, ...]
     seconds: float
+    found_light_error_deg: float | None = None
 
     @property
     def trials(self) -> int:

@@ -56,7 +56,9 @@ class ProtocolTrials:
             scores = [score for trial in trials if (score := store.find(trial)) is not None]
             seconds = math.fsum(score.seconds for score in scores) / len(scores)
             maes_deg = tuple(score.mae_deg for score in scores)
-            results.append(Result(method, capture, len(trials[0].lights), maes_deg, seconds))
+            found = [s.found_light_error_deg for s in scores if s.found_light_error_deg is not None]
+            light_error_deg = math.fsum(found) / len(found) if found else None
+            results.append(Result(method, capture, len(trials[0].lights), maes_deg, seconds, light_error_deg))
             n_estimated[capture] = (sum(score.estimated_intensities for score in scores), len(scores))
         if not results:
             raise _nothing_scored([self.failures[name] for name in captures])
@@ -66,6 +68,11 @@ class ProtocolTrials:
             f"{name}: no file gives the light intensities; they were estimated in {count} of {of} trials."
             for name, (count, of) in n_estimated.items()
             if count
+        ]
+        notes += [
+            f"{name}: the estimated light directions are wrong by {error_deg:.2f} degrees on average."
+            for name, error_deg in {r.capture: r.found_light_error_deg for r in results}.items()
+            if error_deg is not None
         ]
         return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes))
 
@@ -143,7 +150,7 @@ class CaptureJob:
         rows = scored_rows(stored.capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
         as_stored = all(task.protocol.as_stored for task in self.tasks)
         whole = any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw) or any(
-            task.protocol.light_error_deg is not None for task in self.tasks
+            task.protocol.light_error_deg is not None or task.protocol.finds_lights for task in self.tasks
         )
         return TrialSource.with_pixels(stored, rows, as_stored=as_stored, whole=whole)
 
@@ -198,6 +205,8 @@ def draws_for(
         )
     if protocol.light_error_deg is not None:
         check_distant(near=source.lamps is not None and source.lamps.used)
+    if protocol.finds_lights and source.lamps is not None and source.lamps.used:
+        raise UsageError(f"{name}: --lights estimate finds distant lights, and this capture has near lamps")
     skipped = protocol.skipped_lights(name)
     left = source.n_lights - skipped
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)

@@ -31,9 +31,9 @@ class Protocol:
         as_stored: score the stored values alone, as the published tables do. By default, saturated observations are
             restored and unknown light intensities are estimated, as `infer` does.
         white_level: stored value from which an observation is saturated; None to find it, see open_capture.
-
         light_error_deg: usual error of light directions, with which each trial refines its directions (see
             refine_capture). None refines none.
+        finds_lights: whether each trial finds its lights from its images, as `infer --lights estimate` does.
 
     Raises:
         UsageError: a value is out of its range.
@@ -49,6 +49,7 @@ class Protocol:
     as_stored: bool = False
     white_level: float | None = None
     light_error_deg: float | None = None
+    finds_lights: bool = False
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
@@ -99,5 +100,7 @@ def protocol_in_words(protocol: Protocol) -> str:
         parts.append(f"white level {protocol.white_level:g}")
     if protocol.light_error_deg is not None:
         parts.append("lights refined")
+    if protocol.finds_lights:
+        parts.append("lights estimated from the images")
     parts.append("images as stored" if protocol.as_stored else "images restored")
     return ", ".join(parts)

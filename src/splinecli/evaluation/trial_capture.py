@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from threading import Lock
 
 import numpy as np
@@ -17,6 +19,8 @@ from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Score, Trial
 from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.light.unknown_lights import find_lights
+from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.methods.near_light import find_surface
@@ -64,6 +68,9 @@ class TrialSource:
         It has the scored pixels, or with `whole` all of them. Lights are refined from all pixels, as in `infer`.
         """
         rows = None if whole else self.rows
+        if trial.finds_lights:
+            capture = self._see(trial, None)
+            return capture if rows is None else capture.choose_pixels(rows)
         if trial.light_error_deg is None:
             return self._see(trial, rows)
         known = self.stored.intensities_known
@@ -77,6 +84,8 @@ class TrialSource:
         seen = self.stored.choose_lights([position[light] for light in trial.lights])
         if trial.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
+        if trial.finds_lights:
+            seen = seen.find_lights(partial(find_lights, largest_error_deg=math.inf))
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
         intensities = None if trial.as_stored else seen.estimate_intensities()
         if rows is None or seen.capture.lamps is None:
@@ -109,7 +118,17 @@ class SharedDraw:
         progress = None if begin is None else begin(capture.n_pixels)
         estimate = estimate_normals(capture, estimator, progress=progress)
         estimated = capture.estimated_intensities is not None
-        return Score(self._mean_error_deg(estimate), estimate.seconds, estimated)
+        return Score(
+            self._mean_error_deg(estimate), estimate.seconds, estimated, self._light_error_deg(capture)
+        )
+
+    def _light_error_deg(self, capture: Capture) -> float | None:
+        if capture.light_errors_deg is None:
+            return None
+        whole = self._source.stored.capture
+        place = {light: place for place, light in enumerate(whole.light_indices)}
+        true = whole.light_directions[[place[light] for light in capture.light_indices]]
+        return float(angle_between_deg(capture.light_directions, true).mean())
 
     def _capture(self, *, whole: bool) -> Capture:
         """Return the capture under the lights of the draw: the scored pixels, or all."""

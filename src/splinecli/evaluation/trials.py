@@ -31,7 +31,7 @@ class Trial:
         method: name of the method.
         number: number of the trial, from 0.
         lights: the draw.
-        light_noise_deg, seed, max_pixels, as_stored, light_error_deg: see Protocol.
+        light_noise_deg, seed, max_pixels, as_stored, light_error_deg, finds_lights: see Protocol.
         made_of: digest of the capture's files and of the method's settings.
     """
 
@@ -45,6 +45,7 @@ class Trial:
     as_stored: bool
     made_of: str
     light_error_deg: float | None = None
+    finds_lights: bool = False
 
     @classmethod
     def of(
@@ -62,6 +63,7 @@ class Trial:
             protocol.as_stored,
             made_of,
             protocol.light_error_deg,
+            protocol.finds_lights,
         )
 
     @property
@@ -71,6 +73,8 @@ class Trial:
         del values["capture"]  # only a name in the tables: made_of has the files themselves
         if self.light_error_deg is None:
             del values["light_error_deg"]  # so that earlier trials stay valid
+        if not self.finds_lights:
+            del values["finds_lights"]  # likewise
         if self.light_noise_deg == 0:
             del values["number"]
             if self.max_pixels is None:
@@ -86,11 +90,13 @@ class Score:
         mae_deg: mean angular error over the scored pixels.
         seconds: time spent on estimating their normals.
         estimated_intensities: whether the light intensities were estimated from the images.
+        found_light_error_deg: mean error of light directions that were estimated from the images; None where none were.
     """
 
     mae_deg: float
     seconds: float
     estimated_intensities: bool
+    found_light_error_deg: float | None = None
 
 
 class TrialStore:
@@ -119,7 +125,10 @@ class TrialStore:
                 if record is not None:
                     kept.append(line.rstrip("\n") + "\n")
                     self._scores[record["key"]] = Score(
-                        record["mae_deg"], record["seconds"], record["estimated_intensities"]
+                        record["mae_deg"],
+                        record["seconds"],
+                        record["estimated_intensities"],
+                        record.get("found_light_error_deg"),
                     )
             # Anew, because the next lines would reach every other name of this file.
             if os.path.lexists(path):
@@ -165,4 +174,5 @@ def _read_line(line: str) -> dict[str, Any] | None:
     except (ValueError, TypeError, KeyError):
         return None
     usable = all(isinstance(number, float) for number in numbers) and isinstance(estimated, bool)
+    usable = usable and isinstance(record.get("found_light_error_deg"), float | None)
     return dict(record) if usable and isinstance(record.get("key"), str) else None

@@ -11,10 +11,13 @@ from splinecli.pictures.plotting import png_bytes
 _RINGS_DEG = (15, 30, 45, 60, 75)  # from the viewing direction
 
 
-def sky_plot(light_directions: NDArray[np.float64], title: str) -> bytes:
+def sky_plot(
+    light_directions: NDArray[np.float64], title: str, *, errors_deg: NDArray[np.float64] | None = None
+) -> bytes:
     """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
 
-    The rings are angles from the viewing direction, in degrees.
+    The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle of this radius is
+    drawn around each light.
     """
     from matplotlib.figure import Figure
 
@@ -27,9 +30,23 @@ def sky_plot(light_directions: NDArray[np.float64], title: str) -> bytes:
         if ring_deg < 90:  # the label of 90 degrees would overlap that of 75 degrees
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
+    for outline in [] if errors_deg is None else _circles(light_directions, np.radians(errors_deg), angle):
+        axes.plot(*outline.T, color="#D55E00", alpha=0.4, linewidth=1, zorder=2)
     axes.scatter(x, y, s=30, color="#D55E00", zorder=3)
     for number, place in enumerate(zip(x, y, strict=True), start=1):
         axes.annotate(str(number), place, xytext=(4, 4), textcoords="offset points", fontsize=7, zorder=3)
     axes.set_title(printable(title), parse_math=False)
     axes.set_axis_off()
     return png_bytes(figure, 120)
+
+
+def _circles(
+    directions: NDArray[np.float64], radii: NDArray[np.float64], angle: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the x and y (F, N, 2) of circles on the sphere around directions (F, 3), with radii (F,) in radians."""
+    across = np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    turned = np.cross(directions, across)
+    around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
+    cosine, sine = np.cos(radii)[:, None, None], np.sin(radii)[:, None, None]
+    return np.asarray((directions[:, None] * cosine + around * sine)[..., :2])

@@ -171,17 +171,18 @@ def _write(
     lamps: LampPositions | None,
     report: dict[str, Any],
 ) -> None:
+    from splinecli.capture.lights.light_files import rows_text
     from splinecli.pictures.calibration import calibration_picture
     from splinecli.pictures.png import encode_png
     from splinecli.system.publishing import new_files
 
     known = lamps if lamps is not None and lamps.known else None
     texts = {
-        DIRECTIONS: _text(lights.directions),
-        INTENSITIES: None if intensities is None else _text(intensities),
-        POSITIONS: None if known is None else _text(known.positions),
+        DIRECTIONS: rows_text(lights.directions),
+        INTENSITIES: None if intensities is None else rows_text(intensities),
+        POSITIONS: None if known is None else rows_text(known.positions),
         PIXEL_SIZE: None if known is None else f"{known.pixel_size:.9g}\n",
-        CAMERA_MATRIX: _text(known.view.matrix) if known is not None and known.view.known else None,
+        CAMERA_MATRIX: rows_text(known.view.matrix) if known is not None and known.view.known else None,
         REPORT: json.dumps(report, indent=2) + "\n",
     }
     # Files that are not written anew would belong to earlier lights. They are removed.
@@ -190,7 +191,3 @@ def _write(
             if text is not None:
                 new.write(name, text)
         new.write(PICTURE, encode_png(calibration_picture(lights.balls)))
-
-
-def _text(values: NDArray[np.float64]) -> str:
-    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture import find_captures, open_capture
+from splinecli.capture.lights.found_lights import ESTIMATE
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, UsageError
@@ -47,6 +48,7 @@ class EvaluateOptions:
             DEFAULT_LIGHTS, or for the number in the draws file.
         light_noise_deg: standard deviations of the light noise; one evaluation for each.
         trials: number of random draws; None for DEFAULT_TRIALS.
+        lights: "estimate" to find the lights of each trial from its images; None for the captures' light files.
         refine_lights: refine the light directions of each trial. light_error_deg: see Protocol.
         seed, max_pixels, skip_first, as_stored, white_level: see Protocol.
         draws: path of a draws file, in place of random draws.
@@ -71,6 +73,7 @@ class EvaluateOptions:
     max_pixels: int | None = None
     skip_first: dict[str, int] = field(default_factory=dict)
     as_stored: bool = False
+    lights: str | None = None
     refine_lights: bool = False
     light_error_deg: float | None = None
     white_level: float | None = None
@@ -94,6 +97,16 @@ class EvaluateOptions:
                 hint="Leave --trials out: each line of the draws is a trial",
             )
         check_light_error(self.light_error_deg, refines=self.refine_lights)
+        if self.lights not in (None, ESTIMATE):
+            raise UsageError(
+                f"--lights is {self.lights}; expected {ESTIMATE}",
+                hint="Without it, the captures' light files count",
+            )
+        if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
+            raise UsageError(
+                "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg",
+                hint="Leave these out",
+            )
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:
@@ -126,6 +139,7 @@ class EvaluateOptions:
                 self.as_stored,
                 self.white_level,
                 (self.light_error_deg or LIGHT_ERROR_DEG) if self.refine_lights else None,
+                self.lights is not None,
             )
             for count, noise in product(dict.fromkeys(counts), dict.fromkeys(self.light_noise_deg))
         ]

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splinecli.errors import UsageError
+from splinecli.errors import OutputError, UsageError
 from splinecli.pipeline.finished import inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
@@ -72,6 +72,8 @@ def _infer_into(
     from splinecli.results.report import report_of
 
     clock = Clock()
+    if options.finds_lights:
+        _check_light_files(target)
     source, capture = _read(folder, options, observer)
     if estimator is None:
         estimator = make_method(options)
@@ -173,6 +175,19 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
         check_triangles(capture.mask)
 
 
+def _check_light_files(target: Path) -> None:
+    """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
+    from splinecli.results.files import LIGHT_FILES, own_light_files
+
+    for name in LIGHT_FILES:
+        if (target / name).exists() and name not in own_light_files(target):
+            raise OutputError(
+                "the file is not from an earlier run, and --lights estimate would overwrite it",
+                path=target / name,
+                hint="Choose another -o",
+            )
+
+
 def _light_refinement(source: CaptureSource, options: InferOptions) -> Callable[[Capture], Capture] | None:
     if not options.refine_lights:
         return None
@@ -210,6 +225,8 @@ def _further_files(
         writers.append(partial(files.write_confidence, estimate.confidence_map))
     if "preview" in options.maps:
         writers.append(partial(files.write_preview, estimate))
+    if capture.light_errors_deg is not None:
+        writers.append(partial(files.write_lights, capture))
     if source.automatic_mask is not None:
         writers.append(partial(files.write_mask, source.window.filled(capture.mask)))
     if options.surface:

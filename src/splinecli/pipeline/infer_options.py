@@ -72,6 +72,10 @@ class InferOptions(Reading):
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
+        if self.finds_lights and self.refine_lights:
+            raise UsageError(
+                "--lights estimate refines the lights that it finds", hint="Leave --refine-lights out"
+            )
         check_method(self.method)
         check_pixel_size(self.pixel_size if self.surface else None)
         if self.n_lights is not None:

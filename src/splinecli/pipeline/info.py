@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ from splinecli.pipeline.reading import Reading
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource
+    from splinecli.capture.lights.found_lights import FoundLights
     from splinecli.capture.summary import CaptureSummary
 
 PIXELS_PER_SECOND = 2000
@@ -57,6 +58,13 @@ class InfoOptions:
     overwrite: bool = False
     check_lights: bool = False
 
+    def __post_init__(self) -> None:
+        """Raise UsageError for options that contradict each other."""
+        if self.check_lights and self.reading.finds_lights:
+            raise UsageError(
+                "--check-lights checks a light file, and --lights estimate reads none", hint="Leave one out"
+            )
+
 
 def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Read a capture without estimating normals, and return the report.
@@ -68,6 +76,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
+    from splinecli.capture.capture_warnings import estimated_lights
     from splinecli.capture.summary import summarise_capture
     from splinecli.diagnosis.checks import check_sample
     from splinecli.diagnosis.evidence import StatedLights
@@ -79,19 +88,21 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         _check_plot(options.plot, source, overwrite=options.overwrite)
     with observer.progress("reading", len(source.files.images)) as advance:
         summary = summarise_capture(source, progress=lambda: advance(1))
+    summary, found_lights = _with_found_lights(summary)
+    source = summary.source
     if options.plot is not None:
-        from splinecli.pictures.light_sky import sky_plot
-
-        write_bytes(options.plot, sky_plot(source.light_directions, source.files.name))
+        write_bytes(options.plot, _sky_plot(source, found_lights))
     check, warnings = None, summary.warnings()
     if summary.sample is not None and summary.closeup is not None:
         lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
         check, found = check_sample(lights, summary.sample, summary.closeup, strict=options.reading.strict)
         warnings += found
+    if found_lights is not None:
+        warnings.append(estimated_lights(found_lights.errors_deg))
     for warning in warnings:
         observer.warn(str(warning))
     report = {
-        **_report(summary),
+        **_report(summary, found_lights),
         "warnings": [str(warning) for warning in warnings],
         "warning_codes": [warning.code for warning in warnings],
     }
@@ -109,12 +120,13 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         for kind in report["image_kinds"]
     )
     nearest, farthest = report["axis_angle_deg"]
+    lights = report["light_directions"] or "estimated from the images"
     exposure, level = report["exposure"], report["white_level"]
     dark, bright = exposure["bright"]
     rows = [
         ("capture", f"{report['capture']} ({report['layout']})"),
         ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
-        ("lights", f"{report['light_directions']}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
+        ("lights", f"{lights}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
         *([("lamps", report["lamps"])] if report["lamps"] else []),
         ("intensities", report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"),
         *([("reads", report["reads"])] if report["reads"] else []),
@@ -160,7 +172,23 @@ def _check_plot(plot: Path, source: CaptureSource, *, overwrite: bool) -> None:
     check_free(plot.parent, [plot.name], overwrite=overwrite)
 
 
-def _report(summary: CaptureSummary) -> dict[str, Any]:
+def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLights | None]:
+    """Return the summary with the lights that are found from its sample, and these; None where files give them."""
+    source, sample = summary.source, summary.sample
+    if source.find_lights is None or sample is None:
+        return summary, None
+    found = source.find_lights(sample.observations, sample.mask, source.intensities_known)
+    return replace(summary, source=replace(source, light_directions=found.directions)), found
+
+
+def _sky_plot(source: CaptureSource, found: FoundLights | None) -> bytes:
+    from splinecli.pictures.light_sky import sky_plot
+
+    errors_deg = None if found is None else found.errors_deg
+    return sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg)
+
+
+def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any]:
     source, files, level = summary.source, summary.source.files, summary.white_level
     kinds = sorted(
         {(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images}
@@ -182,7 +210,14 @@ def _report(summary: CaptureSummary) -> dict[str, Any]:
         ],
         "reads": source.window.in_words(),
         "n_pixels": summary.n_pixels,
-        "light_directions": str(files.light_directions),
+        "light_directions": None if files.light_directions is None else str(files.light_directions),
+        "estimated_lights": None
+        if found is None
+        else {
+            "directions": found.directions.round(6).tolist(),
+            "errors_deg": found.errors_deg.round(2).tolist(),
+            "intensities": None if found.intensities is None else found.intensities.round(4).tolist(),
+        },
         "lamps": None if source.lamps is None else source.lamps.in_words(),
         "light_intensities": None if intensities is None else str(intensities),
         "mask": None if files.mask is None else str(files.mask),

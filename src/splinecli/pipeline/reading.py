@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from splinecli.capture.lights.light_angles import LightForm
-from splinecli.errors import check_one_of
+from splinecli.errors import UsageError, check_one_of
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 
 if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
+    from splinecli.capture.lights.found_lights import LightFinder
     from splinecli.capture.lights.lamp_files import LampOptions
 
 
@@ -20,7 +21,8 @@ class Reading:
     """Which files make a capture, and how they are read.
 
     Args:
-        lights, mask, ground_truth: files that replace those of the capture.
+        lights, mask, ground_truth: files that replace those of the capture. `lights` may be "estimate": the directions
+            are found from the images.
         intensities: a file of light intensities, or "equal".
         lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
@@ -62,10 +64,30 @@ class Reading:
         from splinecli.capture.window import parse_window
 
         _ = self.lamps, parse_window(self.crop, self.scale)
+        if self.finds_lights:
+            self._check_found_lights()
         parse_transfer(self.transfer)
         parse_light_frame(self.light_frame)
         check_white_level(self.white_level)
         check_one_of("light format", self.lights_format, get_args(LightForm))
+
+    @property
+    def finds_lights(self) -> bool:
+        """Whether the lights are found from the images."""
+        from splinecli.capture.lights.found_lights import ESTIMATE
+
+        return self.lights == ESTIMATE
+
+    def _check_found_lights(self) -> None:
+        """Raise UsageError for options that concern a light file or near lamps."""
+        lamps = {"light-positions": self.light_positions, "light-distance": self.light_distance}
+        files = {"light-frame": self.light_frame, "lights-format": self.lights_format != "xyz" or None}
+        for name in (name for name, value in (lamps | files).items() if value is not None):
+            why = "finds distant lights" if name in lamps else "needs no light file"
+            raise UsageError(
+                f"--lights estimate {why}, so it contradicts --{name}",
+                hint=f"Leave --{name} out, or give a light file",
+            )
 
     @property
     def scales_surface(self) -> bool:
@@ -92,10 +114,11 @@ class Reading:
         from splinecli.capture.reader import EQUAL
 
         intensities = None if self.intensities == EQUAL else self.intensities
-        named = (self.lights, self.light_positions, intensities, self.camera_matrix, self.mask)
+        lights = None if self.finds_lights else self.lights
+        named = (lights, self.light_positions, intensities, self.camera_matrix, self.mask)
         for name in (*named, self.ground_truth, self.ambient):
             if name is not None:
-                check_file(Path(name), "a file", pipe=name == self.lights)
+                check_file(Path(name), "a file", pipe=name == lights)
         self.radiometric_calibration()
 
     def radiometric_calibration(self) -> RadiometricCalibration:
@@ -117,9 +140,15 @@ class Reading:
         from splinecli.capture.lights.light_frames import parse_light_frame
         from splinecli.capture.window import parse_window
 
+        find: LightFinder | None = None
+        if self.finds_lights:
+            from splinecli.light.unknown_lights import find_lights
+
+            find = find_lights
+
         return open_capture(
             folder,
-            lights=self.lights,
+            lights=None if self.finds_lights else self.lights,
             intensities=self.intensities,
             mask=self.mask,
             ground_truth=self.ground_truth,
@@ -129,4 +158,5 @@ class Reading:
             lights_format=self.lights_format,
             lamps=self.lamps,
             window=parse_window(self.crop, self.scale),
+            find_lights=find,
         )

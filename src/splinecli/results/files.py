@@ -10,8 +10,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import Capture
+from splinecli.capture.lights.light_files import rows_text
 from splinecli.inference import NormalEstimate
 from splinecli.maths.normals import Convention, describe, encode_picture
+from splinecli.pictures.light_sky import sky_plot
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
 from splinecli.results.clock import Clock
@@ -32,6 +35,11 @@ ERROR_MAP = "error_map.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR, PREVIEW = "albedo.png", "albedo.npy", "albedo.exr", "preview.png"
 CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
+LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
+    "light_directions.txt",
+    "light_intensities.txt",
+    "lights.png",
+)
 MAPS = {
     "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
     "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
@@ -49,7 +57,10 @@ OWN_FILES = (
     PAGE,
     REPORT,
 )
-"""All files that `infer` and `integrate` may write into a capture's folder of results."""
+"""All files that `infer` and `integrate` may write into a capture's folder of results, but LIGHT_FILES."""
+
+LIGHT_FILES = (LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT)
+"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
 
 
 class UnfinishedError(ValueError):
@@ -83,7 +94,7 @@ def write_estimate(
         OutputError: a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
-    stale = [name for name in OWN_FILES if name != FOUND_MASK]
+    stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)
     with new_files(folder, report=REPORT, stale=stale) as new:
         for form in formats:
             with new.open(NORMALS[form]) as file:
@@ -101,6 +112,24 @@ def write_estimate(
         }
         new.write(REPORT, json.dumps(report, indent=2) + "\n")
     return report
+
+
+def own_light_files(folder: Path) -> list[str]:
+    """Return those of LIGHT_FILES in a folder of results that an earlier run wrote, as its report says."""
+    try:
+        return [name for name in LIGHT_FILES if name in read_report(folder)["files"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return []
+
+
+def write_lights(capture: Capture, new: NewFiles) -> None:
+    """Write lights that were found from the images as `--lights` and `--intensities` read them, and a picture."""
+    new.write(LIGHT_DIRECTIONS, rows_text(capture.light_directions))
+    if capture.estimated_intensities is not None:
+        new.write(LIGHT_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1)))
+    new.write(
+        LIGHT_PLOT, sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
+    )
 
 
 def read_report(folder: Path) -> dict[str, Any]:

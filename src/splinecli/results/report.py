@@ -23,7 +23,7 @@ def report_of(
     options: Mapping[str, Any],
     inputs: str,
     *,
-    light_file: Path,
+    light_file: Path | None,
     as_stored: bool,
     distillation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def report_of(
         estimator: the method that made it.
         options: the options of the run, ready for JSON.
         inputs: a digest that changes when an input file changes.
-        light_file: the file that gave the lights.
+        light_file: the file that gave the lights; None where they were found from the images.
         as_stored: whether the capture was read without any restoration.
         distillation: what DistilledEstimator.report returns; None where the method estimated every pixel.
     """
@@ -50,8 +50,11 @@ def report_of(
         "weights": estimator.weights,
         "n_lights": capture.n_lights,
         "light_indices": list(capture.light_indices),
-        "light_file": str(light_file.absolute()),
+        "light_file": None if light_file is None else str(light_file.absolute()),
         "light_directions": capture.light_directions.round(6).tolist(),
+        "light_errors_deg": None
+        if capture.light_errors_deg is None
+        else capture.light_errors_deg.round(2).tolist(),
         "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
         "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
         "n_pixels": capture.n_pixels,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from splinecli.capture.layouts.image_lists import IMAGE_SUFFIXES, PICTURE_SUFFIXES, list_folder
@@ -40,6 +40,7 @@ NOT_PHOTOGRAPHS = frozenset(
         "mesh",
         "found_mask",
         "calibration",
+        "lights",
     }
 )
 """Lower-case stems of pictures in a capture's folder that are not images of the object under one light."""
@@ -54,7 +55,8 @@ class CaptureFiles:
         name: name of the capture, in most layouts that of its folder.
         folder: the folder with the files beside the images.
         images: one file for each light.
-        light_directions: F x 3 text, or a file of named_lights.py, which sets the order of the images.
+        light_directions: F x 3 text, or a file of named_lights.py, which sets the order of the images; None where no
+            lights are needed.
         light_intensities: F x 3 text, or None where no file gives them.
         mask: an image, or None where every pixel counts.
         boundaries: used instead of a mask: images whose pixels above zero together are the object.
@@ -66,7 +68,7 @@ class CaptureFiles:
     name: str
     folder: Path
     images: tuple[Path, ...]
-    light_directions: Path
+    light_directions: Path | None
     light_intensities: Path | None = None
     mask: Path | None = None
     ground_truth: Path | None = None
@@ -76,12 +78,16 @@ class CaptureFiles:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Files named by the user, which replace those in the folder."""
+    """Files named by the user, which replace those in the folder.
+
+    Without needs_lights, light files in the folder do not count, and none is missed.
+    """
 
     lights: Path | None = None
     intensities: Path | None = None
     mask: Path | None = None
     ground_truth: Path | None = None
+    needs_lights: bool = field(default=True, kw_only=True)
 
     def named(self) -> tuple[Path, ...]:
         """Return the files that are given. Raises InputError for one that is no file."""
@@ -100,7 +106,7 @@ def gather_files(
     layout: str,
     folder: Path,
     images: tuple[Path, ...],
-    lights: Path,
+    lights: Path | None,
     overrides: Overrides,
     ground_truth_names: Sequence[str] = GROUND_TRUTH,
 ) -> CaptureFiles:
@@ -110,7 +116,7 @@ def gather_files(
         name=folder_name(folder),
         folder=folder,
         images=images,
-        light_directions=lights,
+        light_directions=lights if overrides.needs_lights else None,
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
         mask=overrides.mask or find_named(folder, MASK),
         ground_truth=overrides.ground_truth or find_named(folder, ground_truth_names),

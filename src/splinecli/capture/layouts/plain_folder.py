@@ -38,13 +38,13 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     else:
         images = list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
     check_not_empty(images, folder)
-    lights = overrides.lights or find_lights(folder)
-    if lights is None:
+    lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
+    if lights is None and overrides.needs_lights:
         raise InputError(
             f"the folder contains {len(images)} images but no light file ({LIGHT_FILES})",
             path=folder,
             hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
-            " images of a mirror ball",
+            " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
     layout, ground_truth = (
         ("DiLiGenT", _DILIGENT_GROUND_TRUTH) if is_diligent else ("plain folder", GROUND_TRUTH)

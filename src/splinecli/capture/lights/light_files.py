@@ -280,3 +280,8 @@ def _one_light_a_row(
         path=table.path,
         hint="The file needs one line for each image, in the order of the images",
     )
+
+
+def rows_text(values: NDArray[np.float64]) -> str:
+    """Return rows of numbers (F, C) as the lines of a light file."""
+    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)

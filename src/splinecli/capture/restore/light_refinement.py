@@ -10,6 +10,7 @@ intensities are known, nothing else is open. If not, a prior on them holds the g
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +52,7 @@ _MIN_PIXELS = 100
 _DARK_SHARE = 0.02
 _SHADOW_SHARE = 0.1  # of the pixel's quantile below, as in IW12
 _UNSHADED = 0.6
-_WORTH_PIXELS = 50.0
-"""Number of pixels that the data weigh against the prior: errors of a matte model are alike in many pixels."""
+_WORTH_PIXELS = 50.0  # see fit_near
 
 _MAX_ROUNDS = 150
 _FIRST_FITS, _FITS_PER_ROUND = 8, 2
@@ -174,6 +174,54 @@ def refine_lights(
         light_directions: (F, 3), unit.
         error_deg, intensities_known: see refine_capture.
     """
+    fit = fit_near(
+        observations,
+        light_directions,
+        error_deg,
+        intensity_error=0.0 if intensities_known else INTENSITY_ERROR,
+        worth_pixels=_WORTH_PIXELS,
+    )
+    if fit is None:
+        return None
+    ratio = fit.after / max(fit.before, 1e-12)
+    better = fit.after < MAX_MISFIT and ratio < BETTER_FIT and bool((fit.directions[:, 2] > 0).all())
+    return RefinedLights(fit.directions, fit.intensities, ratio) if better else None
+
+
+class LightFit(NamedTuple):
+    """Lights that fit the images best near given ones.
+
+    Attributes:
+        directions: (F, 3), unit.
+        intensities: (F,), relative to those of the observations.
+        before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
+            observation.
+    """
+
+    directions: Array
+    intensities: Array
+    before: float
+    after: float
+
+
+def fit_near(
+    observations: NDArray[np.float32],
+    light_directions: Array,
+    error_deg: float | Array,
+    *,
+    intensity_error: float,
+    worth_pixels: float,
+) -> LightFit | None:
+    """Return the lights near the given ones that fit the images best; None for too few lights or lit pixels.
+
+    Args:
+        observations: (P, F), linear.
+        light_directions: (F, 3), unit.
+        error_deg: the usual error of each direction (F,), or of all.
+        intensity_error: the usual error of intensities of 1, a share; 0 if they are known.
+        worth_pixels: the number of pixels that the images weigh against the prior. Errors of a matte model are alike in
+            many pixels.
+    """
     values = _choose_pixels(observations)
     if values is None:
         return None
@@ -182,21 +230,17 @@ def refine_lights(
     lights = light_directions
     normals, weights = fit_robustly(values, lit, lights, _FIRST_FITS)
     before = _misfit(values, normals, lights, lit)
-    precision = _prior(light_directions, error_deg)
+    precision = _prior(light_directions, error_deg, intensity_error or INTENSITY_ERROR)
     for _ in range(_MAX_ROUNDS):
         normals, weights = fit_robustly(values, lit, lights, _FITS_PER_ROUND, weights)
-        moved = _move_lights(values, normals, weights, lights, light_directions, precision)
-        moved = unit(moved) if intensities_known else moved
+        moved = _move_lights(values, normals, weights, lights, light_directions, precision, worth_pixels)
+        moved = moved if intensity_error else unit(moved)
         change, lights = np.abs(moved - lights).max(), moved
         if change < _CONVERGED:
             break
     normals, _ = fit_robustly(values, lit, lights, _FIRST_FITS, weights)
     after = _misfit(values, normals, lights, lit)
-    ratio = after / max(before, 1e-12)
-    intensities = np.linalg.norm(lights, axis=1)
-    directions = unit(lights)
-    better = after < MAX_MISFIT and ratio < BETTER_FIT and bool((directions[:, 2] > 0).all())
-    return RefinedLights(directions, intensities, ratio) if better else None
+    return LightFit(unit(lights), np.linalg.norm(lights, axis=1), before, after)
 
 
 def _choose_pixels(observations: NDArray[np.float32]) -> Array | None:
@@ -214,22 +258,28 @@ def _misfit(values: Array, normals: Array, lights: Array, lit: Array) -> float:
     return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))
 
 
-def _prior(light_directions: Array, error_deg: float) -> Array:
+def _prior(light_directions: Array, error_deg: float | Array, intensity_error: float) -> Array:
     """Return the precision (F, 3, 3) of the given light vectors: of their directions and their lengths."""
     along = light_directions[:, :, None] * light_directions[:, None, :]
     # The angle has two components, each with half of its variance.
-    across_variance = np.radians(error_deg) ** 2 / 2
-    return np.asarray((np.eye(3) - along) / across_variance + along / INTENSITY_ERROR**2)
+    across_variance = np.broadcast_to(np.radians(error_deg) ** 2 / 2, len(along))[:, None, None]
+    return np.asarray((np.eye(3) - along) / across_variance + along / intensity_error**2)
 
 
 def _move_lights(
-    values: Array, normals: Array, weights: Array, lights: Array, given: Array, precision: Array
+    values: Array,
+    normals: Array,
+    weights: Array,
+    lights: Array,
+    given: Array,
+    precision: Array,
+    worth_pixels: float,
 ) -> Array:
     """Return the light vectors (F, 3) that fit the observations best, within the prior."""
     residuals = values - normals @ lights.T
     variance = (weights * residuals**2).sum() / weights.sum()
     # A light that no pixel shows keeps its given vector.
-    scale = _WORTH_PIXELS / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
+    scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
     curvature = np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True) * scale[:, None, None]
     gradient = ((weights * residuals).T @ normals) * scale[:, None]
     pull = np.einsum("fij,fj->fi", precision, given - lights)

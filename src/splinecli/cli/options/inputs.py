@@ -15,8 +15,15 @@ CAPTURE = Argument(..., metavar="CAPTURE", help="Folder with the images of one o
 
 LIGHTS = Option(
     None,
-    metavar="FILE",
-    help="Light directions: a line x y z for each image, z to the camera. [default: the light file in CAPTURE]",
+    metavar="FILE|estimate",
+    help="Light directions: a line x y z for each image, z to the camera. estimate finds them from the images, less"
+    " exactly. [default: the light file in CAPTURE]",
+)
+ESTIMATED_LIGHTS = Option(
+    None,
+    "--lights",
+    metavar="estimate",
+    help="Estimate the lights of each draw from its images, and score them, too. [default: the captures' light files]",
 )
 LIGHT_FRAME = Option(
     None,

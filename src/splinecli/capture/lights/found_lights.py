@@ -1,0 +1,37 @@
+"""Lights that are found from the images of the object, where no file gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+ESTIMATE = "estimate"
+"""Given in place of a light file: the lights are found from the images."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLights:
+    """Lights of F images.
+
+    Args:
+        directions: (F, 3) float64, unit; x right, y up, z to the camera.
+        errors_deg: (F,), the expected errors of the directions in degrees.
+        intensities: (F,), with a mean of 1; None where they are known.
+    """
+
+    directions: NDArray[np.float64]
+    errors_deg: NDArray[np.float64]
+    intensities: NDArray[np.float64] | None = None
+
+
+def placeholders(n_lights: int) -> NDArray[np.float64]:
+    """Return directions (F, 3) that mean nothing, in place of those that are found later: any that give normals."""
+    azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
+    return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
+
+
+LightFinder = Callable[[NDArray[np.float32], NDArray[np.bool_], bool], FoundLights]
+"""Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the intensities are known."""

@@ -1,0 +1,148 @@
+"""Lights from the images of the object alone: uncalibrated photometric stereo.
+
+The light network guesses each light from shading, shadows and outline, with an error that it expects. The images then
+decide what they can: a matte surface under F lights has images of rank 3 (Hayakawa, JOSA A 1994), so the lights are
+moved together until such a surface explains the images, within the guesses and their errors. The images of a matte
+surface leave a generalised bas-relief ambiguity (Belhumeur, Kriegman and Yuille, IJCV 1999). There, the guesses decide.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import resources
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splinecli.capture.lights.found_lights import FoundLights
+from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, LightFit, fit_near
+from splinecli.errors import InputError
+from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
+from splinecli.networks.weights import SHIPPED, load_strictly, read_tensors
+
+LIGHT_NET = "light-net.safetensors"
+LIGHT_FORMAT = "splinecli-light-net-1"
+
+LARGEST_ERROR_DEG = 20.0
+"""Lights with a larger expected error on average are refused: their normals would be worth little."""
+
+SAME_IMAGES = 0.01
+"""Images that differ by less from their mean, as a share of it, show no light that moves."""
+
+_WORTH_PIXELS = 6.0  # see fit_near; chosen on rendered scenes that the network was not trained on
+_EXPECTED_SCALE = 1.0
+_MOST_PIXELS = 4_000_000
+_VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
+
+
+def find_lights(
+    observations: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    intensities_known: bool,
+    *,
+    largest_error_deg: float = LARGEST_ERROR_DEG,
+) -> FoundLights:
+    """Find the lights of the images of one object.
+
+    Args:
+        observations: (P, F), linear, 0 or more; divided by the light intensities where they are known.
+        mask: (H, W) with P true pixels, in row-major order.
+        intensities_known: whether the intensities are known; else they are found, too.
+        largest_error_deg: lights with a larger expected error on average are refused.
+
+    Raises:
+        InputError: the images are all alike, or their lights cannot be told.
+    """
+    _check_different(observations)
+    guess = _ask_network(observations, mask)
+    directions, errors_deg, intensities = guess
+    fit = None
+    if not intensities_known:
+        observations = np.asarray(observations / intensities, np.float32)
+    fit = fit_near(
+        observations,
+        directions,
+        errors_deg,
+        intensity_error=0.0 if intensities_known else INTENSITY_ERROR,
+        worth_pixels=_WORTH_PIXELS,
+    )
+    if fit is not None and _is_better(fit):
+        directions, intensities = fit.directions, intensities * fit.intensities
+    errors_deg = _EXPECTED_SCALE * errors_deg
+    if (expected := float(errors_deg.mean())) > largest_error_deg:
+        raise InputError(
+            f"the lights cannot be told from the images: their expected error is {expected:.0f} degrees, and at most"
+            f" {largest_error_deg:.0f} is of use",
+            hint="Show the whole outline of the object and give its mask, add images with other lights, or measure the"
+            " lights with 'splinecli calibrate'",
+        )
+    return FoundLights(
+        directions, errors_deg, None if intensities_known else intensities / intensities.mean()
+    )
+
+
+def _is_better(fit: LightFit) -> bool:
+    return fit.after < fit.before and bool((fit.directions[:, 2] > 0).all())
+
+
+def _check_different(observations: NDArray[np.float32]) -> None:
+    """Raise InputError for images that show no change of the light."""
+    rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
+    rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
+    mean = rows.mean(axis=1, keepdims=True)
+    if np.abs(rows - mean).mean() < SAME_IMAGES * mean.mean():
+        raise InputError(
+            "all images are alike, so they say nothing about the lights",
+            hint="Photograph the object with the lamp at a different place for each image",
+        )
+
+
+def _ask_network(
+    observations: NDArray[np.float32], mask: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
+
+    They are means over the four turns of the images by 90 degrees and their mirror images.
+    """
+    step = max(1, int(np.ceil(np.sqrt(observations.shape[0] / _MOST_PIXELS))))
+    area, image = torch.from_numpy(mask), np.zeros(mask.shape, np.float32)
+    small = []
+    for values in observations.T:  # one image at a time: all of them would double the memory
+        image[mask] = values
+        cut, inside = square_images(torch.from_numpy(image)[None, ::step, ::step], area[::step, ::step])
+        small.append(cut[0])
+    images = torch.stack(small)
+    images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
+    network = _network()
+    with torch.inference_mode():
+        guesses = [_view(network, images, inside, turns, mirrored) for turns, mirrored in _VIEWS]
+    directions, sharpness, log_intensities = (torch.cat(part).double() for part in zip(*guesses, strict=True))
+    towards = (sharpness.exp()[..., None] * directions).sum(dim=0)
+    mean = torch.nn.functional.normalize(towards, dim=-1)
+    between = (directions * mean).sum(dim=-1).clamp(-1, 1).acos().square().mean(dim=0)
+    own = LightGuess(directions, sharpness, log_intensities).expected_rad().square().mean(dim=0)
+    return mean.numpy(), (own + between).sqrt().rad2deg().numpy(), log_intensities.mean(dim=0).exp().numpy()
+
+
+def _view(
+    network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool
+) -> LightGuess:
+    """Return what the network reads off turned, then mirrored images, in the frame of the images as they are."""
+    images, inside = torch.rot90(images, turns, (1, 2)), torch.rot90(inside, turns, (0, 1))
+    if mirrored:
+        images, inside = images.flip(2), inside.flip(1)
+    guess: LightGuess = network(network_inputs(images, inside)[None])
+    x, y, z = guess.directions.unbind(dim=-1)
+    x = -x if mirrored else x
+    for _ in range(turns):
+        x, y = y, -x
+    return guess._replace(directions=torch.stack((x, y, z), dim=-1))
+
+
+@cache
+def _network() -> LightNet:
+    with resources.as_file(SHIPPED / LIGHT_NET) as path:
+        network = LightNet()
+        load_strictly(network, read_tensors(path, LIGHT_FORMAT, "Reinstall splinecli")[0], path)
+    return network.float().eval()
