@@ -3,7 +3,8 @@
 The light network guesses each light from shading, shadows and outline, with an error that it expects. The images then
 decide what they can: a matte surface under F lights has images of rank 3 (Hayakawa, JOSA A 1994), so the lights are
 moved together until such a surface explains the images, within the guesses and their errors. The images of a matte
-surface leave a generalised bas-relief ambiguity (Belhumeur, Kriegman and Yuille, IJCV 1999). There, the guesses decide.
+surface leave a generalised bas-relief ambiguity (Belhumeur, Kriegman and Yuille, IJCV 1999). There, the guesses decide,
+and the outline of the object where it is clear.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from splinecli.capture.lights.found_lights import FoundLights
 from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, LightFit, fit_near
 from splinecli.errors import InputError
+from splinecli.light.outline import turn_at_outline
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
 from splinecli.networks.weights import SHIPPED, load_strictly, read_tensors
 
@@ -30,8 +32,13 @@ LARGEST_ERROR_DEG = 20.0
 SAME_IMAGES = 0.01
 """Images that differ by less from their mean, as a share of it, show no light that moves."""
 
-_WORTH_PIXELS = 6.0  # see fit_near; chosen on rendered scenes that the network was not trained on
-_EXPECTED_SCALE = 1.0
+# Chosen on rendered scenes that the network was not trained on.
+_WORTH_PIXELS = 6.0  # see fit_near
+_CLEAR_OUTLINE, _OUTLINE_SHARE = (
+    0.2,
+    0.35,
+)  # largest spread of an outline that counts, and how much of its turn counts
+_EXPECTED_SCALE = 0.8  # of the error that the network expects, after the images and the outline had their say
 _MOST_PIXELS = 4_000_000
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
 
@@ -69,6 +76,11 @@ def find_lights(
     )
     if fit is not None and _is_better(fit):
         directions, intensities = fit.directions, intensities * fit.intensities
+        observations = np.asarray(observations / fit.intensities, np.float32)
+    turn = turn_at_outline(observations, mask, directions)
+    if turn is not None and turn.spread < _CLEAR_OUTLINE:
+        turned = directions @ turn.share(_OUTLINE_SHARE).T
+        directions = turned if (turned[:, 2] > 0).all() else directions
     errors_deg = _EXPECTED_SCALE * errors_deg
     if (expected := float(errors_deg.mean())) > largest_error_deg:
         raise InputError(

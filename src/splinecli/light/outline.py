@@ -1,0 +1,108 @@
+"""The common rotation of lights and normals that the outline of the object shows.
+
+Where a smooth surface turns away from the camera, its normals are perpendicular to the view and to the outline. Lights
+that were turned together turn all normals with them, also those at the outline.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.robust_fit import fit_robustly
+from splinecli.maths.normals import unit
+
+Array = NDArray[np.float64]
+
+MIN_PIXELS = 20
+"""Fewer lit pixels at the outline show no rotation."""
+
+_SMOOTHING = 0.02
+"""Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards."""
+
+_RIM_Z = 0.25
+"""Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""
+
+_LIT_SHARE, _DARK_SHARE, _MIN_LIT, _FITS = 0.1, 0.02, 4, 6
+_EQUAL_WEIGHT_BELOW, _PRIOR = 0.1, 1e-3
+_ROUNDS, _CONVERGED = 25, 1e-4
+
+
+class OutlineTurn(NamedTuple):
+    """A rotation that turns the normals at the outline outwards.
+
+    Attributes:
+        rotation: (3, 3), of lights and normals.
+        spread: the median of what remains of the z of these normals. It is small where the outline is one of a smooth
+            surface that the fit explains.
+    """
+
+    rotation: Array
+    spread: float
+
+    def share(self, part: float) -> Array:
+        """Return a part of the rotation (3, 3), from 0 to 1."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_matrix(self.rotation).as_rotvec()
+        return np.asarray(Rotation.from_rotvec(part * turn).as_matrix())
+
+
+def turn_at_outline(
+    observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
+) -> OutlineTurn | None:
+    """Return the rotation of the lights that the outline shows; None where it shows none.
+
+    The border of the image is no outline.
+
+    Args:
+        observations: (P, F), linear, divided by the light intensities.
+        mask: (H, W) with P true pixels, in row-major order.
+        light_directions: (F, 3), unit.
+    """
+    from scipy.spatial.transform import Rotation
+
+    normals, outwards = _rim(observations, mask, light_directions)
+    if len(normals) < MIN_PIXELS:
+        return None
+    along = np.cross((0.0, 0.0, 1.0), outwards)
+    turn = Rotation.identity()
+    for _ in range(_ROUNDS):
+        turned = turn.apply(normals)
+        # A small turn w adds w x n. The first residual is along the view axis, the second along the outline.
+        residuals = np.stack((turned[:, 2] - _RIM_Z, (turned * along).sum(axis=1)))
+        slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
+        weights = 1 / (np.abs(residuals) + _EQUAL_WEIGHT_BELOW)
+        curvature = np.einsum("kp,kpi,kpj->ij", weights, slopes, slopes) + _PRIOR * np.eye(3)
+        step = np.linalg.solve(curvature, -np.einsum("kp,kpi,kp->i", weights, slopes, residuals))
+        turn = Rotation.from_rotvec(step) * turn
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return OutlineTurn(np.asarray(turn.as_matrix()), float(np.median(np.abs(residuals[0]))))
+
+
+def _rim(
+    observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
+) -> tuple[Array, Array]:
+    """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
+    import cv2
+
+    padded = np.pad(mask, 1).astype(np.uint8)
+    rim = (mask & (cv2.erode(padded, np.ones((3, 3), np.uint8))[1:-1, 1:-1] == 0)).copy()
+    rim[[0, -1]] = rim[:, [0, -1]] = False
+    width = max(1.5, _SMOOTHING * float(np.sqrt(np.count_nonzero(mask))))
+    falling = cv2.GaussianBlur(np.pad(mask, 3).astype(np.float32), (0, 0), width)
+    down, right = (slope[3:-3, 3:-3] for slope in np.gradient(falling))
+    outwards = np.stack((-right, down, np.zeros_like(down)), axis=-1)[rim].astype(np.float64)
+    values = observations[rim[mask]].astype(np.float64)
+    brightest = values.max(axis=1, keepdims=True, initial=0)
+    values = values / np.maximum(brightest, 1e-12)
+    lit = (values > _LIT_SHARE).astype(np.float64)
+    bright = brightest[:, 0] > _DARK_SHARE * np.quantile(observations.max(axis=1), 0.99)
+    seen = (lit.sum(axis=1) >= _MIN_LIT) & bright & outwards.any(axis=1)
+    if not seen.any():
+        return np.empty((0, 3)), np.empty((0, 3))
+    fitted, _ = fit_robustly(values[seen], lit[seen] + 1e-3, light_directions, _FITS)
+    return unit(fitted), unit(outwards[seen])
