@@ -13,6 +13,7 @@ from splinecli.cli.documents import Documents, printed_documents
 from splinecli.cli.options import computing, distribution, inputs, outputs
 from splinecli.cli.options.values import (
     Device,
+    FirstLight,
     LightForm,
     NormalConvention,
     Precision,
@@ -41,6 +42,7 @@ _WORDS = {
 def infer(
     captures: list[Path] = inputs.CAPTURES,
     lights: Path | None = inputs.LIGHTS,
+    first_light: FirstLight | None = inputs.FIRST_LIGHT,
     intensities: Path | None = inputs.INTENSITIES,
     refine_lights: bool = inputs.REFINE_LIGHTS,
     light_positions: Path | None = inputs.LIGHT_POSITIONS,

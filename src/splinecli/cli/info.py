@@ -6,7 +6,7 @@ from pathlib import Path
 
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.options import inputs, outputs
-from splinecli.cli.options.values import LightForm
+from splinecli.cli.options.values import FirstLight, LightForm
 from splinecli.cli.records import record_from
 from splinecli.errors import InputError
 from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
@@ -16,6 +16,7 @@ from splinecli.pipeline.reading import Reading
 def info(
     capture: Path = inputs.CAPTURE,
     lights: Path | None = inputs.LIGHTS,
+    first_light: FirstLight | None = inputs.FIRST_LIGHT,
     intensities: Path | None = inputs.INTENSITIES,
     light_positions: Path | None = inputs.LIGHT_POSITIONS,
     light_distance: float | None = inputs.LIGHT_DISTANCE,

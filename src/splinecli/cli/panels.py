@@ -14,6 +14,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Input": ("--mask", "--auto-mask", *PART, "--ground-truth", *VALUES, "--as-stored"),
         "Lights": (
             "--lights",
+            "--first-light",
             "--light-frame",
             "--lights-format",
             "--intensities",
@@ -45,6 +46,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Input": ("--mask", *PART, "--ground-truth", *VALUES),
         "Lights": (
             "--lights",
+            "--first-light",
             "--light-frame",
             "--lights-format",
             "--intensities",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -85,7 +84,7 @@ class TrialSource:
         if trial.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
         if trial.finds_lights:
-            seen = seen.find_lights(partial(find_lights, largest_error_deg=math.inf))
+            seen = seen.find_lights(partial(find_lights, refuse=False))
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
         intensities = None if trial.as_stored else seen.estimate_intensities()
         if rows is None or seen.capture.lamps is None:

@@ -83,6 +83,15 @@ def turn_at_outline(
     return OutlineTurn(np.asarray(turn.as_matrix()), float(np.median(np.abs(residuals[0]))))
 
 
+def outline_share(mask: NDArray[np.bool_]) -> float:
+    """Return the share of the boundary of a mask (H, W) that lies inside the image, not at its border."""
+    padded = np.pad(mask, 1)
+    inner = padded[1:-1, :-2] & padded[1:-1, 2:] & padded[:-2, 1:-1] & padded[2:, 1:-1]
+    boundary = mask & ~inner
+    inside = boundary[1:-1, 1:-1]
+    return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
+
+
 def _rim(
     observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
 ) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import resources
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from splinecli.capture.lights.found_lights import FoundLights
 from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, LightFit, fit_near
 from splinecli.errors import InputError
-from splinecli.light.outline import turn_at_outline
+from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
 from splinecli.networks.weights import SHIPPED, load_strictly, read_tensors
 
@@ -28,6 +29,16 @@ LIGHT_FORMAT = "splinecli-light-net-1"
 
 LARGEST_ERROR_DEG = 20.0
 """Lights with a larger expected error on average are refused: their normals would be worth little."""
+
+LARGEST_MISFIT = 0.08
+"""Largest median residual of a matte surface, as a share of a pixel's brightest observation. Rendered scenes, metals
+among them, have at most half of it."""
+
+LEAST_OUTLINE = 0.5
+"""Smallest share of the mask's boundary inside the image. With less, the object continues outside of it."""
+
+FirstLight = Literal["left", "right", "above", "below"]
+SIDES: dict[str, tuple[float, float]] = {"left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
 
 SAME_IMAGES = 0.01
 """Images that differ by less from their mean, as a share of it, show no light that moves."""
@@ -48,7 +59,8 @@ def find_lights(
     mask: NDArray[np.bool_],
     intensities_known: bool,
     *,
-    largest_error_deg: float = LARGEST_ERROR_DEG,
+    first_light: FirstLight | None = None,
+    refuse: bool = True,
 ) -> FoundLights:
     """Find the lights of the images of one object.
 
@@ -56,15 +68,22 @@ def find_lights(
         observations: (P, F), linear, 0 or more; divided by the light intensities where they are known.
         mask: (H, W) with P true pixels, in row-major order.
         intensities_known: whether the intensities are known; else they are found, too.
-        largest_error_deg: lights with a larger expected error on average are refused.
+        first_light: the side of the image from which the first light comes. It decides between a bump and a hollow.
+        refuse: raise an error for lights that the images do not tell; else return a guess.
 
     Raises:
-        InputError: the images are all alike, or their lights cannot be told.
+        InputError: the images are all alike, they do not show one surface, or they do not tell the lights.
     """
     _check_different(observations)
-    guess = _ask_network(observations, mask)
-    directions, errors_deg, intensities = guess
-    fit = None
+    if refuse and first_light is None and outline_share(mask) < LEAST_OUTLINE:
+        raise InputError(
+            "the images do not show the outline of the object, so a bump looks like a hollow under opposite lights",
+            hint="Say from which side the light of the first image comes: --first-light left, right, above or below."
+            " Or show the whole object, and give its mask",
+        )
+    directions, errors_deg, intensities = _ask_network(observations, mask)
+    if first_light is not None and directions[0, :2] @ SIDES[first_light] < 0:
+        directions = directions * (-1, -1, 1)
     if not intensities_known:
         observations = np.asarray(observations / intensities, np.float32)
     fit = fit_near(
@@ -74,6 +93,11 @@ def find_lights(
         intensity_error=0.0 if intensities_known else INTENSITY_ERROR,
         worth_pixels=_WORTH_PIXELS,
     )
+    if refuse and fit is not None and fit.after > LARGEST_MISFIT:
+        raise InputError(
+            "the images do not show one surface under different distant lights, so the lights cannot be found",
+            hint="Check that camera and object stood still, and that all images show the same object",
+        )
     if fit is not None and _is_better(fit):
         directions, intensities = fit.directions, intensities * fit.intensities
         observations = np.asarray(observations / fit.intensities, np.float32)
@@ -82,10 +106,10 @@ def find_lights(
         turned = directions @ turn.share(_OUTLINE_SHARE).T
         directions = turned if (turned[:, 2] > 0).all() else directions
     errors_deg = _EXPECTED_SCALE * errors_deg
-    if (expected := float(errors_deg.mean())) > largest_error_deg:
+    if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
         raise InputError(
             f"the lights cannot be told from the images: their expected error is {expected:.0f} degrees, and at most"
-            f" {largest_error_deg:.0f} is of use",
+            f" {LARGEST_ERROR_DEG:.0f} is of use",
             hint="Show the whole outline of the object and give its mask, add images with other lights, or measure the"
             " lights with 'splinecli calibrate'",
         )

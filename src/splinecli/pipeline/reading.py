@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
     from splinecli.capture.lights.found_lights import LightFinder
     from splinecli.capture.lights.lamp_files import LampOptions
+    from splinecli.light.unknown_lights import FirstLight
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +25,7 @@ class Reading:
     Args:
         lights, mask, ground_truth: files that replace those of the capture. `lights` may be "estimate": the directions
             are found from the images.
+        first_light: the side of the image from which the first of these lights comes: left, right, above or below.
         intensities: a file of light intensities, or "equal".
         lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
@@ -40,6 +43,7 @@ class Reading:
     """
 
     lights: str | None = None
+    first_light: FirstLight | None = None
     intensities: str | None = None
     light_positions: str | None = None
     light_distance: float | None = None
@@ -63,9 +67,11 @@ class Reading:
         from splinecli.capture.restore.white_level import check_white_level
         from splinecli.capture.window import parse_window
 
-        _ = self.lamps, parse_window(self.crop, self.scale)
         if self.finds_lights:
             self._check_found_lights()
+        elif self.first_light is not None:
+            raise UsageError("--first-light needs --lights estimate", hint="Add it, or leave both out")
+        _ = self.lamps, parse_window(self.crop, self.scale)
         parse_transfer(self.transfer)
         parse_light_frame(self.light_frame)
         check_white_level(self.white_level)
@@ -144,7 +150,7 @@ class Reading:
         if self.finds_lights:
             from splinecli.light.unknown_lights import find_lights
 
-            find = find_lights
+            find = partial(find_lights, first_light=self.first_light)
 
         return open_capture(
             folder,

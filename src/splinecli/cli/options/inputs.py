@@ -19,6 +19,10 @@ LIGHTS = Option(
     help="Light directions: a line x y z for each image, z to the camera. estimate finds them from the images, less"
     " exactly. [default: the light file in CAPTURE]",
 )
+FIRST_LIGHT = Option(
+    None,
+    help="With --lights estimate: side of the image from which the first light comes, where the object has no outline.",
+)
 ESTIMATED_LIGHTS = Option(
     None,
     "--lights",

@@ -26,6 +26,15 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
+class FirstLight(StrEnum):
+    """Side of the image from which a light comes."""
+
+    left = "left"
+    right = "right"
+    above = "above"
+    below = "below"
+
+
 class LightForm(StrEnum):
     """Numbers of a light: a vector, or azimuth and elevation in degrees."""
 

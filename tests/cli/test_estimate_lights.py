@@ -1,0 +1,137 @@
+"""`--lights estimate` of infer, info and evaluate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cli.test_schema import check
+from scenes import cap_directions, shade, sphere, write_capture
+from splinecli.maths.normals import angle_between_deg
+
+LIGHTS = cap_directions(10, 50, 4, even=True)
+
+
+@pytest.fixture
+def unlit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A matte sphere without a light file, `ball` in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    normals, inside = sphere(64)
+    images = shade(normals, LIGHTS, noise=0.002) * inside[..., None]
+    pictures = np.moveaxis((images.clip(0, 1) * 60_000).astype(np.uint16), 2, 0)
+    truth = (normals * inside[..., None]).astype(np.float32)
+    return write_capture(Path("ball"), pictures, None, mask=inside, normals=truth)
+
+
+def test_infer(unlit, run):
+    result = run("infer", unlit, "--lights", "estimate", "--method", "ls", "--json")
+    assert result.code == 0, result.err
+    [report] = json.loads(result.out)
+    check(report, "report")
+    assert report["light_file"] is None
+    assert "estimated_lights" in [warning["code"] for warning in report["warnings"]]
+    assert {"light_directions.txt", "lights.png"} <= set(report["files"])
+    found = np.loadtxt("out/ball/light_directions.txt")
+    error = angle_between_deg(found, LIGHTS).mean()
+    assert error < 5 and error < 3 * np.mean(report["light_errors_deg"])
+    assert cv2.imread("out/ball/lights.png") is not None
+    # The files give the same normals again.
+    intensities = Path("out/ball/light_intensities.txt")
+    given = ["--intensities", str(intensities) if intensities.exists() else "equal"]
+    lights = ["--lights", "out/ball/light_directions.txt"]
+    assert run("infer", unlit, *lights, *given, "--method", "ls", "-o", "again").code == 0
+    np.testing.assert_allclose(np.load("again/ball/normals.npy"), np.load("out/ball/normals.npy"), atol=2e-4)
+
+
+def test_the_message_about_a_missing_light_file_names_it(unlit, run):
+    result = run("infer", unlit)
+    assert result.code == 3 and "--lights estimate" in result.err and "splinecli calibrate" in result.err
+
+
+def test_a_light_file_of_the_user_is_kept(unlit, run):
+    """Here, the results go into the folder of the capture."""
+    own = "\n".join("0 0 1" for _ in LIGHTS)
+    (unlit / "light_directions.txt").write_text(own)
+    command = ("infer", unlit, "--lights", "estimate", "--intensities", "equal", "--method", "ls", "-o", ".")
+    result = run(*command)
+    assert result.code == 5 and "not from an earlier run" in result.err
+    assert (unlit / "light_directions.txt").read_text() == own
+    (unlit / "light_directions.txt").unlink()
+    assert run(*command).code == 0
+    # Its own files are replaced, and removed where the lights are no longer estimated.
+    assert run(*command, "--overwrite").code == 0
+    np.savetxt("given.txt", LIGHTS)
+    assert run("infer", unlit, "--lights", "given.txt", "--method", "ls", "-o", ".", "--overwrite").code == 0
+    assert not (unlit / "light_directions.txt").exists()
+
+
+def test_info(unlit, run):
+    result = run("info", unlit, "--lights", "estimate", "--json", "--plot", "sky/lights.png")
+    assert result.code == 0, result.err
+    report = json.loads(result.out)
+    assert angle_between_deg(np.array(report["estimated_lights"]["directions"]), LIGHTS).mean() < 5
+    assert report["light_directions"] is None and "estimated_lights" in report["warning_codes"]
+    assert "estimated from the images" in run("info", unlit, "--lights", "estimate").out
+
+
+def test_evaluate(unlit, run):
+    np.savetxt(unlit / "light_directions.txt", LIGHTS)
+    (unlit / "light_intensities.txt").write_text("1\n" * len(LIGHTS))
+    arguments = (
+        "evaluate",
+        unlit,
+        "--method",
+        "ls",
+        "--n-lights",
+        "8",
+        "--trials",
+        "2",
+        "--json",
+        "-o",
+        "scores",
+    )
+    given = json.loads(run(*arguments).out)
+    result = run(*arguments, "--lights", "estimate")
+    estimated = json.loads(result.out)
+    check(estimated, "results")
+    assert given["results"][0]["found_light_error_deg"] is None
+    error = estimated["results"][0]["found_light_error_deg"]
+    assert 0 < error < 6
+    assert given["results"][0]["mae_deg"] < estimated["results"][0]["mae_deg"] < error + 3
+    assert estimated["protocol"]["lights_estimated"] and "are wrong by" in result.err
+
+
+def test_first_light(unlit, run):
+    """The whole image: it shows no outline."""
+    (unlit / "mask.png").unlink()
+    crop = ("infer", unlit, "--crop", "16,16,32,32", "--lights", "estimate", "--method", "ls")
+    result = run(*crop)
+    assert result.code == 3 and "--first-light left, right, above or below" in result.err
+    side = "left" if LIGHTS[0, 0] < 0 else "right"
+    assert run(*crop, "--first-light", side).code == 0
+    assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
+    result = run("infer", unlit, "--first-light", side)
+    assert result.code == 2 and "--first-light needs --lights estimate" in result.err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("infer", "ball", "--light-distance", "100"),
+        ("infer", "ball", "--light-positions", "x.txt"),
+        ("infer", "ball", "--light-frame", "x-left"),
+        ("infer", "ball", "--lights-format", "azel"),
+        ("infer", "ball", "--refine-lights"),
+        ("info", "ball", "--check-lights"),
+        ("evaluate", "ball", "--refine-lights"),
+        ("evaluate", "ball", "--light-noise-deg", "2"),
+    ],
+)
+def test_contradictions(unlit, run, arguments):
+    result = run(*arguments, "--lights", "estimate")
+    assert result.code == 2 and "--lights estimate" in result.err
+    assert not Path("out").exists()

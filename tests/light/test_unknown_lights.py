@@ -1,0 +1,147 @@
+"""Lights that are found from the images: analytic spheres, whose lights are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from scenes import cap_directions, shade, sphere, sphere_cap
+from splinecli import estimate_normals
+from splinecli.capture.capture_warnings import ESTIMATED_LIGHTS
+from splinecli.capture.restore.light_refinement import fit_near
+from splinecli.confidence.correction import add_light_error
+from splinecli.errors import InputError, UsageError
+from splinecli.light.outline import turn_at_outline
+from splinecli.light.unknown_lights import find_lights
+from splinecli.maths.normals import angle_between_deg
+
+SIZE = 64
+NORMALS, INSIDE = sphere(SIZE)
+
+
+def lights(count: int = 10, seed: int = 1) -> NDArray[np.float64]:
+    return cap_directions(count, 55, seed, even=True)
+
+
+def observed(directions: NDArray[np.float64], **gloss: float) -> NDArray[np.float32]:
+    return shade(NORMALS[INSIDE], directions, noise=0.002, **gloss).astype(np.float32)
+
+
+def mean_angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    return float(angle_between_deg(found, true).mean())
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.5])
+@pytest.mark.parametrize("count", [4, 10, 40])
+def test_a_sphere(count: int, gloss: float) -> None:
+    true = lights(count)
+    found = find_lights(observed(true, gloss=gloss), INSIDE, True)
+    assert found.intensities is None
+    assert mean_angle(found.directions, true) < 5
+    assert mean_angle(found.directions, true) < 3 * found.errors_deg.mean()
+    np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1)
+
+
+def test_intensities_are_found_with_the_directions() -> None:
+    true, intensities = lights(), np.random.default_rng(3).uniform(0.7, 1.4, 10)
+    intensities /= intensities.mean()
+    found = find_lights(observed(true) * intensities.astype(np.float32), INSIDE, False)
+    assert found.intensities is not None and found.intensities.mean() == pytest.approx(1)
+    assert mean_angle(found.directions, true) < 6
+    assert np.abs(found.intensities / intensities - 1).mean() < 0.5 * np.abs(intensities - 1).mean()
+
+
+def test_a_turned_camera_turns_the_lights() -> None:
+    """All eight turns and mirror images are seen, so none is preferred."""
+    true = lights()
+    images = np.zeros((10, SIZE, SIZE), np.float32)
+    images[:, INSIDE] = observed(true, gloss=0.3).T
+    inside = INSIDE.copy()
+    inside[: SIZE // 4] = False  # no symmetric outline
+    straight = find_lights(np.ascontiguousarray(images[:, inside].T), inside, True)
+    turned, turned_inside = np.rot90(images, axes=(1, 2)), np.rot90(inside).copy()
+    found = find_lights(np.ascontiguousarray(turned[:, turned_inside].T), turned_inside, True)
+    x, y, z = straight.directions.T
+    # The sample of pixels that the lights are fitted to differs a little.
+    assert mean_angle(found.directions, np.stack((-y, x, z), axis=1)) < 0.2
+
+
+def test_images_that_are_alike_are_refused() -> None:
+    same = np.repeat(observed(lights(1)), 6, axis=1) * np.linspace(0.5, 1, 6, dtype=np.float32)
+    with pytest.raises(InputError, match="all images are alike"):
+        find_lights(same, INSIDE, True)
+
+
+def test_what_shows_no_object_is_refused() -> None:
+    noise = np.random.default_rng(0).uniform(size=(SIZE * SIZE, 8)).astype(np.float32)
+    with pytest.raises(InputError, match="do not show one surface"):
+        find_lights(noise, np.ones((SIZE, SIZE), np.bool_), True, first_light="left")
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow: bool) -> None:
+    """A matte hollow shows the same as a bump under opposite lights."""
+    everywhere, true = np.ones((SIZE, SIZE), np.bool_), lights()
+    true[0] = (-0.6, 0.0, 0.8)
+    normals = sphere_cap(SIZE).reshape(-1, 3) * ((-1, -1, 1) if hollow else (1, 1, 1))
+    images = shade(normals, true, noise=0.002).astype(np.float32)
+    with pytest.raises(InputError, match=r"a bump looks like a hollow .* --first-light left"):
+        find_lights(images, everywhere, True)
+    found = find_lights(images, everywhere, True, first_light="left")
+    assert mean_angle(found.directions, true) < 6
+
+
+def test_the_images_correct_guesses_that_disagree_with_each_other() -> None:
+    """A matte surface cannot tell a common turn, but nearly all of the rest."""
+    true = lights(12)
+    guessed = true + np.random.default_rng(2).normal(scale=0.06, size=true.shape)
+    guessed /= np.linalg.norm(guessed, axis=1, keepdims=True)
+    fit = fit_near(observed(true), guessed, np.full(12, 5.0), intensity_error=0.0, worth_pixels=50)
+    assert fit is not None and fit.after < 0.5 * fit.before
+
+    def without_common_turn(directions: NDArray[np.float64]) -> float:
+        turn, _ = Rotation.align_vectors(true, directions)
+        return mean_angle(turn.apply(directions), true)
+
+    assert without_common_turn(fit.directions) < 0.4 * without_common_turn(guessed)
+
+
+@pytest.mark.parametrize("turn_deg", [(8, 0, 0), (0, -6, 0), (3, 4, 5)])
+def test_the_outline_shows_a_common_turn(turn_deg: tuple[float, float, float]) -> None:
+    true = lights(20)
+    turn = Rotation.from_rotvec(turn_deg, degrees=True)
+    found = turn_at_outline(observed(true), INSIDE, turn.apply(true))
+    assert found is not None and found.spread < 0.1
+    left = (Rotation.from_matrix(found.rotation) * turn).magnitude()
+    assert np.degrees(left) < 0.35 * np.linalg.norm(turn_deg)
+    half = Rotation.from_matrix(found.share(0.5))
+    assert half.magnitude() == pytest.approx(Rotation.from_matrix(found.rotation).magnitude() / 2)
+
+
+def test_the_border_of_the_image_is_no_outline() -> None:
+    everywhere = np.ones((SIZE, SIZE), np.bool_)
+    values = shade(sphere_cap(SIZE)[everywhere], lights()).astype(np.float32)
+    assert turn_at_outline(values, everywhere, lights()) is None
+
+
+def test_confidence_includes_the_lights() -> None:
+    errors = np.array([[np.log(0.03), 1.0], [np.log(0.5), 1.0]], np.float32)
+    add_light_error(errors, np.array([2.0, 4.0]))
+    turn = np.radians(3.0)
+    np.testing.assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
+
+
+def test_python() -> None:
+    true = lights()
+    images = np.zeros((10, SIZE, SIZE), np.float32)
+    images[:, INSIDE] = observed(true).T
+    estimate = estimate_normals(images, None, INSIDE, method="ls")
+    capture = estimate.capture
+    assert ESTIMATED_LIGHTS in [warning.code for warning in capture.warnings]
+    assert capture.light_errors_deg is not None and capture.light_errors_deg.shape == (10,)
+    errors = angle_between_deg(estimate.normal_map[INSIDE], NORMALS[INSIDE])
+    assert np.median(errors) < mean_angle(capture.light_directions, true) + 3
+    with pytest.raises(UsageError, match="near lamps need positions"):
+        estimate_normals(images, None, INSIDE, pixel_size=1.0)
