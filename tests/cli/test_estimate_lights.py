@@ -110,7 +110,10 @@ def test_first_light(unlit, run):
     (unlit / "mask.png").unlink()
     crop = ("infer", unlit, "--crop", "16,16,32,32", "--lights", "estimate", "--method", "ls")
     result = run(*crop)
-    assert result.code == 3 and "--first-light left, right, above or below" in result.err
+    assert result.code == 3 and result.err.startswith("splinecli: ball: the images do not show the outline")
+    assert "--first-light left, right, above or below" in result.err
+    result = run("info", unlit, "--crop", "16,16,32,32", "--lights", "estimate")
+    assert result.code == 3 and result.err.startswith("splinecli: ball: the images do not show the outline")
     side = "left" if LIGHTS[0, 0] < 0 else "right"
     assert run(*crop, "--first-light", side).code == 0
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15

@@ -14,6 +14,7 @@ from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.capture.restore.saturation import restore_saturated
 from splinecli.capture.restore.white_level import Saturation
+from splinecli.errors import InputError
 
 
 def name_reading(*, as_stored: bool) -> str:
@@ -48,7 +49,10 @@ class StoredCapture:
             InputError: the images do not tell the lights, or the lights that are found cannot give normals.
         """
         capture = self.capture
-        found = find(capture.observations, capture.mask, self.intensities_known)
+        try:
+            found = find(capture.observations, capture.mask, self.intensities_known)
+        except InputError as error:
+            raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
         warning = capture_warnings.estimated_lights(found.errors_deg)
         capture = replace(
             capture,

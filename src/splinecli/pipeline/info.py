@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splinecli.errors import UsageError
+from splinecli.errors import InputError, UsageError
 from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.reading import Reading
@@ -177,7 +177,10 @@ def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLi
     source, sample = summary.source, summary.sample
     if source.find_lights is None or sample is None:
         return summary, None
-    found = source.find_lights(sample.observations, sample.mask, source.intensities_known)
+    try:
+        found = source.find_lights(sample.observations, sample.mask, source.intensities_known)
+    except InputError as error:
+        raise InputError(error.problem, path=source.files.folder, hint=error.hint) from None
     return replace(summary, source=replace(source, light_directions=found.directions)), found
 
 
