@@ -13,7 +13,7 @@ from splinecli.capture.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.capture.restore.light_refinement import fit_near
 from splinecli.confidence.correction import add_light_error
 from splinecli.errors import InputError, UsageError
-from splinecli.light.outline import turn_at_outline
+from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.light.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg
 
@@ -75,9 +75,36 @@ def test_images_that_are_alike_are_refused() -> None:
 
 
 def test_what_shows_no_object_is_refused() -> None:
-    noise = np.random.default_rng(0).uniform(size=(SIZE * SIZE, 8)).astype(np.float32)
+    noise = np.random.default_rng(0).uniform(size=(int(INSIDE.sum()), 8)).astype(np.float32)
     with pytest.raises(InputError, match="do not show one surface"):
-        find_lights(noise, np.ones((SIZE, SIZE), np.bool_), True, first_light="left")
+        find_lights(noise, INSIDE, True)
+
+
+def test_black_images_and_thin_masks_are_refused() -> None:
+    with pytest.raises(InputError, match="all images are alike"):
+        find_lights(np.zeros((int(INSIDE.sum()), 8), np.float32), INSIDE, True)
+    normals, disc = sphere(400)
+    ring = disc & ~sphere(400, 0.96)[1]
+    with pytest.raises(InputError, match="the mask is too thin"):
+        find_lights(shade(normals[ring], lights()).astype(np.float32), ring, True)
+
+
+def test_a_first_light_from_another_side_decides_nothing() -> None:
+    true = lights()
+    true[0] = (0.0, 0.6, 0.8)
+    with pytest.raises(InputError, match="does not come clearly from left"):
+        find_lights(observed(true), INSIDE, True, first_light="left")
+    found = find_lights(observed(true), INSIDE, True, first_light="above")
+    assert mean_angle(found.directions, true) < 5
+
+
+def test_holes_and_narrow_borders_are_no_outline() -> None:
+    mask = np.ones((200, 200), np.bool_)
+    mask[80:120, 80:120] = False
+    assert outline_share(mask) == 0
+    mask[:2] = mask[-2:] = mask[:, :2] = mask[:, -2:] = False
+    assert outline_share(mask) == 0
+    assert outline_share(INSIDE) > 0.9
 
 
 @pytest.mark.parametrize("hollow", [False, True])

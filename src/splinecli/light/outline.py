@@ -22,6 +22,9 @@ MIN_PIXELS = 20
 _SMOOTHING = 0.02
 """Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards."""
 
+_BORDER = 0.01
+"""Masks of objects that fill the image may leave out a border of this share of its sides."""
+
 _RIM_Z = 0.25
 """Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""
 
@@ -84,12 +87,19 @@ def turn_at_outline(
 
 
 def outline_share(mask: NDArray[np.bool_]) -> float:
-    """Return the share of the boundary of a mask (H, W) that lies inside the image, not at its border."""
-    padded = np.pad(mask, 1)
-    inner = padded[1:-1, :-2] & padded[1:-1, 2:] & padded[:-2, 1:-1] & padded[2:, 1:-1]
-    boundary = mask & ~inner
-    inside = boundary[1:-1, 1:-1]
+    """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of the image."""
+    boundary = _boundary(mask)
+    rows, columns = (1 + round(_BORDER * side) for side in mask.shape)
+    inside = boundary[rows:-rows, columns:-columns]
     return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
+
+
+def _boundary(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pixels of a mask (H, W) at its outer boundary; holes have none."""
+    from scipy.ndimage import binary_erosion, binary_fill_holes
+
+    filled = binary_fill_holes(mask)
+    return np.asarray(mask & ~binary_erosion(filled, np.ones((3, 3))))
 
 
 def _rim(
@@ -98,8 +108,7 @@ def _rim(
     """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
     import cv2
 
-    padded = np.pad(mask, 1).astype(np.uint8)
-    rim = (mask & (cv2.erode(padded, np.ones((3, 3), np.uint8))[1:-1, 1:-1] == 0)).copy()
+    rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False
     width = max(1.5, _SMOOTHING * float(np.sqrt(np.count_nonzero(mask))))
     falling = cv2.GaussianBlur(np.pad(mask, 3).astype(np.float32), (0, 0), width)

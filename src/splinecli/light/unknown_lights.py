@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import resources
-from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.found_lights import FoundLights
+from splinecli.capture.lights.found_lights import FirstLight, FoundLights
 from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, LightFit, fit_near
 from splinecli.errors import InputError
 from splinecli.light.outline import outline_share, turn_at_outline
@@ -37,7 +36,9 @@ among them, have at most half of it."""
 LEAST_OUTLINE = 0.5
 """Smallest share of the mask's boundary inside the image. With less, the object continues outside of it."""
 
-FirstLight = Literal["left", "right", "above", "below"]
+LEAST_SIDE = 0.15
+"""Smallest share of a direction towards a side from which a light comes: 9 degrees from the camera axis."""
+
 SIDES: dict[str, tuple[float, float]] = {"left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
 
 SAME_IMAGES = 0.01
@@ -68,7 +69,8 @@ def find_lights(
         observations: (P, F), linear, 0 or more; divided by the light intensities where they are known.
         mask: (H, W) with P true pixels, in row-major order.
         intensities_known: whether the intensities are known; else they are found, too.
-        first_light: the side of the image from which the first light comes. It decides between a bump and a hollow.
+        first_light: the side of the image from which the light of the first observations comes. It decides between a
+            bump and a hollow.
         refuse: raise an error for lights that the images do not tell; else return a guess.
 
     Raises:
@@ -78,12 +80,18 @@ def find_lights(
     if refuse and first_light is None and outline_share(mask) < LEAST_OUTLINE:
         raise InputError(
             "the images do not show the outline of the object, so a bump looks like a hollow under opposite lights",
-            hint="Say from which side the light of the first image comes: --first-light left, right, above or below."
-            " Or show the whole object, and give its mask",
+            hint="Say from which side the light of the first image that is used comes: --first-light left, right,"
+            " above or below. Or show the whole object, and give its mask",
         )
     directions, errors_deg, intensities = _ask_network(observations, mask)
-    if first_light is not None and directions[0, :2] @ SIDES[first_light] < 0:
-        directions = directions * (-1, -1, 1)
+    if first_light is not None:
+        towards = float(directions[0, :2] @ SIDES[first_light])
+        if abs(towards) < LEAST_SIDE:
+            raise InputError(
+                f"the first light does not come clearly from {first_light}, nor from the opposite side",
+                hint="Name the side that it is nearest to, or put an image whose light comes from a side first",
+            )
+        directions = directions * (-1, -1, 1) if towards < 0 else directions
     if not intensities_known:
         observations = np.asarray(observations / intensities, np.float32)
     fit = fit_near(
@@ -127,7 +135,7 @@ def _check_different(observations: NDArray[np.float32]) -> None:
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
     rows = rows / np.maximum(rows.mean(axis=0), 1e-12)  # a change of exposure is none of the light
     mean = rows.mean(axis=1, keepdims=True)
-    if np.abs(rows - mean).mean() < SAME_IMAGES * mean.mean():
+    if np.abs(rows - mean).mean() <= SAME_IMAGES * mean.mean():  # equal for black images
         raise InputError(
             "all images are alike, so they say nothing about the lights",
             hint="Photograph the object with the lamp at a different place for each image",
@@ -148,6 +156,10 @@ def _ask_network(
         image[mask] = values
         cut, inside = square_images(torch.from_numpy(image)[None, ::step, ::step], area[::step, ::step])
         small.append(cut[0])
+    if not inside.any():
+        raise InputError(
+            "the mask is too thin or too scattered to find the lights", hint="Give a mask of the whole object"
+        )
     images = torch.stack(small)
     images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
     network = _network()

@@ -120,7 +120,13 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         for kind in report["image_kinds"]
     )
     nearest, farthest = report["axis_angle_deg"]
+    estimated = report["estimated_lights"]
     lights = report["light_directions"] or "estimated from the images"
+    if report["light_directions"] is None and estimated is None:
+        lights = "not estimated, because the images differ in size"
+    intensities = report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
+    if estimated is not None and estimated["intensities"] is not None:
+        intensities = "estimated from the images"
     exposure, level = report["exposure"], report["white_level"]
     dark, bright = exposure["bright"]
     rows = [
@@ -128,7 +134,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("images", f"{report['images']} ({report['first_image']} ... {report['last_image']}): {kinds}"),
         ("lights", f"{lights}, {nearest:.0f} to {farthest:.0f} degrees from the camera axis"),
         *([("lamps", report["lamps"])] if report["lamps"] else []),
-        ("intensities", report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"),
+        ("intensities", intensities),
         *([("reads", report["reads"])] if report["reads"] else []),
         ("mask", f"{report['mask'] or 'none: all pixels'} ({report['n_pixels']} pixels)"),
         ("ground truth", report["ground_truth"] or "none"),

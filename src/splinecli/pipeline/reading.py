@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
+from splinecli.capture.lights.found_lights import FirstLight
 from splinecli.capture.lights.light_angles import LightForm
 from splinecli.errors import UsageError, check_one_of
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from splinecli.capture import CaptureSource, RadiometricCalibration
     from splinecli.capture.lights.found_lights import LightFinder
     from splinecli.capture.lights.lamp_files import LampOptions
-    from splinecli.light.unknown_lights import FirstLight
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +71,8 @@ class Reading:
             self._check_found_lights()
         elif self.first_light is not None:
             raise UsageError("--first-light needs --lights estimate", hint="Add it, or leave both out")
+        if self.first_light is not None:
+            check_one_of("first light", self.first_light, get_args(FirstLight))
         _ = self.lamps, parse_window(self.crop, self.scale)
         parse_transfer(self.transfer)
         parse_light_frame(self.light_frame)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+FirstLight = Literal["left", "right", "above", "below"]
+"""Side of the image from which a light comes."""
 
 ESTIMATE = "estimate"
 """Given in place of a light file: the lights are found from the images."""

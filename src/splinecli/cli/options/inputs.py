@@ -21,7 +21,8 @@ LIGHTS = Option(
 )
 FIRST_LIGHT = Option(
     None,
-    help="With --lights estimate: side of the image from which the first light comes, where the object has no outline.",
+    help="With --lights estimate: side from which the light of the first image that is used comes. Objects without"
+    " outline need it.",
 )
 ESTIMATED_LIGHTS = Option(
     None,
