@@ -20,9 +20,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from splinecli.light.unknown_lights import LIGHT_FORMAT
 from splinecli.networks.light_net import LightNet, network_inputs, square_images
-from splinecli.networks.weights import serialise, tensors_sha256
+from splinecli.networks.weights import LIGHT_FORMAT, save_module
 from splinecli.synthesis import shapes
 from splinecli.synthesis.background import add_background
 from splinecli.synthesis.fields import ellipsoid, smooth_union, triangulate
@@ -217,11 +216,7 @@ def train(folder: Path, minutes: float, output: Path) -> None:
             state = {"network": network.state_dict(), "average": average.state_dict()}
             torch.save({**state, "optimiser": optimiser.state_dict(), "step": step}, checkpoint)
             print(step, f"{validate(average, folder):.2f} degrees on held scenes", flush=True)
-    tensors = {name: value.half().contiguous() for name, value in average.state_dict().items()}
-    tensors = {name: value.clone(memory_format=torch.contiguous_format) for name, value in tensors.items()}
-    output.write_bytes(
-        serialise(tensors, {"format": LIGHT_FORMAT, "tensors_sha256": tensors_sha256(tensors)})
-    )
+    save_module(average, output, {"format": LIGHT_FORMAT})
     print(step, f"{validate(average, folder):.2f} degrees on held scenes, {output}")
 
 

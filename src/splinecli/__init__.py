@@ -100,11 +100,14 @@ def estimate_normals(
     from splinecli.capture.arrays import capture_from_arrays
     from splinecli.capture.capture_warnings import PROBABLY_WRONG
     from splinecli.diagnosis.checks import check_arrays
+    from splinecli.errors import UsageError
     from splinecli.methods import MethodOptions, check_method, make_estimator
     from splinecli.pipeline.estimate import estimate_capture
 
     check_method(method)
     find: LightFinder | None = None
+    if first_light is not None and light_directions is not None:
+        raise UsageError("first_light is for lights that are found", hint="Leave it or light_directions out")
     if light_directions is None:
         from splinecli.light.unknown_lights import find_lights
 

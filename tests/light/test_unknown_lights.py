@@ -141,10 +141,11 @@ def test_the_outline_shows_a_common_turn(turn_deg: tuple[float, float, float]) -
     turn = Rotation.from_rotvec(turn_deg, degrees=True)
     found = turn_at_outline(observed(true), INSIDE, turn.apply(true))
     assert found is not None and found.spread < 0.1
-    left = (Rotation.from_matrix(found.rotation) * turn).magnitude()
+    shown = Rotation.from_rotvec(found.rotation)
+    left = (shown * turn).magnitude()
     assert np.degrees(left) < 0.35 * np.linalg.norm(turn_deg)
     half = Rotation.from_matrix(found.share(0.5))
-    assert half.magnitude() == pytest.approx(Rotation.from_matrix(found.rotation).magnitude() / 2)
+    assert half.magnitude() == pytest.approx(shown.magnitude() / 2)
 
 
 def test_the_border_of_the_image_is_no_outline() -> None:
@@ -172,3 +173,7 @@ def test_python() -> None:
     assert np.median(errors) < mean_angle(capture.light_directions, true) + 3
     with pytest.raises(UsageError, match="near lamps need positions"):
         estimate_normals(images, None, INSIDE, pixel_size=1.0)
+    with pytest.raises(UsageError, match="first_light is for lights that are found"):
+        estimate_normals(images, true, INSIDE, first_light="left")
+    with pytest.raises(UsageError, match="first light"):
+        estimate_normals(images, None, INSIDE, first_light="north")  # type: ignore[arg-type]

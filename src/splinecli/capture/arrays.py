@@ -59,6 +59,8 @@ def capture_from_arrays(
     """
     stack = _checked_images(images)
     shape, n_lights = stack[0].shape[:2], len(stack)
+    if light_directions is None and find_lights is None:
+        raise UsageError("found neither light directions nor a function that finds them")
     if light_directions is None and pixel_size is not None:
         raise UsageError(
             "light_directions is None, but near lamps need positions", hint="Leave pixel_size out"

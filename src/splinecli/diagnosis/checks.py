@@ -43,6 +43,10 @@ that fit best leave less than this share of it. Right captures of flat metal lea
 Check = Callable[[Evidence], list[CaptureWarning]]
 
 
+def shifted_images(seen: Evidence) -> list[CaptureWarning]:
+    return shift_warnings(seen.shifts, seen.lights.names)
+
+
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
     """Warn of an image that contradicts the others, and is not only shifted."""
     odd = seen.light_check.odd_image
@@ -138,7 +142,7 @@ DOUBTED = frozenset(
 EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
-    (lambda seen: shift_warnings(seen.shifts, seen.lights.names), frozenset()),
+    (shifted_images, frozenset()),
     (odd_image, frozenset()),
     (lambda seen: light_warnings(seen.light_check, seen.lights, strict=seen.strict), frozenset()),
     (missing_mask, frozenset()),
@@ -152,7 +156,7 @@ CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
 )
 """The checks, and the codes of earlier warnings after which each is skipped."""
 
-WITHOUT_LIGHTS = (CHECKS[0][0], missing_mask, same_images)
+WITHOUT_LIGHTS = (shifted_images, missing_mask, same_images)
 """The checks that need no lights. Where the lights were found from the images, only these are made."""
 
 

@@ -108,16 +108,21 @@ def smooth_normals(vectors: NDArray[np.floating], mask: NDArray[np.bool_]) -> Ro
 
 def _outward(mask: NDArray[np.bool_]) -> Array:
     """Return unit vectors (h, w, 2) out of the mask at its rim; the picture's own border is no outline."""
-    from scipy.ndimage import distance_transform_edt, gaussian_filter
+    from scipy.ndimage import distance_transform_edt
 
     padded = np.pad(mask, RIM_PIXELS + 1, mode="edge")
     if padded.all():
         return np.zeros((*mask.shape, 2))
-    inside, soft = distance_transform_edt(padded), gaussian_filter(padded.astype(np.float64), 2 * SMOOTHING)
-    x, y = _derivatives(soft)
     inner = slice(RIM_PIXELS + 1, -RIM_PIXELS - 1)
-    rim = (mask & (inside[inner, inner] <= RIM_PIXELS))[..., None]
-    return np.where(rim, unit(-np.stack((x, y), axis=2)[inner, inner]), 0.0)
+    rim = (mask & (distance_transform_edt(padded)[inner, inner] <= RIM_PIXELS))[..., None]
+    return np.where(rim, outward_directions(padded, 2 * SMOOTHING)[inner, inner], 0.0)
+
+
+def outward_directions(mask: NDArray[np.bool_], sigma: float) -> Array:
+    """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels falls; else zero."""
+    from scipy.ndimage import gaussian_filter
+
+    return unit(-np.stack(_derivatives(gaussian_filter(mask.astype(np.float64), sigma)), axis=2))
 
 
 def _derivatives(values: Array) -> tuple[Array, Array]:

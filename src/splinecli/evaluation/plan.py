@@ -203,10 +203,11 @@ def draws_for(
             path=source.files.folder,
             hint="Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat",
         )
+    near = source.lamps is not None and source.lamps.used
     if protocol.light_error_deg is not None:
-        check_distant(near=source.lamps is not None and source.lamps.used)
-    if protocol.finds_lights and source.lamps is not None and source.lamps.used:
-        raise UsageError(f"{name}: --lights estimate finds distant lights, and this capture has near lamps")
+        check_distant("--refine-lights", "refines", near=near)
+    if protocol.finds_lights:
+        check_distant("--lights estimate", "finds", near=near)
     skipped = protocol.skipped_lights(name)
     left = source.n_lights - skipped
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)

@@ -62,20 +62,17 @@ class TrialSource:
         return cls(stored, rows)
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
-        """Return the capture under the lights of a trial, with noise on their directions, which are refined if asked.
+        """Return the capture under the lights of a trial, which have noise, or are refined or found, if it says so.
 
-        It has the scored pixels, or with `whole` all of them. Lights are refined from all pixels, as in `infer`.
+        It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
         """
         rows = None if whole else self.rows
-        if trial.finds_lights:
-            capture = self._see(trial, None)
-            return capture if rows is None else capture.choose_pixels(rows)
-        if trial.light_error_deg is None:
+        if trial.light_error_deg is None and not trial.finds_lights:
             return self._see(trial, rows)
-        known = self.stored.intensities_known
-        capture = refine_capture(
-            self._see(trial, None), error_deg=trial.light_error_deg, intensities_known=known
-        )
+        capture = self._see(trial, None)
+        if trial.light_error_deg is not None:
+            known = self.stored.intensities_known
+            capture = refine_capture(capture, error_deg=trial.light_error_deg, intensities_known=known)
         return capture if rows is None else capture.choose_pixels(rows)
 
     def _see(self, trial: Trial, rows: NDArray[np.integer] | None) -> Capture:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import fit_robustly
+from splinecli.diagnosis.frame_evidence import outward_directions
 from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
@@ -37,7 +38,7 @@ class OutlineTurn(NamedTuple):
     """A rotation that turns the normals at the outline outwards.
 
     Attributes:
-        rotation: (3, 3), of lights and normals.
+        rotation: (3,), the rotation vector of lights and normals.
         spread: the median of what remains of the z of these normals. It is small where the outline is one of a smooth
             surface that the fit explains.
     """
@@ -49,8 +50,7 @@ class OutlineTurn(NamedTuple):
         """Return a part of the rotation (3, 3), from 0 to 1."""
         from scipy.spatial.transform import Rotation
 
-        turn = Rotation.from_matrix(self.rotation).as_rotvec()
-        return np.asarray(Rotation.from_rotvec(part * turn).as_matrix())
+        return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
 
 
 def turn_at_outline(
@@ -83,7 +83,7 @@ def turn_at_outline(
         turn = Rotation.from_rotvec(step) * turn
         if np.abs(step).max() < _CONVERGED:
             break
-    return OutlineTurn(np.asarray(turn.as_matrix()), float(np.median(np.abs(residuals[0]))))
+    return OutlineTurn(np.asarray(turn.as_rotvec()), float(np.median(np.abs(residuals[0]))))
 
 
 def outline_share(mask: NDArray[np.bool_]) -> float:
@@ -106,14 +106,10 @@ def _rim(
     observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
 ) -> tuple[Array, Array]:
     """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
-    import cv2
-
     rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False
     width = max(1.5, _SMOOTHING * float(np.sqrt(np.count_nonzero(mask))))
-    falling = cv2.GaussianBlur(np.pad(mask, 3).astype(np.float32), (0, 0), width)
-    down, right = (slope[3:-3, 3:-3] for slope in np.gradient(falling))
-    outwards = np.stack((-right, down, np.zeros_like(down)), axis=-1)[rim].astype(np.float64)
+    outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
     values = observations[rim[mask]].astype(np.float64)
     brightest = values.max(axis=1, keepdims=True, initial=0)
     values = values / np.maximum(brightest, 1e-12)
@@ -123,4 +119,4 @@ def _rim(
     if not seen.any():
         return np.empty((0, 3)), np.empty((0, 3))
     fitted, _ = fit_robustly(values[seen], lit[seen] + 1e-3, light_directions, _FITS)
-    return unit(fitted), unit(outwards[seen])
+    return unit(fitted), outwards[seen]

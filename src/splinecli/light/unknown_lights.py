@@ -9,8 +9,7 @@ and the outline of the object where it is clear.
 
 from __future__ import annotations
 
-from functools import cache
-from importlib import resources
+import math
 
 import numpy as np
 import torch
@@ -18,13 +17,10 @@ from numpy.typing import NDArray
 
 from splinecli.capture.lights.found_lights import FirstLight, FoundLights
 from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, LightFit, fit_near
-from splinecli.errors import InputError
+from splinecli.errors import InputError, check_one_of
 from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
-from splinecli.networks.weights import SHIPPED, load_strictly, read_tensors
-
-LIGHT_NET = "light-net.safetensors"
-LIGHT_FORMAT = "splinecli-light-net-1"
+from splinecli.networks.weights import light_net
 
 LARGEST_ERROR_DEG = 20.0
 """Lights with a larger expected error on average are refused: their normals would be worth little."""
@@ -46,12 +42,10 @@ SAME_IMAGES = 0.01
 
 # Chosen on rendered scenes that the network was not trained on.
 _WORTH_PIXELS = 6.0  # see fit_near
-_CLEAR_OUTLINE, _OUTLINE_SHARE = (
-    0.2,
-    0.35,
-)  # largest spread of an outline that counts, and how much of its turn counts
+_CLEAR_OUTLINE = 0.2  # largest spread of an outline that counts
+_OUTLINE_SHARE = 0.35  # of the turn that it shows
 _EXPECTED_SCALE = 0.8  # of the error that the network expects, after the images and the outline had their say
-_MOST_PIXELS = 4_000_000
+_MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
 
 
@@ -74,8 +68,16 @@ def find_lights(
         refuse: raise an error for lights that the images do not tell; else return a guess.
 
     Raises:
+        UsageError: the first light is of no known side.
         InputError: the images are all alike, they do not show one surface, or they do not tell the lights.
     """
+    if first_light is not None:
+        check_one_of("first light", first_light, SIDES)
+    step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
+    if step > 1:
+        grid = np.zeros_like(mask)
+        grid[::step, ::step] = mask[::step, ::step]
+        observations, mask = observations[grid[mask]], mask[::step, ::step]
     _check_different(observations)
     if refuse and first_light is None and outline_share(mask) < LEAST_OUTLINE:
         raise InputError(
@@ -149,12 +151,11 @@ def _ask_network(
 
     They are means over the four turns of the images by 90 degrees and their mirror images.
     """
-    step = max(1, int(np.ceil(np.sqrt(observations.shape[0] / _MOST_PIXELS))))
     area, image = torch.from_numpy(mask), np.zeros(mask.shape, np.float32)
     small = []
     for values in observations.T:  # one image at a time: all of them would double the memory
         image[mask] = values
-        cut, inside = square_images(torch.from_numpy(image)[None, ::step, ::step], area[::step, ::step])
+        cut, inside = square_images(torch.from_numpy(image)[None], area)
         small.append(cut[0])
     if not inside.any():
         raise InputError(
@@ -162,7 +163,7 @@ def _ask_network(
         )
     images = torch.stack(small)
     images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
-    network = _network()
+    network = light_net()
     with torch.inference_mode():
         guesses = [_view(network, images, inside, turns, mirrored) for turns, mirrored in _VIEWS]
     directions, sharpness, log_intensities = (torch.cat(part).double() for part in zip(*guesses, strict=True))
@@ -186,11 +187,3 @@ def _view(
     for _ in range(turns):
         x, y = y, -x
     return guess._replace(directions=torch.stack((x, y, z), dim=-1))
-
-
-@cache
-def _network() -> LightNet:
-    with resources.as_file(SHIPPED / LIGHT_NET) as path:
-        network = LightNet()
-        load_strictly(network, read_tensors(path, LIGHT_FORMAT, "Reinstall splinecli")[0], path)
-    return network.float().eval()

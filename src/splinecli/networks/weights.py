@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -17,16 +18,20 @@ from torch import Tensor, nn
 from splinecli.errors import ModelError
 from splinecli.networks.capture_head import CaptureHead
 from splinecli.networks.config import NetworkConfig
+from splinecli.networks.light_net import LightNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.system.files import file_sha256, is_special, parse_json, write_bytes
 
 FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
+LIGHT_NET, LIGHT_FORMAT = "light-net.safetensors", "splinecli-light-net-1"
 LONGEST = 500_000_000
 """Bytes of the longest file of tensors that is read; a checkpoint of the paper's networks has 170 MB."""
 
 _LENGTH_BYTES = 8  # of the number at the start of a safetensors file, the length of its header
 _LONGEST_HEADER = 1 << 20  # bytes; a tensor has about 100
+Module = TypeVar("Module", bound=nn.Module)
+
 SHIPPED = resources.files("splinecli") / "assets"
 
 
@@ -71,16 +76,17 @@ def serialise(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
 
 def save_weights(network: SplineNet, path: Path) -> None:
     """Write the parameters of a network as float16, with its configuration. Raises OutputError."""
+    config = json.dumps(network.config.to_dict(), sort_keys=True)
+    save_module(network, path, {"format": FORMAT, "config": config})
+
+
+def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None:
+    """Write the parameters of a module as float16, with metadata and their checksum. Raises OutputError."""
     tensors = {
         name: tensor.detach().cpu().half().clone(memory_format=torch.contiguous_format)
-        for name, tensor in network.state_dict().items()
+        for name, tensor in module.state_dict().items()
     }
-    metadata = {
-        "format": FORMAT,
-        "config": json.dumps(network.config.to_dict(), sort_keys=True),
-        "tensors_sha256": tensors_sha256(tensors),
-    }
-    write_bytes(path, serialise(tensors, metadata))
+    write_bytes(path, serialise(tensors, {**metadata, "tensors_sha256": tensors_sha256(tensors)}))
 
 
 def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -226,10 +232,21 @@ def capture_head(sha256: str) -> CaptureHead | None:
         if entry["sha256"] == sha256 and "capture_head" in entry:
             with resources.as_file(SHIPPED / entry["capture_head"]["file"]) as path:
                 _check_shipped(path, entry["capture_head"]["sha256"], path.stem)
-                head = CaptureHead()
-                load_strictly(head, read_tensors(path, HEAD_FORMAT, "Reinstall splinecli")[0], path)
-                return head
+                return _load_module(CaptureHead(), path, HEAD_FORMAT)
     return None
+
+
+@cache
+def light_net() -> LightNet:
+    """Load the light network (float32, evaluation mode). Raises ModelError."""
+    with resources.as_file(SHIPPED / LIGHT_NET) as path:
+        return _load_module(LightNet(), path, LIGHT_FORMAT).float().eval()
+
+
+def _load_module(module: Module, path: Path, expected_format: str) -> Module:
+    """Return the module with the parameters of a shipped file. Raises ModelError."""
+    load_strictly(module, read_tensors(path, expected_format, "Reinstall splinecli")[0], path)
+    return module
 
 
 def _check_shipped(path: Path, sha256: str, name: str) -> None:

@@ -179,8 +179,9 @@ def _check_light_files(target: Path) -> None:
     """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
     from splinecli.results.files import LIGHT_FILES, own_light_files
 
+    own = own_light_files(target)
     for name in LIGHT_FILES:
-        if (target / name).exists() and name not in own_light_files(target):
+        if (target / name).exists() and name not in own:
             raise OutputError(
                 "the file is not from an earlier run, and --lights estimate would overwrite it",
                 path=target / name,

@@ -88,14 +88,23 @@ class Reading:
 
     def _check_found_lights(self) -> None:
         """Raise UsageError for options that concern a light file or near lamps."""
-        lamps = {"light-positions": self.light_positions, "light-distance": self.light_distance}
-        files = {"light-frame": self.light_frame, "lights-format": self.lights_format != "xyz" or None}
-        for name in (name for name, value in (lamps | files).items() if value is not None):
-            why = "finds distant lights" if name in lamps else "needs no light file"
-            raise UsageError(
-                f"--lights estimate {why}, so it contradicts --{name}",
-                hint=f"Leave --{name} out, or give a light file",
-            )
+        reasons = {
+            "--light-positions": self.light_positions is not None and "finds distant lights",
+            "--light-distance": self.light_distance is not None and "finds distant lights",
+            "--light-frame": self.light_frame is not None and "needs no light file",
+            "--lights-format": self.lights_format != "xyz" and "needs no light file",
+        }
+        for option, reason in reasons.items():
+            if reason:
+                raise UsageError(
+                    f"--lights estimate {reason}, so it contradicts {option}",
+                    hint=f"Leave {option} out, or give a light file",
+                )
+
+    @property
+    def light_file(self) -> str | None:
+        """The light file that replaces that of the capture."""
+        return None if self.finds_lights else self.lights
 
     @property
     def scales_surface(self) -> bool:
@@ -122,11 +131,10 @@ class Reading:
         from splinecli.capture.reader import EQUAL
 
         intensities = None if self.intensities == EQUAL else self.intensities
-        lights = None if self.finds_lights else self.lights
-        named = (lights, self.light_positions, intensities, self.camera_matrix, self.mask)
+        named = (self.light_file, self.light_positions, intensities, self.camera_matrix, self.mask)
         for name in (*named, self.ground_truth, self.ambient):
             if name is not None:
-                check_file(Path(name), "a file", pipe=name == lights)
+                check_file(Path(name), "a file", pipe=name == self.light_file)
         self.radiometric_calibration()
 
     def radiometric_calibration(self) -> RadiometricCalibration:
@@ -156,7 +164,7 @@ class Reading:
 
         return open_capture(
             folder,
-            lights=None if self.finds_lights else self.lights,
+            lights=self.light_file,
             intensities=self.intensities,
             mask=self.mask,
             ground_truth=self.ground_truth,

@@ -87,7 +87,7 @@ def refine_capture(
     Raises:
         UsageError: the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
     """
-    check_distant(near=capture.lamps is not None)
+    check_distant("--refine-lights", "refines", near=capture.lamps is not None)
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
     check_light_error(error_deg, refines=True)
     found = refine_lights(
@@ -139,12 +139,11 @@ def _why_kept(capture: Capture) -> str:
     return "no others near them fit the images much better"
 
 
-def check_distant(*, near: bool) -> None:
-    """Raise UsageError for a capture with near lamps."""
+def check_distant(option: str, verb: str, *, near: bool) -> None:
+    """Raise UsageError for a capture with near lamps under an option that refines or finds distant lights."""
     if near:
         raise UsageError(
-            "--refine-lights refines distant lights, and this capture has near lamps",
-            hint="Leave --refine-lights out",
+            f"{option} {verb} distant lights, and this capture has near lamps", hint=f"Leave {option} out"
         )
 
 
