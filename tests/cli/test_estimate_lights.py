@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from capture.formats.test_film import path_of_lamp, sphere_film, write_film
 from cli.test_schema import check
 from scenes import cap_directions, shade, sphere, write_capture
 from splinecli.maths.normals import angle_between_deg
@@ -28,7 +30,7 @@ def unlit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_infer(unlit, run):
-    result = run("infer", unlit, "--lights", "estimate", "--method", "ls", "--json")
+    result = run("infer", unlit, "--lights", "estimate", "--method", "ls", "--json", "--html")
     assert result.code == 0, result.err
     [report] = json.loads(result.out)
     check(report, "report")
@@ -38,7 +40,9 @@ def test_infer(unlit, run):
     found = np.loadtxt("out/ball/light_directions.txt")
     error = angle_between_deg(found, LIGHTS).mean()
     assert error < 5 and error < 3 * np.mean(report["light_errors_deg"])
+    picture = Path("out/ball/lights.png").read_bytes()
     assert cv2.imread("out/ball/lights.png") is not None
+    assert base64.b64encode(picture).decode() in Path("out/ball/page.html").read_text()
     # The files give the same normals again.
     intensities = Path("out/ball/light_intensities.txt")
     given = ["--intensities", str(intensities) if intensities.exists() else "equal"]
@@ -138,3 +142,46 @@ def test_contradictions(unlit, run, arguments):
     result = run(*arguments, "--lights", "estimate")
     assert result.code == 2 and "--lights estimate" in result.err
     assert not Path("out").exists()
+
+
+def test_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run) -> None:
+    monkeypatch.chdir(tmp_path)
+    lights = path_of_lamp(120)
+    film = write_film(Path("clip.avi"), sphere_film(lights))
+    mask = sphere(96)[1]
+    assert cv2.imwrite("mask.png", mask.astype(np.uint8) * 255)
+    command = ("infer", film, "--lights", "estimate", "--mask", "mask.png", "--method", "ls")
+    result = run(*command, "--json")
+    assert result.code == 0, result.err
+    [report] = json.loads(result.out)
+    check(report, "report")
+    frames = sorted(Path("out/frames/clip").glob("*.png"))
+    assert report["capture"] == "clip" and report["n_lights"] == len(frames) <= 24
+    true = lights[[int(frame.stem.removeprefix("frame-")) for frame in frames]]
+    assert angle_between_deg(np.loadtxt("out/clip/light_directions.txt"), true).mean() < 6
+    normals = np.load("out/clip/normals.npy")
+    assert angle_between_deg(normals[mask], sphere(96)[0][mask]).mean() < 6
+    # The frames are a capture of their own, and stay while the film does.
+    again = run(
+        "infer", "out/frames/clip", "--lights", "out/clip/light_directions.txt", "-o", "b", "--method", "ls"
+    )
+    assert again.code == 0, again.err
+    times = [frame.stat().st_mtime_ns for frame in frames]
+    assert "already done" in run(*command).err
+    assert [frame.stat().st_mtime_ns for frame in frames] == times
+    write_film(film, sphere_film(lights[::-1].copy()))
+    assert "other input files" in run(*command).err
+    assert [frame.stat().st_mtime_ns for frame in sorted(Path("out/frames/clip").glob("*.png"))] != times
+    assert "from the camera axis" in run("info", film, "--lights", "estimate", "--mask", "mask.png").out
+
+
+def test_films_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run) -> None:
+    monkeypatch.chdir(tmp_path)
+    film = write_film(Path("clip.avi"), sphere_film(np.repeat(path_of_lamp(1), 10, axis=0)))
+    result = run("infer", film)
+    assert result.code == 2 and "Add --lights estimate" in result.err
+    result = run("infer", film, "--lights", "estimate")
+    assert result.code == 3 and "clip.avi: found 1 of 10 frames" in result.err
+    assert not Path("out/frames").exists()
+    result = run("infer", "none.mp4", "--lights", "estimate")
+    assert result.code == 3 and "does not exist" in result.err

@@ -19,6 +19,14 @@ TransferCurve = float | tuple[float, ...] | None
 
 SRGB: TransferCurve = None
 
+
+def _decode_bt709(stored: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(stored < 0.081, stored / 4.5, ((stored + 0.099) / 1.099) ** (1 / 0.45))
+
+
+BT709: TransferCurve = tuple(_decode_bt709(np.linspace(0, 1, 256)).tolist())
+"""The curve of most films (ITU-R BT.709), for values of 8 bits."""
+
 GAMMAS = 0.1, 10.0
 """The smallest and the largest exponent."""
 

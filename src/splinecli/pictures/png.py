@@ -19,12 +19,15 @@ _HEAD = 33
 """Bytes of the signature and of the header, which is the first chunk of a file."""
 
 
-def encode_png(picture: NDArray[np.unsignedinteger], texts: Mapping[str, str] | None = None) -> bytes:
+def encode_png(
+    picture: NDArray[np.unsignedinteger], texts: Mapping[str, str] | None = None, *, film: bool = False
+) -> bytes:
     """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) of 8 or 16 bits.
 
     Args:
         picture: the picture.
         texts: texts of the file by keyword, in Latin-1 (PNG specification, tEXt).
+        film: whether the values have the primaries and the transfer curve of a film (BT.709; cICP).
 
     Raises:
         OutputError: OpenCV cannot encode the picture.
@@ -35,11 +38,12 @@ def encode_png(picture: NDArray[np.unsignedinteger], texts: Mapping[str, str] | 
     if not done:
         raise OutputError("the picture cannot be encoded as PNG")
     file = encoded.tobytes()
-    chunks = b"".join(_text_chunk(*text) for text in (texts or {}).items())
-    return file[:_HEAD] + chunks + file[_HEAD:]
-
-
-def _text_chunk(keyword: str, text: str) -> bytes:
     # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
-    content = b"tEXt" + keyword.encode("latin-1") + b"\0" + text.encode("latin-1")
+    chunks = [b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()]
+    chunks += [b"cICP\x01\x01\x00\x01"] if film else []
+    return file[:_HEAD] + b"".join(map(_chunk, chunks)) + file[_HEAD:]
+
+
+def _chunk(content: bytes) -> bytes:
+    """Return a chunk of a name and its content."""
     return struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))

@@ -207,6 +207,7 @@ def _further_files(
     clock: Clock,
 ) -> list[Callable[[NewFiles], None]]:
     """Compute what else the options ask for. Each function that is returned writes some files."""
+    from splinecli.pictures.light_sky import sky_plot
     from splinecli.results import files
 
     capture = estimate.capture
@@ -226,8 +227,10 @@ def _further_files(
         writers.append(partial(files.write_confidence, estimate.confidence_map))
     if "preview" in options.maps:
         writers.append(partial(files.write_preview, estimate))
+    light_plot = None
     if capture.light_errors_deg is not None:
-        writers.append(partial(files.write_lights, capture))
+        light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
+        writers.append(partial(files.write_lights, capture, light_plot))
     if source.automatic_mask is not None:
         writers.append(partial(files.write_mask, source.window.filled(capture.mask)))
     if options.surface:
@@ -235,7 +238,7 @@ def _further_files(
         writers.append(_surface(estimate, colours, report, options, observer))
     if options.html:
         clock.begin("pictures")
-        writers.append(_page(estimate, albedo, {**report, "seconds": clock.seconds()}))
+        writers.append(_page(estimate, albedo, {**report, "seconds": clock.seconds()}, light_plot))
     return writers
 
 
@@ -270,7 +273,10 @@ def _surface(
 
 
 def _page(
-    estimate: NormalEstimate, albedo: NDArray[np.float32] | None, report: dict[str, Any]
+    estimate: NormalEstimate,
+    albedo: NDArray[np.float32] | None,
+    report: dict[str, Any],
+    light_plot: bytes | None,
 ) -> Callable[[NewFiles], None]:
     from splinecli.results.files import PAGE
     from splinecli.results.page import result_page
@@ -282,5 +288,6 @@ def _page(
         albedo=albedo,
         confidence_map=estimate.confidence_map,
         error_map_deg=estimate.error_map_deg,
+        light_plot=light_plot,
     )
     return lambda new: new.write(PAGE, page)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import InputError, UsageError
 from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
+from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.reading import Reading
 
@@ -76,6 +78,12 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
+    with TemporaryDirectory() as frames:  # of a film
+        folder = unpacked(options.capture, Path(frames), options.reading, observer)
+        return _describe(replace(options, capture=folder), observer)
+
+
+def _describe(options: InfoOptions, observer: Observer) -> dict[str, Any]:
     from splinecli.capture.capture_warnings import estimated_lights
     from splinecli.capture.summary import summarise_capture
     from splinecli.diagnosis.checks import check_sample

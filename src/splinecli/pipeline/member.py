@@ -6,10 +6,12 @@ import errno
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splinecli.errors import InputError, OutputError, SplinecliError
 from splinecli.pipeline.capture_list import Member
+from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.finished import find_earlier
 from splinecli.pipeline.infer import held_results, infer_capture
 from splinecli.pipeline.infer_options import InferOptions
@@ -65,6 +67,8 @@ def run_member(
     if member.missing is not None:
         return replace(failed(member.name, member.missing), status="missing")
     try:
+        folder = unpacked(member.folder, Path(options.output), options, observer)
+        member = replace(member, folder=folder)
         outcome = _earlier_outcome(member, options, observer, redo)
     except Exception as error:
         outcome = _failure(member, error)

@@ -14,7 +14,6 @@ from splinecli.capture import Capture
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.inference import NormalEstimate
 from splinecli.maths.normals import Convention, describe, encode_picture
-from splinecli.pictures.light_sky import sky_plot
 from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
 from splinecli.pictures.png import encode_png
 from splinecli.results.clock import Clock
@@ -122,14 +121,12 @@ def own_light_files(folder: Path) -> list[str]:
         return []
 
 
-def write_lights(capture: Capture, new: NewFiles) -> None:
-    """Write lights that were found from the images as `--lights` and `--intensities` read them, and a picture."""
+def write_lights(capture: Capture, plot: bytes, new: NewFiles) -> None:
+    """Write lights that were found from the images as `--lights` and `--intensities` read them, and their plot."""
     new.write(LIGHT_DIRECTIONS, rows_text(capture.light_directions))
     if capture.estimated_intensities is not None:
         new.write(LIGHT_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1)))
-    new.write(
-        LIGHT_PLOT, sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
-    )
+    new.write(LIGHT_PLOT, plot)
 
 
 def read_report(folder: Path) -> dict[str, Any]:

@@ -42,6 +42,7 @@ def result_page(
     albedo: NDArray[np.float32] | None = None,
     confidence_map: NDArray[np.float32] | None = None,
     error_map_deg: NDArray[np.float32] | None = None,
+    light_plot: bytes | None = None,
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
 
@@ -57,6 +58,7 @@ def result_page(
         albedo: (H, W, 3), linear, from albedo_map.
         confidence_map: (H, W), probabilities.
         error_map_deg: (H, W) degrees, NaN where there is no error.
+        light_plot: a PNG of the lights, where they were found from the images.
 
     Raises:
         OutputError: a picture cannot be encoded.
@@ -93,6 +95,7 @@ def result_page(
         first={name: _data_url(picture) for name, picture in first.items()},
         maps={name: _data_url(picture) for name, picture in maps.items()},
         error_map=error_png,
+        light_plot=None if light_plot is None else _png_url(light_plot),
         error_colours=_error_colours(),
         error_ticks=[f"{TOP_DEG * third / 3:g}°" for third in range(4)],
     )
@@ -200,4 +203,8 @@ def _error_colours() -> str:
 
 
 def _data_url(picture: Picture) -> str:
-    return f"data:image/png;base64,{base64.b64encode(encode_png(picture)).decode('ascii')}"
+    return _png_url(encode_png(picture))
+
+
+def _png_url(file: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(file).decode('ascii')}"

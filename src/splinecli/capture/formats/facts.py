@@ -20,7 +20,7 @@ from splinecli.capture.formats.raw import is_raw, raw_size
 from splinecli.capture.formats.tiff import first_page
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
-from splinecli.maths.transfer import SRGB, TransferCurve
+from splinecli.maths.transfer import BT709, SRGB, TransferCurve
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -40,6 +40,9 @@ _MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF an
 
 _MOST_PARTS = 10_000
 """Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
+
+_CODE_POINTS: dict[int, TransferCurve] = {1: BT709, 6: BT709, 14: BT709, 15: BT709, 8: 1.0, 13: SRGB}
+"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273)."""
 
 _RAW_WHITE = 65_535
 """The white level of developed RAW files; see decode_raw."""
@@ -68,7 +71,7 @@ class ImageFacts:
         path: the file.
         kind: "PNG", "JPEG", "TIFF" or "RAW"; empty for none of them.
         stated_size: None for a RAW file, and for a damaged one.
-        curve: that of a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
+        curve: that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
         white_level: the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is
             in the unit of the decoded values: full scale for a RAW file, whatever its tags say.
         exif: orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads.
@@ -171,7 +174,9 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
         path,
         "PNG",
         size,
-        _curve(StatedCurve(SRGB, "PNG that says so") if encoded else StatedCurve(), profile),
+        _code_points(chunks[b"cICP"][1:2])
+        if b"cICP" in chunks
+        else _curve(StatedCurve(SRGB, "PNG that says so") if encoded else StatedCurve(), profile),
         _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None,
         _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))),
     )
@@ -278,6 +283,15 @@ def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
         return StatedCurve(stated.curve, stated.by, unread=True)
     name, curve = found
     return StatedCurve(curve, f'colour profile "{name}"')
+
+
+def _code_points(transfer: bytes) -> StatedCurve:
+    """Return the curve of a number of the transfer characteristics, which goes before all else in a PNG."""
+    number = int.from_bytes(transfer, "big")
+    if number not in _CODE_POINTS:
+        return StatedCurve(unread=True)
+    curve = _CODE_POINTS[number]
+    return StatedCurve(curve, "" if curve == 1 else "PNG of a film" if curve == BT709 else "PNG that says so")
 
 
 def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:

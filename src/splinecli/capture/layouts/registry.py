@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splinecli.capture.formats.film import is_film
 from splinecli.capture.layouts import cyclesps, plain_folder, psbox
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
@@ -48,11 +49,13 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the name of the capture in the folder: that of the folder, but in CyclesPS <object>_<kind>.
+    """Return the name of the capture: that of the folder or the film, but in CyclesPS <object>_<kind>.
 
     Raises:
         InputError: the system refuses to say what is there.
     """
+    if is_film(Path(folder)):
+        return Path(folder).stem
     return cyclesps.capture_name(Path(folder)) or folder_name(Path(folder))
 
 

@@ -10,8 +10,8 @@ MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 
 # Captures of infer and info.
 
-CAPTURES = Argument(..., metavar="CAPTURE", help="Folders with the images of one object each.")
-CAPTURE = Argument(..., metavar="CAPTURE", help="Folder with the images of one object.")
+CAPTURES = Argument(..., metavar="CAPTURE", help="Folders with the images of one object each, or films.")
+CAPTURE = Argument(..., metavar="CAPTURE", help="Folder with the images of one object, or a film.")
 
 LIGHTS = Option(
     None,

@@ -1,0 +1,196 @@
+"""Films as captures: a fixed camera films an object while a lamp is carried around it.
+
+Of hundreds of frames, few are needed: sharp ones, not overexposed, whose light differs as much as possible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.image_size import check_stored_size
+from splinecli.capture.formats.native_stderr import native_stderr
+from splinecli.capture.paths import check_file, is_folder
+from splinecli.errors import InputError
+from splinecli.maths.transfer import BT709, decode_transfer
+
+if TYPE_CHECKING:
+    import cv2
+
+FILM_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+
+MOST_FRAMES, FEWEST_FRAMES = 24, 6
+
+LEAST_DIFFERENCE = 0.05
+"""Distance between two frames' thumbnails of unit length below which their light counts as the same."""
+
+_CANDIDATES = 1000  # frames that are compared; of a longer film, one of two, of four and so on
+_THUMBNAIL, _SMALL = 64, 512  # longest sides in pixels: of shading, of sharpness and exposure
+_NEIGHBOURS = 7  # frames before and after, whose light is similar
+_BLURRED = 0.6  # share of the neighbours' sharpness
+_DARK = 0.2  # share of the usual brightness
+_CLIPPED = 250  # stored value from which a pixel counts as overexposed
+_MOST_CLIPPED = 0.01  # share of pixels that are overexposed
+# FFmpeg recognises playlists by their content, and these name other files. So only containers of films are opened.
+_CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
+
+
+class _Candidate(NamedTuple):
+    """A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels."""
+
+    number: int
+    thumbnail: NDArray[np.float32]
+    sharpness: float
+    clipped: float
+
+
+def is_film(path: Path) -> bool:
+    """Return whether the path has the name of a film, and is no folder."""
+    return path.suffix.lower() in FILM_SUFFIXES and not is_folder(path)
+
+
+def choose_frames(film: Path) -> tuple[int, ...]:
+    """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights differ most.
+
+    Raises:
+        InputError: the film cannot be read, or its light does not move.
+    """
+    candidates = _candidates(film)
+    light = np.array([frame.thumbnail.mean() for frame in candidates])
+    clipped = np.array([frame.clipped for frame in candidates])
+    usable = (
+        _sharp(np.array([frame.sharpness for frame in candidates]))
+        & (light >= _DARK * np.median(light))
+        & (light > 0)
+        & (clipped <= max(_MOST_CLIPPED, float(np.median(clipped))))
+    )
+    frames = [frame for frame, use in zip(candidates, usable, strict=True) if use]
+    chosen = _farthest([frame.thumbnail for frame in frames])
+    if len(chosen) < FEWEST_FRAMES:
+        raise InputError(
+            f"found {len(chosen)} of {len(candidates)} frames that are sharp and differ in their light,"
+            f" expected at least {FEWEST_FRAMES}",
+            path=film,
+            hint="Film from a tripod while the lamp moves all around the object, with focus and exposure locked",
+        )
+    return tuple(sorted(frames[place].number for place in chosen))
+
+
+def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
+    """Yield frames of rising numbers as stored: (H, W, 3) RGB, usually with the curve BT709. Raises InputError."""
+    with _opened(film) as video:
+        place = 0
+        for number in numbers:
+            while place <= number:
+                if not video.grab():
+                    raise _damaged(film)
+                place += 1
+            yield np.ascontiguousarray(_picture(video, film)[..., ::-1])
+
+
+def _candidates(film: Path) -> list[_Candidate]:
+    """Return frames at even distances, with what their choice depends on. Raises InputError."""
+    found: list[_Candidate] = []
+    step = 1
+    with _opened(film) as video:
+        number = 0
+        while video.grab():
+            if number % step == 0:
+                found.append(_candidate(number, _picture(video, film)))
+            if len(found) >= _CANDIDATES:
+                found, step = found[::2], 2 * step
+            number += 1
+    if not found:
+        raise _damaged(film)
+    return found
+
+
+def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
+    import cv2
+
+    def reduced(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+        share = side / max(image.shape[:2])
+        size = max(1, round(image.shape[1] * share)), max(1, round(image.shape[0] * share))
+        return (
+            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            if share < 1
+            else image
+        )
+
+    small = reduced(picture, _SMALL)
+    gray = small.astype(np.float32).mean(axis=2)
+    sharpness = float(np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean() / max(float(gray.mean()), 1e-3))
+    clipped = float((small.max(axis=2) >= _CLIPPED).mean())
+    stored = np.asarray(reduced(small, _THUMBNAIL) / 255, np.float32)
+    linear = np.asarray(decode_transfer(stored, BT709).mean(axis=2), np.float32)
+    return _Candidate(number, linear.ravel(), sharpness, clipped)
+
+
+def _sharp(sharpness: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which frames are about as sharp as those around them. Under another light, sharpness is another."""
+    around = [
+        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1])
+        for place in range(len(sharpness))
+    ]
+    return np.asarray(sharpness >= _BLURRED * np.array(around))
+
+
+def _farthest(thumbnails: list[NDArray[np.float32]]) -> list[int]:
+    """Choose thumbnails one by one, each the farthest from those chosen. Their brightness does not count."""
+    if not thumbnails:
+        return []
+    vectors = np.stack(thumbnails)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    distance = np.linalg.norm(vectors - vectors.mean(axis=0), axis=1)
+    chosen = [int(distance.argmax())]
+    distance = np.linalg.norm(vectors - vectors[chosen[0]], axis=1)
+    while len(chosen) < MOST_FRAMES and distance.max() >= LEAST_DIFFERENCE:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
+    return chosen
+
+
+@contextmanager
+def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
+    """Yield an opened film. Raises InputError."""
+    import cv2
+
+    check_file(film, "a film")
+    try:
+        with film.open("rb") as file:
+            start = file.read(16)
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=film) from None
+    if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
+        raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+    with native_stderr():
+        video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
+    try:
+        if not video.isOpened():
+            raise _damaged(film)
+        size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
+        check_stored_size(size, 1, film)
+        yield video
+    finally:
+        video.release()
+
+
+def _picture(video: cv2.VideoCapture, film: Path) -> NDArray[np.uint8]:
+    """Return the frame that was grabbed, (H, W, 3) in BGR order. Raises InputError."""
+    done, picture = video.retrieve()
+    if not done or picture is None or picture.ndim != 3:
+        raise _damaged(film)
+    return np.asarray(picture, np.uint8)
+
+
+def _damaged(film: Path) -> InputError:
+    return InputError(
+        "the film is damaged, or in a form that cannot be read",
+        path=film,
+        hint="Copy it again, or convert it to MP4 with H.264",
+    )

@@ -1,0 +1,131 @@
+"""Films of an analytic sphere, written by OpenCV: which frames are taken, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from scenes import shade, sphere
+from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.film import (
+    FEWEST_FRAMES,
+    MOST_FRAMES,
+    choose_frames,
+    is_film,
+    read_frames,
+)
+from splinecli.errors import InputError
+from splinecli.maths.transfer import BT709, decode_transfer
+from splinecli.pictures.png import encode_png
+
+SIZE = 96
+
+
+def encode_bt709(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The curve of ITU-R BT.709, from its text."""
+    return np.where(linear < 0.018, 4.5 * linear, 1.099 * np.maximum(linear, 1e-9) ** 0.45 - 0.099)
+
+
+def sphere_film(lights: NDArray[np.float64], texture: float = 0.3) -> NDArray[np.uint8]:
+    """Frames (F, SIZE, SIZE) of a matte sphere with fine texture, under lights (F, 3), with noise."""
+    normals, inside = sphere(SIZE)
+    rng = np.random.default_rng(1)
+    albedo = inside * (0.9 - texture * rng.uniform(size=inside.shape))
+    linear = np.moveaxis(shade(normals, lights), 2, 0) * albedo
+    linear = linear + 0.003 * rng.normal(size=linear.shape)
+    return np.rint(255 * encode_bt709(linear.clip(0, 1))).astype(np.uint8)
+
+
+def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Path:
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, frames.shape[:0:-1])
+    assert video.isOpened()
+    for frame in frames:
+        video.write(cv2.merge([frame, frame, frame]))
+    video.release()
+    return path
+
+
+def path_of_lamp(count: int) -> NDArray[np.float64]:
+    """Lights (count, 3) along a slow spiral, as a lamp is carried."""
+    azimuth, zenith = np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count))
+    return np.stack((np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), 1)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("clip.avi", "MJPG"), ("clip.mp4", "mp4v")])
+def test_frames_under_different_lights_are_chosen(tmp_path: Path, name: str, codec: str) -> None:
+    lights, frames = path_of_lamp(150), sphere_film(path_of_lamp(150))
+    film = write_film(tmp_path / name, frames, codec)
+    chosen = choose_frames(film)
+    assert FEWEST_FRAMES <= len(chosen) <= MOST_FRAMES and list(chosen) == sorted(set(chosen))
+    # They cover the path: each light has a chosen one near it.
+    assert (lights @ lights[list(chosen)].T).max(axis=1).min() > np.cos(np.radians(20))
+    for number, found in zip(chosen, read_frames(film, chosen), strict=True):
+        assert found.shape == (SIZE, SIZE, 3)
+        assert np.abs(found.mean(axis=2) - frames[number]).mean() < 6  # compression
+
+
+def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path: Path) -> None:
+    frames = sphere_film(path_of_lamp(120))
+    blurred, bright, dark = range(20, 24), range(60, 63), range(90, 94)
+    for number in blurred:
+        frames[number] = cv2.GaussianBlur(frames[number], (0, 0), 3)
+    frames[bright] = np.minimum(frames[bright] * 2.5, 255).astype(np.uint8)
+    frames[dark] //= 8
+    chosen = choose_frames(write_film(tmp_path / "clip.avi", frames))
+    assert not {*blurred, *bright, *dark}.intersection(chosen)
+
+
+def test_the_curve_is_undone(tmp_path: Path) -> None:
+    linear = np.linspace(0, 1, 256)
+    stored = encode_bt709(linear).astype(np.float32)
+    np.testing.assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
+    (tmp_path / "frame.png").write_bytes(encode_png(np.zeros((4, 4, 3), np.uint8), film=True))
+    facts = read_facts(tmp_path / "frame.png")
+    assert facts.curve.curve == BT709 and facts.damage is None
+
+
+@pytest.mark.parametrize(("number", "curve"), [(1, BT709), (8, 1.0), (13, None)])
+def test_code_points_go_before_other_curves(tmp_path: Path, number: int, curve: object) -> None:
+    """cICP, ITU-T H.273: BT.709, linear and sRGB. 16 and 18 are those of films with a high dynamic range."""
+    file = encode_png(np.zeros((4, 4), np.uint8), film=True)
+    place = file.index(b"cICP") + 5
+    for value, expected in ((number, (curve, False)), (16, (1.0, True))):
+        (tmp_path / "image.png").write_bytes(file[:place] + bytes([value]) + file[place + 1 :])
+        found = read_facts(tmp_path / "image.png").curve
+        assert (found.curve, found.unread) == expected
+
+
+def test_a_film_in_which_nothing_moves_is_refused(tmp_path: Path) -> None:
+    film = write_film(tmp_path / "clip.avi", sphere_film(np.repeat(path_of_lamp(40)[20:21], 40, axis=0)))
+    with pytest.raises(InputError, match=r"found 1 of 40 frames that are sharp and differ in their light"):
+        choose_frames(film)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "found no film"),
+        (b"#EXTM3U\n#EXTINF:1,\nother.ts\n", "found no film"),
+        (b"ffconcat version 1.0\nfile other.mp4\n", "found no film"),
+        (b"\0\0\0\x18ftypisom" + bytes(200), "the film is damaged"),
+    ],
+)
+def test_what_is_no_film_is_refused(tmp_path: Path, content: bytes, problem: str) -> None:
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(content)
+    assert is_film(path)
+    with pytest.raises(InputError, match=problem):
+        choose_frames(path)
+    with pytest.raises(InputError, match="does not exist"):
+        choose_frames(tmp_path / "none.mp4")
+
+
+def test_a_truncated_film_is_refused(tmp_path: Path) -> None:
+    film = write_film(tmp_path / "clip.mp4", sphere_film(path_of_lamp(40)), "mp4v")
+    film.write_bytes(film.read_bytes()[:20_000])  # the index at the end is missing
+    with pytest.raises(InputError, match="damaged"):
+        choose_frames(film)
