@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.maths.normals import unit
 from splinecli.surface import integration
+from splinecli.surface.bilateral_equations import CONTRADICTION
 from splinecli.surface.integration import integrate_normals
 
 Floats = NDArray[np.float64]
@@ -19,12 +21,17 @@ Mask = NDArray[np.bool_]
 CAMERA = np.array([[210.0, 0.0, 63.0], [0.0, 200.0, 41.0], [0.0, 0.0, 1.0]])
 # Maps of more pixels than this start from coarser ones.
 COARSE_FROM = {"own scale": 10**9, "coarse to fine": 300}
-TIGHT = {"tolerance": 1e-9, "max_iterations": 400}
+
+
+@pytest.fixture
+def until_nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(integration, "_STILL", 0.0)
+    monkeypatch.setattr(integration, "_SOLVES_OF_COARSEST", 400)
 
 
 @pytest.fixture(params=COARSE_FROM)
 def any_scale(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(integration, "_COARSE_FROM", COARSE_FROM[request.param])
+    monkeypatch.setattr(integration, "_COARSEST", COARSE_FROM[request.param])
 
 
 def grid(height: int, width: int) -> tuple[Floats, Floats]:
@@ -117,7 +124,7 @@ def test_levels_apart(joined: int) -> None:
     least_squares = integrate_normals(normals, everywhere, stiffness=0)
     torn = integrate_normals(normals, everywhere)
     assert error_share(least_squares, truth, ~wall) > 0.1
-    assert error_share(torn, truth, ~wall) < 5e-3
+    assert error_share(torn, truth, ~wall) < 1e-2
     # The wall itself may have any height.
     assert np.isfinite(torn).all()
 
@@ -215,7 +222,9 @@ def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Flo
         weights = []
         for forth, back in ((0, 1), (1, 0), (2, 3), (3, 2)):
             gaps = (matrices[back] @ heights) ** 2 - (matrices[forth] @ heights) ** 2
-            weights.append(1 / (1 + np.exp(-stiffness * (iteration > 0) * gaps)))
+            residuals = [np.abs(matrices[side] @ heights + constants[side]) for side in (forth, back)]
+            share = 1 / (1 + np.exp(-stiffness * (iteration > 0) * gaps)) - 0.5
+            weights.append(0.5 + share * (1 - np.exp(-((np.maximum(*residuals) / CONTRADICTION) ** 2))))
         root = np.sqrt(np.concatenate(weights))
         heights = np.linalg.lstsq(
             root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants)
@@ -230,10 +239,11 @@ def test_least_squares_is_the_dense_solution() -> None:
     np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
 
 
+@pytest.mark.usefixtures("until_nothing_moves")
 def test_bilateral_is_the_dense_solution() -> None:
     normals, mask = bumps(12, 17), holes(12, 17)
     normals[normals[..., 2] < 0.1] = (0, 0, 1)
-    found = integrate_normals(normals, mask, **TIGHT)[mask]
+    found = integrate_normals(normals, mask)[mask]
     least_squares = dense(normals, mask, 0, 1)
     expected = dense(normals, mask, 2, 200)
     assert np.abs(expected - least_squares).max() > 0.5
@@ -241,22 +251,15 @@ def test_bilateral_is_the_dense_solution() -> None:
 
 
 @pytest.mark.parametrize("joined", [30, 70])
-def test_coarse_to_fine_tears_at_the_same_places_with_fewer_solves(
-    monkeypatch: pytest.MonkeyPatch, joined: int
-) -> None:
+def test_coarse_to_fine_tears_at_the_same_places(monkeypatch: pytest.MonkeyPatch, joined: int) -> None:
     normals, truth, wall = levels(100, 120, 30, 2, joined)
-    solves = []
-    for limit in COARSE_FROM.values():
-        monkeypatch.setattr(integration, "_COARSE_FROM", limit)
-        done: list[int] = []
-        found = integrate_normals(
-            normals, np.ones(wall.shape, bool), progress=lambda n, _, done=done: done.append(n)
-        )
+    for limit in (10**9, 3000):
+        monkeypatch.setattr(integration, "_COARSEST", limit)
+        done: list[float] = []
+        found = integrate_normals(normals, np.ones(wall.shape, bool), progress=done.append)
         # Least squares is off by more than a tenth.
         assert error_share(found, truth, ~wall) < 1e-2
-        assert done == list(range(1, len(done) + 1))
-        solves.append(len(done))
-    assert solves[1] < solves[0] / 3
+        assert 0 < sum(done) <= 1 + 1e-9
 
 
 @pytest.mark.usefixtures("any_scale")
@@ -288,6 +291,7 @@ def turned(array: Any, quarters: int) -> Any:
     return np.ascontiguousarray(np.rot90(array, quarters))
 
 
+@pytest.mark.usefixtures("until_nothing_moves")
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
     normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
@@ -295,17 +299,17 @@ def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
     for _ in range(quarters):
         x, y = -y, x
     turn = turned(np.stack((x, y, z), axis=-1), 0)
-    found = integrate_normals(normals, mask, **TIGHT)
-    again = integrate_normals(turned(turn, quarters), turned(mask, quarters), **TIGHT)
+    found = integrate_normals(normals, mask)
+    again = integrate_normals(turned(turn, quarters), turned(mask, quarters))
     np.testing.assert_allclose(again, turned(found, quarters), atol=5e-3)
 
 
 def test_inputs_do_not_change_and_progress_is_reported() -> None:
     normals, mask, _ = sphere(40, 50, 30, 0.9)
     kept, calls = normals.copy(), []
-    integrate_normals(normals, mask, max_iterations=2, progress=lambda done, most: calls.append((done, most)))
+    integrate_normals(normals, mask, stiffness=0, progress=calls.append)
     np.testing.assert_array_equal(normals, kept)
-    assert calls == [(1, 2), (2, 2)]
+    assert calls == [1.0]
 
 
 @pytest.mark.parametrize("background", [0.0, np.nan])
@@ -343,8 +347,6 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
         ((NORMALS, MASK, CAMERA * (1, -1, 1)), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA.T), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected"),
-        ((NORMALS, MASK), {"max_iterations": 0}, UsageError, "max_iterations is 0, expected"),
-        ((NORMALS, MASK), {"tolerance": np.nan}, UsageError, "the tolerance is nan, expected"),
     ],
 )
 def test_bad_input(
@@ -352,3 +354,19 @@ def test_bad_input(
 ) -> None:
     with pytest.raises(error, match=re.escape(message)):
         integrate_normals(*arguments, **options)
+
+
+def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> None:
+    """Steep waves whose normals have smooth errors of 8 degrees. The published weights tear 1.4 % of the pairs."""
+    x, y = grid(160, 160)
+    truth = 20 * np.sin(x / 8) * np.cos(y / 12)
+    normals = normals_of_slopes(
+        2.5 * np.cos(x / 8) * np.cos(y / 12), -20 / 12 * np.sin(x / 8) * np.sin(y / 12)
+    )
+    errors = gaussian_filter(np.random.default_rng(2).normal(size=normals.shape), (2, 2, 0))
+    noisy = unit(normals + np.radians(8) * errors / errors.std())
+    torn = {}
+    for stiffness in (0.0, 2.0):
+        found = integrate_normals(noisy, np.ones(x.shape, bool), stiffness=stiffness)
+        torn[stiffness] = float((np.abs(np.diff(found - truth, axis=1)) > 1.5).mean())
+    assert torn[0] < torn[2] < 0.0125

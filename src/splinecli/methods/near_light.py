@@ -57,7 +57,5 @@ def _integrate(normals: Floats, blocks: Blocks, camera_matrix: Floats | None) ->
     """Return the depth map (h, w) of normals (p, 3), in pixels of the capture as integrate_normals gives it."""
     normal_map = np.zeros((*blocks.mask.shape, 3))
     normal_map[blocks.mask] = normals
-    depth = integrate_normals(
-        normal_map, blocks.mask, blocks.shrink_camera(camera_matrix), max_iterations=SOLVES
-    )
+    depth = integrate_normals(normal_map, blocks.mask, blocks.shrink_camera(camera_matrix))
     return depth * blocks.step if camera_matrix is None else depth

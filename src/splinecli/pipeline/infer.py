@@ -250,7 +250,7 @@ def _surface(
     observer: Observer,
 ) -> Callable[[NewFiles], None]:
     """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
-    from splinecli.pipeline.surface import make_surface, share_of_iterations, view_of_report
+    from splinecli.pipeline.surface import make_surface, view_of_report
     from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 
     camera_matrix, pixel_size = view_of_report(report)
@@ -261,7 +261,7 @@ def _surface(
             camera_matrix,
             colours,
             pixel_size_mm=pixel_size,
-            progress=share_of_iterations(advance),
+            progress=advance,
         )
     formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
 

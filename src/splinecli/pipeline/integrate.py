@@ -12,12 +12,11 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.maths.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import (
-    STIFFNESS,
     check_pixel_size,
     make_surface,
-    share_of_iterations,
     view_of_report,
 )
+from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.surface.surface_files import (
     DEFAULT_FORMATS,
     SURFACE_FILES,
@@ -155,7 +154,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             largest_step=options.largest_step,
             n_triangles=options.decimate,
             pixel_size_mm=pixel_size,
-            progress=share_of_iterations(advance),
+            progress=advance,
         )
     report = {
         "schema": SCHEMA,

@@ -8,14 +8,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from splinecli.errors import UsageError
+from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.surface.surface_files import Surface
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-STIFFNESS = 2.0
-"""How easily the surface tears at edges, without --stiffness."""
 
 SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
@@ -30,7 +28,7 @@ def make_surface(
     largest_step: float | None = None,
     n_triangles: int | None = None,
     pixel_size_mm: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and what the reports say of it.
 
@@ -135,19 +133,3 @@ def _report(
 def _round(value: float, digits: int = 7) -> float:
     """Round a number to as many significant digits as float32 has."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else value
-
-
-def share_of_iterations(advance: Callable[[float], None]) -> Callable[[int, int], None]:
-    """Return the progress function of integrate_normals that moves `advance` from 0 to 1.
-
-    Integration usually converges long before the largest number of iterations, so the share grows fast at first.
-    """
-    shown = 0.0
-
-    def progress(iteration: int, max_iterations: int) -> None:
-        nonlocal shown
-        share = 1 - 0.5 ** (8 * iteration / max_iterations)
-        advance(share - shown)
-        shown = share
-
-    return progress

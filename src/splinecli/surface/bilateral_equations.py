@@ -11,9 +11,13 @@ Here r is the ray through the pixel, scaled to z = -1, and dr its change to the 
 Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it applies to one
 of them. The method therefore weights the squared residual towards each side by
 
-    sigmoid(stiffness * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
+    share = sigmoid(stiffness * facing^2 * (gap towards the other side^2 - gap towards this side^2)).
 
-A side without a neighbour counts as a gap of zero.
+A side without a neighbour counts as a gap of zero. In the paper, noise and small errors of the normals change the
+shares, too, and the surface tears along rows and columns of pixels where it is continuous. Here a share counts only as
+far as the normal is contradicted, with r the larger residual of the two sides:
+
+    1/2 + (share - 1/2) (1 - exp(-(r / CONTRADICTION)^2)).
 """
 
 from __future__ import annotations
@@ -29,10 +33,16 @@ from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int32]
 
+STIFFNESS = 2.0
+"""How easily the surface tears, as in the paper."""
+
+CONTRADICTION = 0.3
+"""Residual that contradicts a normal: that of a frontal one which is off by 17 degrees."""
+
 # The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
 # the normal says nothing reliable about the height. The equations of the neighbours fix the height of such pixels, and
 # of pixels whose normals face away from the camera.
-_SMALLEST_COSINE = 0.05
+SMALLEST_COSINE = 0.05
 
 
 @dataclass(frozen=True)
@@ -67,7 +77,7 @@ class BilateralEquations:
             facing = -np.einsum("pi,pi->p", normals, rays)
             cosine = facing / np.linalg.norm(rays, axis=1)
             to_right, down, _ = focal_length(camera_matrix) * ray_basis(camera_matrix)
-        usable = cosine > _SMALLEST_COSINE
+        usable = cosine > SMALLEST_COSINE
         number = np.full(mask.shape, -1, np.int32)
         number[mask] = np.arange(len(normals))
         return cls(
@@ -76,29 +86,31 @@ class BilateralEquations:
             (_pairs(number[:, :-1], number[:, 1:]), _pairs(number[:-1], number[1:])),
         )
 
-    def weigh(self, heights: Floats, stiffness: float) -> tuple[Floats, Floats, float]:
-        """Return the weights of all pairs at the heights (P,), their flows, and the weighted sum of squares.
+    def weigh(self, heights: Floats, stiffness: float) -> tuple[Floats, Floats]:
+        """Return the weights of all pairs at the heights (P,), and their flows.
 
         The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
         half the first derivative. Pairs along the rows come first, then those along the columns.
         """
-        cost, weights, flows = 0.0, [], []
+        weights, flows = [], []
         for slant, (near, far) in zip(self.slants, self.pairs, strict=True):
             gap = heights[far] - heights[near]
-            ahead, behind = np.zeros_like(heights), np.zeros_like(heights)
+            ahead, behind, largest = np.zeros_like(heights), np.zeros_like(heights), np.zeros_like(heights)
             ahead[near], behind[far] = gap, gap
-            share_ahead = _sigmoid(stiffness * self.facing**2 * (behind**2 - ahead**2))
-            weight, flow = np.zeros_like(gap), np.zeros_like(gap)
             # Both pixels of a pair have an equation for its gap.
-            for pixels, share in ((near, share_ahead[near]), (far, 1 - share_ahead[far])):
-                facing = self.facing[pixels]
-                residual = facing * gap + slant[pixels]
-                weight += share * facing**2
-                flow += share * facing * residual
-                cost += float(share @ residual**2)
+            residuals = [self.facing[pixels] * gap + slant[pixels] for pixels in (near, far)]
+            for pixels, residual in zip((near, far), residuals, strict=True):
+                largest[pixels] = np.maximum(largest[pixels], np.abs(residual))
+            share_ahead = _sigmoid(stiffness * self.facing**2 * (behind**2 - ahead**2))
+            share_ahead = 0.5 - (share_ahead - 0.5) * np.expm1(-((largest / CONTRADICTION) ** 2))
+            weight, flow = np.zeros_like(gap), np.zeros_like(gap)
+            shares = share_ahead[near], 1 - share_ahead[far]
+            for pixels, share, residual in zip((near, far), shares, residuals, strict=True):
+                weight += share * self.facing[pixels] ** 2
+                flow += share * self.facing[pixels] * residual
             weights.append(weight)
             flows.append(flow)
-        return np.concatenate(weights), np.concatenate(flows), cost
+        return np.concatenate(weights), np.concatenate(flows)
 
 
 def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:

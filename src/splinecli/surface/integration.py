@@ -1,6 +1,7 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
-Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022. `bilateral_equations` has the
+Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes: the surface tears only
+where it contradicts the normals, and large maps are integrated from coarse to fine. `bilateral_equations` has the
 equations, `laplacian` the linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
@@ -14,19 +15,25 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
-from splinecli.surface.bilateral_equations import BilateralEquations
+from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length
-from splinecli.surface.laplacian import LaplacianSolver
+from splinecli.surface.laplacian import MULTIGRID_PIXELS, LaplacianSolver
 
 Floats = NDArray[np.float64]
 
 _UNIT_TOLERANCE = 1e-2  # accepts normals from float16 and 8-bit images, and refuses zero vectors
-_EXACT = 1e-6  # rms residual in pixels; below it there is nothing to improve
-_FIRST_PRECISION = 1e-9
-_LATER_PRECISION = 0.03
-_STILL = 50  # times the tolerance, in pixels: the rms movement of large maps at which they are finished
-_COARSE_FROM = 100_000  # pixels; smaller maps are fast at their own scale
+_FIRST_PRECISION, _LATER_PRECISION = 1e-9, 0.03  # relative residuals of the linear solves
+_STILL = 0.002  # pixels: the rms movement at which the surface is finished
+_COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
+_FINEST = 8_000_000  # pixels; larger maps have the heights of their blocks, interpolated
+_SOLVES_OF_COARSEST = 150
+_MOST_SOLVES, _FEWEST_SOLVES = 20, 4  # the most at finer scales, of small maps and of large ones
+_SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
+_MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
+
+Progress = Callable[[float], object]
+"""Called with the share of the work that was just done."""
 
 
 def integrate_normals(
@@ -34,10 +41,8 @@ def integrate_normals(
     mask: NDArray[np.bool_] | None = None,
     camera_matrix: NDArray[np.floating] | None = None,
     *,
-    stiffness: float = 2.0,
-    max_iterations: int = 150,
-    tolerance: float = 1e-4,
-    progress: Callable[[int, int], None] | None = None,
+    stiffness: float = STIFFNESS,
+    progress: Progress = lambda share: None,
 ) -> Floats:
     """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
 
@@ -51,23 +56,18 @@ def integrate_normals(
         camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV: columns count to the
             right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
-        max_iterations: largest number of linear solves. 1 is least squares.
-        tolerance: relative change of the sum of squares at which the iteration stops. Maps of more than 100,000 pixels
-            also stop when the surface moves by at most 50 times as many pixels.
-        progress: called with the number of iterations done and `max_iterations`.
+        progress: see Progress. The shares may add up to less than 1.
 
     Raises:
         UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
         InputError: the mask is empty, a normal in the mask is not a unit vector, or the camera matrix is not valid.
     """
-    _check_options(stiffness, max_iterations, tolerance)
+    if not (isfinite(stiffness) and stiffness >= 0):
+        raise UsageError(f"the stiffness is {stiffness:g}, expected a number of at least 0")
     if mask is None:
         mask = _mask_of_normals(normal_map)
     _check_maps(normal_map, mask)
-    heights = _integrate(
-        normal_map, mask, camera_matrix, stiffness, max_iterations, tolerance, progress or (lambda *_: None)
-    )
-    return _depth_map(heights, mask, camera_matrix)
+    return _depth_map(_integrate(normal_map, mask, camera_matrix, stiffness, progress), mask, camera_matrix)
 
 
 def _integrate(
@@ -75,51 +75,63 @@ def _integrate(
     mask: NDArray[np.bool_],
     camera_matrix: NDArray[np.floating] | None,
     stiffness: float,
-    max_iterations: int,
-    tolerance: float,
-    progress: Callable[[int, int], None],
-    *,
-    is_coarse: bool = False,
+    progress: Progress,
 ) -> Floats:
     """Return the heights (P,) of the mask's pixels; see integrate_normals.
 
-    A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears shows at coarser scales, too.
-    Large maps and blocks are finished when the surface hardly moves.
+    A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
+    at the coarsest scale, where many solves take little time. Finer scales follow the edges.
     """
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
     heights: Floats = np.zeros(n_pixels)
-    cost, movement, still = np.inf, np.inf, 0.0
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
-    precision = _FIRST_PRECISION
-    if is_coarse:
-        still = _STILL * tolerance
-    if n_pixels > _COARSE_FROM and stiffness > 0 and max_iterations > 1:
+    precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if stiffness > 0 else 1, 1.0
+    if n_pixels > (_COARSEST if stiffness > 0 else MULTIGRID_PIXELS):
         blocks = Blocks.of_step(mask, 2)
         coarse = np.zeros((*blocks.mask.shape, 3))
-        coarse[blocks.mask] = unit(blocks.average(normal_map[mask].astype(np.float64), mask))
-        camera = blocks.shrink_camera(camera_matrix)
-        of_blocks = np.zeros(blocks.mask.shape)
+        coarse[blocks.mask] = _normals_of(blocks, normal_map[mask].astype(np.float64), mask)
+        of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
         of_blocks[blocks.mask] = _integrate(
-            coarse, blocks.mask, camera, stiffness, max_iterations, tolerance, lambda *_: None, is_coarse=True
+            coarse,
+            blocks.mask,
+            blocks.shrink_camera(camera_matrix),
+            stiffness,
+            lambda share: progress((1 - own_share) * share),
         )
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
-        precision, still = _LATER_PRECISION, _STILL * tolerance
+        if n_pixels > _FINEST:
+            return heights
+        precision, most = _LATER_PRECISION, 1
+        if stiffness > 0:
+            most = min(_MOST_SOLVES, max(_FEWEST_SOLVES, _SOLVED_PIXELS // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
-    for iteration in range(max_iterations):
-        weights, flows, new_cost = equations.weigh(heights, stiffness)
-        if iteration > 1 and abs(cost - new_cost) <= tolerance * new_cost + _EXACT**2 * n_pixels:
-            break
-        if movement < still:
-            break
-        cost = new_cost
+    for _ in range(most):
+        weights, flows = equations.weigh(heights, stiffness)
         change = solver.solve(weights, flows, precision=precision)
         heights += change
-        movement = float(np.std(change))
+        progress(own_share / most)
+        if precision == _LATER_PRECISION and np.std(change) < _STILL:
+            break
         precision = _LATER_PRECISION
-        progress(iteration + 1, max_iterations)
     return heights
+
+
+def _normals_of(blocks: Blocks, normals: Floats, mask: NDArray[np.bool_]) -> Floats:
+    """Return the normals (p, 3) of blocks from those of their pixels (P, 3): the mean, or at an edge the steepest one.
+
+    The mean over an edge would be a slope that joins what it separates. The steepest one belongs to the rim.
+    """
+    mean = unit(blocks.average(normals, mask))
+    block = blocks.numbers_at(*np.nonzero(mask))
+    closest = np.ones(len(mean))
+    np.minimum.at(closest, block, np.einsum("pi,pi->p", normals, mean[block]))
+    by_steepness = np.lexsort((normals[:, 2], block))
+    first = np.searchsorted(block[by_steepness], np.arange(len(mean)))
+    steepest = normals[by_steepness[first]]
+    mixed = (closest < np.cos(np.radians(_MIXED_DEG))) & (steepest[:, 2] > SMALLEST_COSINE)
+    return np.asarray(np.where(mixed[:, None], steepest, mean))
 
 
 def _mask_of_normals(normal_map: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -141,15 +153,6 @@ def _depth_map(
     depth = np.full(mask.shape, np.nan)
     depth[mask] = heights if camera_matrix is None else np.exp(-heights / focal_length(camera_matrix))
     return depth
-
-
-def _check_options(stiffness: float, max_iterations: int, tolerance: float) -> None:
-    if not (isfinite(stiffness) and stiffness >= 0):
-        raise UsageError(f"the stiffness is {stiffness:g}, expected a number of at least 0")
-    if max_iterations < 1:
-        raise UsageError(f"max_iterations is {max_iterations}, expected at least 1")
-    if not (isfinite(tolerance) and tolerance >= 0):
-        raise UsageError(f"the tolerance is {tolerance:g}, expected a number of at least 0")
 
 
 def _check_maps(normal_map: NDArray[np.floating], mask: NDArray[np.bool_]) -> None:
