@@ -75,6 +75,7 @@ def infer(
     maps: str | None = outputs.MAPS,
     html: bool = outputs.HTML,
     surface: bool = outputs.SURFACE,
+    stiffness: float = computing.STIFFNESS,
     convention: NormalConvention = outputs.CONVENTION,
     overwrite: bool = outputs.OVERWRITE,
     update: bool = outputs.UPDATE,

@@ -31,6 +31,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--maps",
             "--html",
             "--surface",
+            "--stiffness",
             "--convention",
             "--strict",
             "--update",

@@ -260,6 +260,7 @@ def _surface(
             estimate.capture.mask,
             camera_matrix,
             colours,
+            stiffness=options.stiffness,
             pixel_size_mm=pixel_size,
             progress=advance,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from math import isfinite
 from typing import Any, Literal, get_args
 
 from splinecli.errors import UsageError, check_one_of
@@ -11,6 +12,7 @@ from splinecli.maths.normals import Convention
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.pipeline.reading import Reading
 from splinecli.pipeline.surface import check_pixel_size
+from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.system.exr import check_exr
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -37,7 +39,7 @@ class InferOptions(Reading):
         formats: names of `splinecli.results.files.NORMALS`. With exr, albedo and depth are EXR files, too.
         maps: names of `splinecli.results.files.MAPS`.
         html: also write page.html. surface: also write the depth map and the mesh; pixel_size, in millimetres, then
-            scales it, too.
+            scales it, too. stiffness: how easily that surface tears; see integrate_normals.
         convention: direction of the green channel in PNG files.
 
     Raises:
@@ -60,6 +62,7 @@ class InferOptions(Reading):
     maps: tuple[str, ...] = ()
     html: bool = False
     surface: bool = False
+    stiffness: float = STIFFNESS
     convention: Convention = "opengl"
 
     def __post_init__(self) -> None:
@@ -78,6 +81,8 @@ class InferOptions(Reading):
             )
         check_method(self.method)
         check_pixel_size(self.pixel_size if self.surface else None)
+        if not (isfinite(self.stiffness) and self.stiffness >= 0):
+            raise UsageError(f"the stiffness is {self.stiffness:g}, expected a number of at least 0")
         if self.n_lights is not None:
             check_draw_settings(self.n_lights, 1, self.seed)
         if self.light_indices is not None:

@@ -36,7 +36,10 @@ DISTIL = Option(
     " on every pixel. [default: the faster one from 100,000 pixels, else --exact]",
 )
 STIFFNESS = Option(
-    2.0, metavar="K", min=0, help="How sharply the surface may break at edges. 0 keeps it in one piece."
+    2.0,
+    metavar="K",
+    min=0,
+    help="How easily the surface of integrate or --surface tears at edges. 0 never tears it.",
 )
 LARGEST_STEP = Option(
     None,
