@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,6 +157,14 @@ def images_left_out(light_file: str, n_named: int, n_images: int) -> CaptureWarn
     return CaptureWarning(
         IMAGES_LEFT_OUT, f"{light_file} names {n_named} of the {n_images} images; the others are left out."
     )
+
+
+def other_pictures(names: Sequence[str]) -> CaptureWarning:
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    text = (
+        f"{names[0]}{more}: left out, because the name says that it is no photograph under one of the lights."
+    )
+    return CaptureWarning(IMAGES_LEFT_OUT, f"{text} To use it, list all images in filenames.txt.")
 
 
 def lights_matched(light_file: str, how: str) -> CaptureWarning:

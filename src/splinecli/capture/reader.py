@@ -101,6 +101,8 @@ def open_capture(
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
         warnings.append(capture_warnings.ambient_subtracted(files.ambient.name))
+    if files.others:
+        warnings.append(capture_warnings.other_pictures([path.name for path in files.others]))
     radiometry, of_curve = radiometry.with_stated_curve(source.facts)
     warnings += of_curve
     # Earlier versions read such images as linear, or those with a colour profile as sRGB.

@@ -27,7 +27,7 @@ class Reading:
             are found from the images.
         first_light: the side of the image from which the first of these lights comes: left, right, above or below.
         intensities: a file of light intensities, or "equal".
-        lights_format: xyz for vectors, azel for azimuth and elevation in degrees.
+        lights_format: xyz for vectors; azel or slant-tilt for angles in degrees.
         light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
         strict: fail where a warning says that the lights or images are probably wrong.
         light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.

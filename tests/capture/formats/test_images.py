@@ -178,7 +178,7 @@ def test_files_that_are_no_such_image(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the file is empty"):
         read_image(path)
     path.write_bytes(b"P5 1 1 255\n0")
-    with pytest.raises(InputError, match="found neither PNG, TIFF nor JPEG"):
+    with pytest.raises(InputError, match="found neither PNG, TIFF, JPEG nor BMP"):
         read_image(path)
     path.write_bytes(b"II*\0\x08\0\0\0")
     with pytest.raises(InputError, match="the TIFF is damaged and cannot be read"):

@@ -1,4 +1,4 @@
-"""Pixels of PNG, JPEG and TIFF files exactly as stored, and of RAW files. Damaged files are refused.
+"""Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files. Damaged files are refused.
 
 OpenCV fills the missing part of a truncated file with gray and only prints to stderr. So the container is checked
 before it is decoded, and the messages of the C libraries are caught and searched.
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.facts import PNG, facts_in, open_image
+from splinecli.capture.formats.facts import PILLOW_KINDS, PNG, facts_in, open_image, open_with_pillow
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
 from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.formats.raw import decode_raw
@@ -106,6 +106,10 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
         if pixels is not None:
             return pixels
         file.seek(0)
+    if kind in PILLOW_KINDS:
+        with open_with_pillow(file, kind, path) as picture:
+            mode = {"1": "L", "L": "L", "LA": "LA", "RGBA": "RGBA"}.get(picture.mode, "RGB")
+            return np.asarray(picture.convert(mode))
     data = file.read()
     if kind != "TIFF":
         (_check_png if kind == "PNG" else _check_jpeg)(data, path)

@@ -29,6 +29,9 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """The first bytes of the files. Those of a PNG are the longest."""
 
+PILLOW_KINDS = ("BMP", "TGA")
+"""Kinds of files that Pillow reads, of 8 bits and without a transfer curve."""
+
 StoredSize = tuple[tuple[int, ...], int]
 """The shape (H, W, C) of an image as stored, and the bytes of each number."""
 
@@ -69,7 +72,7 @@ class ImageFacts:
 
     Args:
         path: the file.
-        kind: "PNG", "JPEG", "TIFF" or "RAW"; empty for none of them.
+        kind: "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them.
         stated_size: None for a RAW file, and for a damaged one.
         curve: that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
         white_level: the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is
@@ -126,9 +129,13 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
                 kind = "PNG" if start == PNG else "JPEG"
             elif start.startswith(TIFF):
                 kind = "TIFF"
+            elif start.startswith(b"BM"):
+                kind = "BMP"
+            elif start and path.suffix.lower() == ".tga":  # its files begin with nothing that is only theirs
+                kind = "TGA"
             else:
                 raise InputError(
-                    "found neither PNG, TIFF nor JPEG" if start else "the file is empty", path=path
+                    "found neither PNG, TIFF, JPEG nor BMP" if start else "the file is empty", path=path
                 )
             yield file, kind
     except OSError as error:
@@ -145,8 +152,27 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageFacts:
     if kind == "RAW":
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
         return ImageFacts(path, kind, white_level=_RAW_WHITE, exif=exif)
+    if kind in PILLOW_KINDS:
+        with open_with_pillow(file, kind, path) as picture:
+            channels = {"1": 1, "L": 1, "LA": 2, "RGBA": 4}.get(picture.mode, 3)
+            return ImageFacts(path, kind, ((picture.height, picture.width, channels), 1))
     read = {"PNG": _png_facts, "JPEG": _jpeg_facts, "TIFF": _tiff_facts}[kind]
     return read(file, path)
+
+
+@contextmanager
+def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Image]:
+    """Yield a picture of PILLOW_KINDS, whose pixels are not read yet. Raises InputError."""
+    from PIL import Image
+
+    with warnings.catch_warnings():  # of large pictures, which are checked later
+        warnings.simplefilter("ignore")
+        try:
+            yield Image.open(file, formats=[kind])
+        except (InputError, MemoryError):
+            raise
+        except Exception:  # damaged files cause a dozen types of errors
+            raise InputError("the image is damaged and cannot be read", path=path) from None
 
 
 def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:

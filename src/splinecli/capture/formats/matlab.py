@@ -1,4 +1,4 @@
-"""Normal maps in MATLAB's .mat files of version 5, 6 and 7 (MathWorks, "MAT-File Format").
+"""Normal maps and matrices in MATLAB's .mat files of version 5, 6 and 7 (MathWorks, "MAT-File Format").
 
 A reader of its own, for arrays of real numbers alone: SciPy's ends the process at types that it does not know.
 """
@@ -29,6 +29,7 @@ _COMPLEX = 1 << 11  # a flag of an array
 _START_BYTES = 1 << 12  # of a variable: enough for its sizes and its name
 _MOST_OVERHEAD = 1 << 16  # bytes of a variable beside its numbers
 _MOST_ELEMENTS = 10_000
+_MOST_NUMBERS = 1 << 20  # of a matrix of a small file
 
 
 class _Variable(NamedTuple):
@@ -53,18 +54,43 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
     with path.open("rb") as file:
         header = file.read(_HEADER_BYTES)
         if header.startswith(b"MATLAB 7.3"):
-            raise InputError(
-                "found a MATLAB 7.3 file, which is not supported",
-                path=path,
-                hint="Save it with MATLAB's option -v7",
-            )
+            raise _unsupported(path)
         order = "<" if header[126:] == b"IM" else ">"
         variable = _choose(list(_variables(file, order)), path)
         check_stored_size(variable.shape, 8, path, expected)
-        most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
-        content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
+        return _numbers(file, variable, order)
+
+
+def read_matrices(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the numeric matrices of a small file by name. Raises InputError."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(_HEADER_BYTES)
+            if header.startswith(b"MATLAB 7.3"):
+                raise _unsupported(path)
+            order = "<" if header[126:] == b"IM" else ">"
+            return {
+                v.name: _numbers(file, v, order)
+                for v in list(_variables(file, order))
+                if len(v.shape) == 2 and 0 < math.prod(v.shape) <= _MOST_NUMBERS
+            }
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    except (KeyError, ValueError, StopIteration, RuntimeError, struct.error, zlib.error):
+        raise InputError("the .mat file is damaged", path=path, hint="Save it again") from None
+
+
+def _numbers(file: BinaryIO, variable: _Variable, order: str) -> NDArray[Any]:
+    most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
+    content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
     kind, numbers = next(islice(_parts(content, order), 3, None))
     return np.frombuffer(numbers, order + _NUMBERS[kind]).reshape(variable.shape, order="F")
+
+
+def _unsupported(path: Path) -> InputError:
+    return InputError(
+        "found a MATLAB 7.3 file, which is not supported", path=path, hint="Save it with MATLAB's option -v7"
+    )
 
 
 def _choose(variables: list[_Variable], path: Path) -> _Variable:

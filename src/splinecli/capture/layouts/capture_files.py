@@ -62,6 +62,7 @@ class CaptureFiles:
         boundaries: used instead of a mask: images whose pixels above zero together are the object.
         ground_truth: a normal map, or None.
         ambient: an image under none of the lights, or None.
+        others: pictures beside the images whose names say that they are no photographs.
     """
 
     layout: str
@@ -74,6 +75,7 @@ class CaptureFiles:
     ground_truth: Path | None = None
     boundaries: tuple[Path, ...] = ()
     ambient: Path | None = None
+    others: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from splinecli.capture.formats.text import read_lines
 from splinecli.capture.paths import check_file, find_mode, is_found_file, resolve
 from splinecli.errors import InputError
 
-_DEVELOPED = (".png", ".tif", ".tiff")
+_DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)
 """Suffixes of pictures, such as masks."""
@@ -90,7 +90,9 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError if there are no images."""
     if not images:
         raise NoImagesError(
-            "the folder contains no images", path=folder, hint="PNG, TIFF, JPEG and RAW files count as images"
+            "the folder contains no images",
+            path=folder,
+            hint="PNG, TIFF, JPEG, BMP, TGA and RAW files count as images",
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 from splinecli.capture.layouts.capture_files import (
@@ -17,6 +19,13 @@ from splinecli.capture.layouts.capture_files import (
 )
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
 from splinecli.errors import InputError
+
+_WORD = re.compile(r"[a-z]+")
+_OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
+"""Words in the names of pictures that other programs leave beside the photographs."""
+
+_MOST_OTHERS = 0.25
+"""Share of the images up to which names with these words are not those of the photographs."""
 
 _DILIGENT_LIGHTS = "light_directions.txt"
 # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
@@ -38,6 +47,14 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     else:
         images = list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
     check_not_empty(images, folder)
+    others: tuple[Path, ...] = ()
+    if filenames is None:
+        others = tuple(
+            image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower()))
+        )
+        if len(others) > _MOST_OTHERS * len(images):
+            others = ()
+        images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         raise InputError(
@@ -49,4 +66,5 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     layout, ground_truth = (
         ("DiLiGenT", _DILIGENT_GROUND_TRUTH) if is_diligent else ("plain folder", GROUND_TRUTH)
     )
-    return gather_files(layout, folder, images, lights, overrides, ground_truth)
+    files = gather_files(layout, folder, images, lights, overrides, ground_truth)
+    return replace(files, others=others)

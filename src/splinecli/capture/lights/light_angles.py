@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.text import NumberRows
 from splinecli.errors import InputError
 
-LightForm = Literal["xyz", "azel"]
-"""The numbers of a light: a vector, or azimuth and elevation in degrees."""
+LightForm = Literal["xyz", "azel", "slant-tilt"]
+"""The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""
 
 RowForm = LightForm | Literal["positions"]
 """The numbers of a row in a file of lights or of near lamps."""
@@ -20,6 +21,7 @@ RowForm = LightForm | Literal["positions"]
 COLUMNS: dict[RowForm, dict[int, str]] = {
     "xyz": {3: "x y z"},
     "azel": {2: "azimuth elevation"},
+    "slant-tilt": {2: "slant tilt"},
     "positions": {3: "x y z"},
 }
 """The number of columns of each form, and their meaning."""
@@ -29,27 +31,38 @@ _ZENITH = ("zen", "polar", "incl", "colat", "coelev")
 AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format azel"
 
 
-def directions_from_angles(angles_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit vectors (F, 3) from azimuths and elevations (F, 2) in degrees.
+def directions_from_angles(angles_deg: NDArray[np.float64], form: RowForm) -> NDArray[np.float64]:
+    """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
 
-    The azimuth counts from x (right) towards y (up), the elevation from the image plane towards the camera.
+    Azimuth and tilt count from x (right) towards y (up), the elevation from the image plane towards the camera, the
+    slant from the camera axis.
     """
-    azimuth, elevation = np.radians(angles_deg).T
+    azimuth, elevation = np.radians([_azimuth_elevation(row, form) for row in angles_deg.tolist()]).T
     level = np.cos(elevation)
     return np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
 
 
-def check_angles(table: NumberRows) -> None:
-    """Raise InputError, with the line, for azimuths or elevations (the last two columns) that are no such angles."""
+def _azimuth_elevation(row: Sequence[float], form: RowForm) -> tuple[float, float]:
+    first, second = row[-2:]
+    return (second, 90 - first) if form == "slant-tilt" else (first, second)
+
+
+def check_angles(table: NumberRows, form: RowForm) -> None:
+    """Raise InputError, with the line, for rows whose last two columns are no such angles."""
     for row, line in zip(table.rows, table.lines, strict=True):
-        azimuth, elevation = row[-2:]
+        azimuth, elevation = _azimuth_elevation(row, form)
         if not (0 < elevation <= 90 and abs(azimuth) <= 360):
+            slants = form == "slant-tilt"
             raise InputError(
-                f"found azimuth {azimuth:g} and elevation {elevation:g}, expected -360 to 360 and above 0 to 90"
+                f"found slant {row[-2]:g} and tilt {row[-1]:g}, expected 0 to below 90 and -360 to 360 degrees"
+                if slants
+                else f"found azimuth {azimuth:g} and elevation {elevation:g}, expected -360 to 360 and above 0 to 90"
                 " degrees",
                 path=table.path,
                 line=line,
-                hint="The elevation counts from the image plane: 90 is the direction of the camera",
+                hint="The slant counts from the camera axis"
+                if slants
+                else "The elevation counts from the image plane: 90 is the direction of the camera",
             )
     if np.abs([row[-2:] for row in table.rows]).max() < 2 * np.pi:
         raise InputError(

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import (
     DECIMAL_POINT,
-    MOST_TEXT,
     NumberRows,
-    check_length,
     columns,
     has_decimal_commas,
     read_number_rows,
 )
+from splinecli.capture.lights.array_files import SUFFIXES, read_array_file
 from splinecli.capture.lights.light_angles import (
     COLUMNS,
     RowForm,
@@ -32,8 +31,6 @@ from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import read_light_rows
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
-
-NPY = ".npy"
 
 _STRONGEST = 1e12  # intensity; float32 computes with it and its inverse
 _FILE = "a text file with a line {} for each image"
@@ -61,8 +58,8 @@ def read_light_directions(
             n_images, and for angles that are read as vectors.
     """
     path = Path(path)
-    if path.suffix.lower() == NPY:
-        return directions_of(_read_array(path), n_images, frame, form)
+    if path.suffix.lower() in SUFFIXES:
+        return directions_of(read_array_file(path, n_images), n_images, frame, form)
     meaning = COLUMNS[form]
     rows = read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
     return directions_of(rows.numbers, n_images, frame, form)
@@ -73,10 +70,10 @@ def directions_of(
 ) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
     table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
-    if form == "azel":
+    if form in ("azel", "slant-tilt"):
         vectors, transposed = _one_light_a_row(table, COLUMNS[form], "lights", n_images)
-        check_angles(table)
-        vectors = directions_from_angles(vectors)
+        check_angles(table, form)
+        vectors = directions_from_angles(vectors, form)
     else:
         if form == "xyz":
             refuse_angles(table)
@@ -181,25 +178,6 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
             line=table.lines[channel if transposed else light],
         )
     return np.broadcast_to(intensities, (n_images, 3)).copy()
-
-
-def _read_array(path: Path) -> NumberRows:
-    """Return the rows of an .npy file; the lines count them from 1."""
-    check_length(path, MOST_TEXT)
-    try:
-        with path.open("rb") as file:
-            array = np.lib.format.read_array(file, allow_pickle=False)
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
-        raise InputError("the .npy file is damaged, or contains no array of numbers", path=path) from None
-    if array.ndim != 2 or array.dtype.kind not in "fiu" or not array.size or not np.isfinite(array).all():
-        raise InputError(
-            f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3",
-            path=path,
-        )
-    rows = tuple(tuple(row) for row in array.astype(np.float64).tolist())
-    return NumberRows(path, rows, tuple(range(1, len(rows) + 1)), ("",) * len(rows))
 
 
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:

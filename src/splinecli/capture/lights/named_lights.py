@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
+from splinecli.capture.lights import array_files
 from splinecli.capture.lights.light_angles import COLUMNS, RowForm
-from splinecli.capture.lights.light_files import NPY, directions_of, read_light_directions, unit_directions
+from splinecli.capture.lights.light_files import directions_of, read_light_directions, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import image_name, read_light_rows
 from splinecli.errors import InputError
@@ -96,7 +97,7 @@ def read_lights(
     """
     if path.suffix.lower() in SUFFIXES:
         return read_named_lights(path, frame)
-    if path.suffix.lower() != NPY:
+    if path.suffix.lower() not in array_files.SUFFIXES:
         meaning = COLUMNS[form]
         expected = f"a text file with a line {next(iter(meaning.values()))} for each image"
         rows = read_light_rows(path, expected=expected, n_numbers=min(meaning))

@@ -42,7 +42,8 @@ CHECK_LIGHTS = Option(
 )
 LIGHTS_FORMAT = Option(
     LightForm.xyz,
-    help="Numbers of a light in a text file: a vector x y z, or azel, its azimuth and elevation in degrees.",
+    help="Numbers of a light in a text file: a vector x y z; azel, azimuth and elevation; or slant-tilt, the angles"
+    " of HALCON. Angles are in degrees.",
 )
 INTENSITIES = Option(
     None,

@@ -40,6 +40,7 @@ class LightForm(StrEnum):
 
     xyz = "xyz"
     azel = "azel"
+    slant_tilt = "slant-tilt"
 
 
 class NormalConvention(StrEnum):

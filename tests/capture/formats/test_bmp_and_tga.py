@@ -1,0 +1,63 @@
+"""BMP and TGA images, written by Pillow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scenes import ring_lights, write_capture
+from splinecli.capture import capture_warnings, read_capture
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.facts import read_facts
+from splinecli.errors import InputError
+
+RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".tga"])
+@pytest.mark.parametrize("options", [{}, {"compression": "tga_rle"}])
+@pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("L", 1), ("P", 3)])
+def test_pixels(tmp_path: Path, suffix: str, options: dict[str, str], mode: str, channels: int) -> None:
+    if suffix == ".bmp" and options:
+        pytest.skip("BMP has no such option")
+    picture = Image.fromarray(RGB).convert(mode)
+    picture.save(tmp_path / f"image{suffix}", **options)
+    path = tmp_path / f"image{suffix}"
+    expected = np.asarray(picture.convert("RGB" if mode == "P" else mode)).reshape(7, 5, channels)
+    np.testing.assert_array_equal(decode_image(path), expected)
+    facts = read_facts(path)
+    assert facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".tga"])
+def test_damage(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(RGB).save(path)
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], whole[:10], b"BM" + bytes(40)):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"damaged|found an image|empty"):
+            decode_image(path)
+
+
+def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
+    lights = ring_lights(6)
+    pictures = np.full((6, 4, 5), 100, np.uint8)
+    folder = write_capture(tmp_path / "owl", pictures, lights, names="owl.{}.png")
+    Image.fromarray(RGB).save(folder / "owl.mask.bmp")
+    Image.fromarray(RGB).save(folder / "owl_normal.tga")
+    capture = read_capture(folder)
+    assert capture.n_lights == 6
+    (found,) = [w for w in capture.warnings if w.code == capture_warnings.IMAGES_LEFT_OUT]
+    assert str(found).startswith("owl.mask.bmp and 1 more: left out")
+
+
+def test_photographs_may_have_such_names(tmp_path: Path) -> None:
+    """All of them: then these names say nothing."""
+    folder = write_capture(
+        tmp_path / "a", np.full((6, 4, 5), 100, np.uint8), ring_lights(6), names="mask_of_a_king_{}.png"
+    )
+    assert read_capture(folder).n_lights == 6
