@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from splinecli.capture.lights.found_lights import LightFinder
     from splinecli.inference import NormalEstimate
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = ["__version__", "estimate_normals", "integrate_normals"]
 
