@@ -84,9 +84,7 @@ class Bench:
 
     def eight_bits(self, convert: Callable[[Any], Any], name: str) -> Cells:
         """Score copies of the captures whose images have other bits, on all pixels under two draws."""
-        copies = {
-            label: rewritten(path, self.results / name, convert) for label, path in self.objects.items()
-        }
+        copies = {label: rewritten(path, self.results / name, convert) for label, path in self.objects.items()}
         cells: Cells = {}
         for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
             found = self.errors(f"{name} errors", copies, method, trials=2, max_pixels=None)
@@ -110,9 +108,7 @@ class Bench:
         unknown = np.mean([photographs.without_intensities(network, draw)[1] for draw in draws], axis=0)
         return {
             name: round(float(value), 4)
-            for name, value in zip(
-                (*tables.EXPOSED, *tables.INTENSITIES), (*exposed, *unknown[2:]), strict=True
-            )
+            for name, value in zip((*tables.EXPOSED, *tables.INTENSITIES), (*exposed, *unknown[2:]), strict=True)
             if np.isfinite(value)  # without its saturated values, a pixel may have too few
         }
 
@@ -197,9 +193,7 @@ class Bench:
 
         seconds, report = large_captures.measure(float(megapixels), "spline-net", "png,npy")
         names = ("processor s", "memory MiB", "processor s a megapixel")
-        return dict(
-            zip(names, (seconds, report["peak_memory_mib"], seconds / float(megapixels)), strict=True)
-        )
+        return dict(zip(names, (seconds, report["peak_memory_mib"], seconds / float(megapixels)), strict=True))
 
     def measurements(self) -> dict[str, Rows]:
         """Return what measures each row of each measurement."""
@@ -260,9 +254,7 @@ def rewritten(folder: Path, place: Path, convert: Callable[[Any], Any]) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--results", type=Path, default=tables.ROOT / "runs/figures")
     parser.add_argument("--figures", type=Path, default=tables.FIGURES)

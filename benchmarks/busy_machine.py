@@ -73,9 +73,7 @@ def busy_processes(count: int) -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", nargs="?", type=Path, default=MEDALLION)
     parser.add_argument("--busy", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--pixels", type=int, default=10**9)

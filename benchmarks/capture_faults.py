@@ -56,9 +56,7 @@ def render(index: int) -> Iterator[Rendered]:
     shape = ("", "", "relief", "", "", "plane", "", "", "sphere", "", "", "low relief")[index % 12]
     mesh = sphere(count=150) if shape == "sphere" else None
     if shape and mesh is None:
-        steepness = {"relief": rng.uniform(0.5, 1.2), "plane": 0.0, "low relief": rng.uniform(0.05, 0.4)}[
-            shape
-        ]
+        steepness = {"relief": rng.uniform(0.5, 1.2), "plane": 0.0, "low relief": rng.uniform(0.05, 0.4)}[shape]
         field = height_field("relief", 201)
         normals = field.vertex_normals / field.vertex_normals[:, 2:] * (steepness, steepness, 1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -134,9 +132,7 @@ def real(folder: Path, draws: int) -> Iterator[tuple[str, list[str]]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--scenes", type=int, default=72)
     parser.add_argument("--draws", type=int, default=5)
@@ -144,9 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     total: Counter[tuple[str, str]] = Counter()
     named: dict[tuple[str, str], Counter[str]] = {}
-    rows = [
-        (kind, "real", found) for folder in options.captures for kind, found in real(folder, options.draws)
-    ]
+    rows = [(kind, "real", found) for folder in options.captures for kind, found in real(folder, options.draws)]
     for index in range(options.scenes):
         rng = np.random.default_rng([SEED, index, 1])
         rows += [(kind, scene.kind, found) for scene in render(index) for kind, found in faults(scene, rng)]

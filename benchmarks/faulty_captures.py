@@ -63,9 +63,7 @@ def draw_mesh(rng: np.random.Generator) -> Mesh:
     if kind < 0.7:
         polar, azimuth = np.meshgrid(np.linspace(0.01, np.pi - 0.01, count), np.linspace(0, 2 * np.pi, count))
         axes = rng.uniform(0.5, 0.95, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.5, 0.95))
-        sphere = np.stack(
-            (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), axis=-1
-        )
+        sphere = np.stack((np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), axis=-1)
         vertices, normals = sphere * axes, unit(sphere / axes)
     else:
         x, y = np.meshgrid(*[np.linspace(-1.05, 1.05, count)] * 2)
@@ -81,10 +79,7 @@ def draw_mesh(rng: np.random.Generator) -> Mesh:
     first = np.stack((corner, corner + 1, corner + count), axis=1)
     faces = np.concatenate((first, np.stack((corner + 1, corner + count + 1, corner + count), axis=1)))
     mesh = Mesh(
-        *(
-            values.reshape(-1, 3).astype(kept)
-            for values, kept in ((vertices, "f4"), (faces, "i4"), (normals, "f4"))
-        )
+        *(values.reshape(-1, 3).astype(kept) for values, kept in ((vertices, "f4"), (faces, "i4"), (normals, "f4")))
     )
     return turn(mesh, draw_rotation(rng)) if kind < 0.7 else mesh
 
@@ -257,9 +252,7 @@ def store_captures(folder: Path, scenes: Sequence[int], size: int) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=int, default=420)
     parser.add_argument("--size", type=int, default=64)

@@ -73,9 +73,7 @@ class Table:
             values = [known.get(row, {}).get(column, "-") for column in self.columns.values()]
             shown = (value if isinstance(value, str) else self.form.format(value) for value in values)
             lines.append("| " + " | ".join((label, *shown)) + " |")
-        captions = dict.fromkeys(
-            caption(measured[source], weights) for source in sources if source != PUBLISHED
-        )
+        captions = dict.fromkeys(caption(measured[source], weights) for source in sources if source != PUBLISHED)
         return "\n".join(lines) + f"\n\n{' '.join(captions)}"
 
 

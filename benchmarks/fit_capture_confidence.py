@@ -138,13 +138,9 @@ def print_table(examples: Sequence[Example]) -> None:
             before, after = (probability_within(claim, CONFIDENT_DEG).numpy() for claim in claims)
             true = float((e.errors_deg <= CONFIDENT_DEG).float().mean())
             worst = np.argsort(-e.errors_deg.numpy())[: len(before) // 10]
-            ranks = [
-                float(np.isin(worst, np.argsort(claim)[: len(worst)]).mean()) for claim in (before, after)
-            ]
+            ranks = [float(np.isin(worst, np.argsort(claim)[: len(worst)]).mean()) for claim in (before, after)]
             rows.setdefault(e.kind, []).append([float(before.mean()), float(after.mean()), true, *ranks])
-    print(
-        "| capture | number | claimed before | after | true | off before | after | worst tenth before | after |"
-    )
+    print("| capture | number | claimed before | after | true | off before | after | worst tenth before | after |")
     print("|---|" + "---:|" * 8)
     for kind, found in sorted(rows.items()):
         before, after, true, *ranks = np.array(found).T
@@ -163,9 +159,7 @@ def write_head(head: CaptureHead) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args(arguments)

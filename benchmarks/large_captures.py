@@ -77,9 +77,7 @@ def draw_plot(path: Path, rows: Sequence[tuple[float, float, float]]) -> None:
 
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     sizes, *columns = zip(*rows, strict=True)
-    for axes, values, name in zip(
-        figure.subplots(1, 2), columns, ("processor (s)", "memory (MiB)"), strict=True
-    ):
+    for axes, values, name in zip(figure.subplots(1, 2), columns, ("processor (s)", "memory (MiB)"), strict=True):
         axes.plot(sizes, values, marker="o")
         axes.set(xlabel="megapixels", ylabel=name, xlim=(0, None), ylim=(0, None))
         axes.grid(visible=True, alpha=0.3)

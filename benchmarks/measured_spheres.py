@@ -101,9 +101,7 @@ def errors_deg(network: SplineNet, materials: Materials, lights: Tensor, draws: 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("materials", type=Path, help="file of measured materials")
     parser.add_argument("lights", type=Path, help="light directions, x y z a line")
     parser.add_argument("--weights", action="append", help="shipped name or file; may be repeated")

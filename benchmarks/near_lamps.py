@@ -66,9 +66,7 @@ def height_field(name: str, count: int = 401) -> Mesh:
 
 def sphere(radius: float = 0.9, count: int = 300) -> Mesh:
     """Return a sphere of meridians and parallels, with exact normals."""
-    polar, azimuth = np.meshgrid(
-        np.linspace(0.002, np.pi - 0.002, count), np.linspace(0, 2 * np.pi, 2 * count)
-    )
+    polar, azimuth = np.meshgrid(np.linspace(0.002, np.pi - 0.002, count), np.linspace(0, 2 * np.pi, 2 * count))
     normals = np.stack(
         (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)), axis=-1
     ).reshape(-1, 3)
@@ -186,9 +184,7 @@ def measure(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--method", default="iw12")
     parser.add_argument("--widths", type=float, nargs="+", default=[2, 4, 8])

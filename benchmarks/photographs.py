@@ -101,16 +101,12 @@ def without_intensities(network: SplineNet, draw: Draw) -> tuple[bool, list[floa
     estimated = estimate_light_intensities(raw, None, draw.lights)
     used = np.ones(N_LIGHTS) if estimated is None else estimated
     spreads = [100 * float(np.std(np.log(s / draw.intensities))) for s in (np.ones(N_LIGHTS), used)]
-    errors = [
-        estimate(network, o, draw).mean() for o in (draw.observations, raw, (raw / used).astype(np.float32))
-    ]
+    errors = [estimate(network, o, draw).mean() for o in (draw.observations, raw, (raw / used).astype(np.float32))]
     return estimated is not None, [*spreads, *(float(error) for error in errors)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--draws", type=int, default=2)
     parser.add_argument("--pixels", type=int, default=1500)

@@ -89,9 +89,7 @@ def mitsuba_shapes(scene: Scene, class_name: str) -> dict[str, Any]:
         )
         properties = mi.Properties()
         properties["bsdf"] = bsdf
-        mesh = mi.Mesh(
-            f"part{number}", len(scene.mesh.vertices), int(kept.sum()), properties, has_vertex_normals=True
-        )
+        mesh = mi.Mesh(f"part{number}", len(scene.mesh.vertices), int(kept.sum()), properties, has_vertex_normals=True)
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = scene.mesh.vertices.ravel()
         parameters["vertex_normals"] = scene.mesh.vertex_normals.ravel()
@@ -194,9 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 # The halves differ by twice the noise of their mean.
                 noise = np.abs(halves[0] - halves[1]).mean() / 2 / truth.mean()
                 mine = ours.observations[name][:, column]
-                rows.append(
-                    (np.abs(mine - truth).mean() / truth.mean(), mine.mean() / truth.mean() - 1, noise)
-                )
+                rows.append((np.abs(mine - truth).mean() / truth.mean(), mine.mean() / truth.mean() - 1, noise))
             errors = np.array(rows)
             total[name].append(float(errors[:, 0].mean()))
             by_light = " ".join(f"{100 * error:5.1f}" for error in errors[:, 0])

@@ -117,9 +117,7 @@ def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple
         chosen = choose(lights, count, generator)
         lights = lights[chosen]
         images = torch.zeros(count, *mask.shape)
-        images[:, mask] = (
-            torch.from_numpy(scene[list(CLASSES)[int(3 * uniform())]][:, chosen.numpy()]).float().T
-        )
+        images[:, mask] = torch.from_numpy(scene[list(CLASSES)[int(3 * uniform())]][:, chosen.numpy()]).float().T
     if uniform() < 0.3:
         side = int(min(mask.shape) * uniform(0.35, 0.8))
         top, left = (int(uniform(0, size - side)) for size in mask.shape)
@@ -170,9 +168,7 @@ def choose(lights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return chosen
 
 
-def losses(
-    network: LightNet, images: Tensor, directions: Tensor, intensities: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def losses(network: LightNet, images: Tensor, directions: Tensor, intensities: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the negative log likelihood of the directions, their mean angle in radians, and the error of the logs."""
     guess = network(images.float())
     cosine = (guess.directions * directions).sum(dim=-1)
@@ -185,9 +181,7 @@ def losses(
 def train(folder: Path, minutes: float, output: Path) -> None:
     """Train for so many minutes, and write the running average of the weights."""
     network, average = LightNet().to(memory_format=torch.channels_last), LightNet()  # type: ignore[call-overload]
-    optimiser = torch.optim.AdamW(
-        network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True
-    )
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True)
     checkpoint, step = output.with_suffix(".checkpoint"), 0
     average.load_state_dict(network.state_dict())
     if checkpoint.exists():
@@ -195,9 +189,7 @@ def train(folder: Path, minutes: float, output: Path) -> None:
         for part, name in ((network, "network"), (average, "average"), (optimiser, "optimiser")):
             part.load_state_dict(state[name])
         step = state["step"]
-    batches = iter(
-        DataLoader(Captures(folder, step, held=False), batch_size=None, num_workers=1, prefetch_factor=6)
-    )
+    batches = iter(DataLoader(Captures(folder, step, held=False), batch_size=None, num_workers=1, prefetch_factor=6))
     begin = time.time()
     while (done := (time.time() - begin) / 60 / minutes) < 1:
         rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * done)) / 2 + 1e-6
@@ -228,9 +220,7 @@ def validate(network: LightNet, folder: Path, batches: int = 40) -> float:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("render", "train"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=int, default=960)

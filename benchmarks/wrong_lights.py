@@ -41,9 +41,7 @@ Lit = tuple[str, Array, Array, NDArray[np.bool_], bool]
 """Name, observations (P, F), lights (F, 3), mask (H, W), and whether a file gives the intensities of the lights."""
 
 
-def wrong_files(
-    lights: Array, rng: np.random.Generator
-) -> Iterator[tuple[str, Array, Callable[[LightCheck], bool]]]:
+def wrong_files(lights: Array, rng: np.random.Generator) -> Iterator[tuple[str, Array, Callable[[LightCheck], bool]]]:
     """Yield the name of each kind of file, the lights as it gives them, and whether a check's mend is the right one."""
     n_lights = len(lights)
     yield "right", lights, lambda check: True
@@ -136,9 +134,7 @@ def grouped(kind: str, by_name: Mapping[str, tuple[int, int, int]]) -> dict[str,
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--draws", type=int, default=20)

@@ -81,9 +81,7 @@ def photographs() -> list[NDArray[np.uint8]]:
     pictures = []
     for path in sorted(MEDALLION.glob("[0-9]*.png")):
         linear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(np.float32) / 65535
-        pictures.append(
-            encode_srgb(cv2.resize(EXPOSURE * linear, (SMALL, SMALL), interpolation=cv2.INTER_AREA))
-        )
+        pictures.append(encode_srgb(cv2.resize(EXPOSURE * linear, (SMALL, SMALL), interpolation=cv2.INTER_AREA)))
     return pictures
 
 

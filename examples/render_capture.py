@@ -146,9 +146,7 @@ def visibility(heights: Array, light: Array) -> Array:
     padded = np.pad(heights, n_steps + 2, mode="constant")
     depth = np.full_like(heights, -np.inf)
     for step, (column, row) in enumerate(zip(columns, rows, strict=True), start=1):
-        np.maximum(
-            depth, shifted(padded, row, column, n_steps + 2, len(heights)) - step * rise - heights, out=depth
-        )
+        np.maximum(depth, shifted(padded, row, column, n_steps + 2, len(heights)) - step * rise - heights, out=depth)
     return np.asarray(1 - np.clip(depth / SHADOW_EDGE, 0, 1))
 
 
@@ -181,9 +179,7 @@ def shade(normals: Array, albedo: Array, light: Array) -> Array:
 def light_rig() -> tuple[Array, Array]:
     """Return light directions (F, 3), rounded to the stored digits, and RGB intensities (F, 3)."""
     tilt, azimuth = np.radians(np.array(LIGHTS_DEG, np.float64)).T
-    directions = np.stack(
-        (np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)), axis=-1
-    )
+    directions = np.stack((np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)), axis=-1)
     return np.asarray(unit(np.round(directions, 6))), np.array(LIGHT_INTENSITIES)
 
 
@@ -232,9 +228,7 @@ def write(rendering: Rendering, folder: Path) -> None:
 
 def write_png(path: Path, pixels: NDArray[np.unsignedinteger]) -> None:
     """Write a gray or RGB picture. OpenCV expects BGR."""
-    if not cv2.imwrite(
-        str(path), pixels[..., ::-1] if pixels.ndim == 3 else pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9]
-    ):
+    if not cv2.imwrite(str(path), pixels[..., ::-1] if pixels.ndim == 3 else pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9]):
         raise OSError(f"{path} cannot be written")
 
 

@@ -75,9 +75,7 @@ def open_page(browser: Browser, tmp_path: Path) -> Iterator[OpenPage]:
     opened: list[Any] = []
     problems: list[str] = []
 
-    def open_html(
-        html: str, fragment: str = "", *, width: int = 800, height: int = 600, webgl: bool = True
-    ) -> Page:
+    def open_html(html: str, fragment: str = "", *, width: int = 800, height: int = 600, webgl: bool = True) -> Page:
         path = tmp_path / f"page{len(opened)}.html"
         path.write_text(html, "utf-8")
         context = browser.new_context(viewport={"width": width, "height": height})

@@ -25,9 +25,7 @@ GOLDEN = Path(__file__).resolve().parent / "golden"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff"
-    )
+    parser.addoption("--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff")
 
 
 @pytest.fixture(autouse=True)

@@ -54,6 +54,4 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
 
 def content(folder: Path) -> dict[str, bytes]:
     """The content of every file below a folder by its path, hidden ones included."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
-    }
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -62,9 +62,7 @@ def halfway(lights: Floats) -> Floats:
     return np.asarray(half / np.linalg.norm(half, axis=1, keepdims=True))
 
 
-def shade(
-    normals: Floats, lights: Floats, *, gloss: float = 0.0, exponent: float = 30, noise: float = 0.0
-) -> Floats:
+def shade(normals: Floats, lights: Floats, *, gloss: float = 0.0, exponent: float = 30, noise: float = 0.0) -> Floats:
     """Observations (..., F): Lambert's cosine, a Blinn-Phong lobe, attached shadows, and noise of this deviation."""
     cosine = np.clip(normals @ lights.T, 0, None)
     seen = cosine + gloss * np.clip(normals @ halfway(lights).T, 0, None) ** exponent * (cosine > 0)

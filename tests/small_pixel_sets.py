@@ -51,9 +51,7 @@ def make_set(tmp_path: Path) -> MakeSet:
     ) -> PixelSet:
         writer = PixelSetWriter(tmp_path / name)
         for index, (entry, scene, pixels, lights) in enumerate(entries):
-            writer.add(
-                entry, scene, "a test", {"by": "hand"}, matte_pixels(pixels, lights, seed=index, dtype=dtype)
-            )
+            writer.add(entry, scene, "a test", {"by": "hand"}, matte_pixels(pixels, lights, seed=index, dtype=dtype))
         return writer.finish()
 
     return make

@@ -39,9 +39,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 def numbers(line: str) -> list[float]:
-    return [
-        float(number) for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))
-    ]
+    return [float(number) for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))]
 
 
 def test_training_speed(run: Run) -> None:
@@ -90,9 +88,7 @@ def test_render_accuracy(run: Run) -> None:
 
 def test_near_lamps(run: Run) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    printed = run(
-        "near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8"
-    ).splitlines()
+    printed = run("near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8").splitlines()
     assert len(printed) == 8
     plane = next(row for row in printed if row.split()[:2] == ["matte", "plane"])
     distant, distant_range, as_distant, bowl, near, near_range, *_ = numbers(plane)
@@ -178,9 +174,7 @@ def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
     half = (light + view) / np.linalg.norm(light + view)
     tangent = half - (half @ n) * n
     tangent /= np.linalg.norm(tangent)
-    frame = np.stack(
-        (tangent, np.cross(n, tangent), n)
-    )  # the normal along z, the half vector at azimuth zero
+    frame = np.stack((tangent, np.cross(n, tangent), n))  # the normal along z, the half vector at azimuth zero
     half, light = frame @ half, frame @ light
     cosine, sine = half[2], math.sqrt(1 - half[2] ** 2)
     difference = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ light

@@ -130,9 +130,7 @@ def test_fields_of_the_report():
 
 
 def test_every_warning_is_explained():
-    codes = {
-        value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)
-    }
+    codes = {value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)}
     explained = re.findall(r"^\| `(\w+)` \|", text_of("docs/troubleshooting.md"), re.MULTILINE)
     assert sorted(codes) == explained
 
@@ -163,27 +161,19 @@ def test_tables_of_figures(name):
 
 
 def test_every_table_of_figures_is_shown():
-    shown = [
-        found
-        for name in figure_tables.PAGES
-        for found in re.findall(r"<!-- figures: (\S+) -->", text_of(name))
-    ]
+    shown = [found for name in figure_tables.PAGES for found in re.findall(r"<!-- figures: (\S+) -->", text_of(name))]
     assert sorted(shown) == sorted(figure_tables.TABLES)
 
 
 def test_figures_of_other_weights_are_marked():
     """New weights never leave old figures unmarked."""
     rows = {row: dict.fromkeys(("4", "10"), 1.0) for row in ("ls",)}
-    table = figure_tables.Table(
-        ("lights",), "method", {"least squares": "ls"}, {"4": "4", "10": "10", "20": "20"}
-    )
+    table = figure_tables.Table(("lights",), "method", {"least squares": "ls"}, {"4": "4", "10": "10", "20": "20"})
     measured = {"lights": {"version": "0.2.0", "weights": "old", "machine": "", "rows": rows}}
     assert table.text(measured, "old").splitlines()[2:] == [
         "| least squares | 1.00 | 1.00 | - |",
         "",
         "(version 0.2.0, weights old)",
     ]
-    assert table.text(measured, "new").endswith(
-        "(**not measured with these weights**: version 0.2.0, weights old)"
-    )
+    assert table.text(measured, "new").endswith("(**not measured with these weights**: version 0.2.0, weights old)")
     assert table.text({}, "new") == "(not measured with these weights)"

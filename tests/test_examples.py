@@ -60,9 +60,7 @@ def test_the_tutorial(tmp_path):
     """Run its commands in order: they lead from photographs to a mesh and print what the tutorial shows."""
     text = TUTORIAL.read_text("utf-8")
     (tmp_path / "examples").symlink_to(EXAMPLES)
-    commands = [
-        line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()
-    ]
+    commands = [line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
     assert len(commands) <= 6
     said = ""
     for command in commands:
@@ -110,9 +108,7 @@ def test_the_stored_mask_and_normals_are_what_the_script_makes(rendering):
 def test_the_stored_lights_are_those_of_the_script(rendering):
     directions = np.loadtxt(MEDALLION / "light_directions.txt")
     np.testing.assert_allclose(directions, rendering.light_directions, rtol=0, atol=1.1e-6)
-    np.testing.assert_array_equal(
-        np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities
-    )
+    np.testing.assert_array_equal(np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities)
 
 
 def test_nothing_is_saturated_and_nothing_is_warned_about():

@@ -33,6 +33,5 @@ def test_another_error_with_a_file_and_another_way_out(monkeypatch: pytest.Monke
     with pytest.raises(InputError) as caught:
         import_extra("rawpy", "raw", error=InputError, path=Path("a.nef"), otherwise="export it")
     assert str(caught.value) == (
-        "a.nef: camera RAW files need rawpy, which is not installed."
-        " Run pip install 'splinecli[raw]', or export it."
+        "a.nef: camera RAW files need rawpy, which is not installed. Run pip install 'splinecli[raw]', or export it."
     )

@@ -39,9 +39,7 @@ def imported_rooms(tree: ast.AST) -> set[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("splinecli"):
             modules += (
-                [f"{node.module}.{alias.name}" for alias in node.names]
-                if node.module == "splinecli"
-                else [node.module]
+                [f"{node.module}.{alias.name}" for alias in node.names] if node.module == "splinecli" else [node.module]
             )
         elif isinstance(node, ast.Import):
             modules += [alias.name for alias in node.names if alias.name.startswith("splinecli")]
@@ -50,9 +48,7 @@ def imported_rooms(tree: ast.AST) -> set[str]:
 
 
 def test_every_room_is_ranked():
-    names = {
-        path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
-    }
+    names = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert names == set(HEIGHT)
 
 

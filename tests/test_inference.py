@@ -64,9 +64,7 @@ def test_errors_against_the_ground_truth() -> None:
     scored[first] = False
     assert np.isnan(estimate.error_map_deg[~scored]).all()
     expected = np.where(np.arange(mask.shape[1]) % 2, 0.0, 180.0)
-    np.testing.assert_allclose(
-        estimate.error_map_deg[scored], np.broadcast_to(expected, mask.shape)[scored], atol=1e-4
-    )
+    np.testing.assert_allclose(estimate.error_map_deg[scored], np.broadcast_to(expected, mask.shape)[scored], atol=1e-4)
     flipped = np.broadcast_to(expected > 0, mask.shape)[scored].mean()
     assert estimate.errors.mean == pytest.approx(180 * flipped, abs=1e-3)
     assert estimate.errors.under_5 == pytest.approx(1 - flipped)

@@ -101,9 +101,7 @@ def test_normals_and_confidence_of_the_network() -> None:
 )
 def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
     images, normals = matte(dtype, scale)
-    estimate = splinecli.estimate_normals(
-        images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS))
-    )
+    estimate = splinecli.estimate_normals(images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS)))
     # 8 bits round by up to 0.25 %.
     np.testing.assert_allclose(estimate.normal_map, normals, atol=1e-2 if dtype is np.uint8 else 1e-4)
 

@@ -115,9 +115,7 @@ def test_ctrl_c_between_renames_leaves_no_report(tmp_path: Path, monkeypatch: py
         assert content(folder).items() <= NEW.items()
 
 
-def test_ctrl_c_at_the_very_end_is_still_an_interrupt(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_at_the_very_end_is_still_an_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish_all = NewFiles.publish
 
     def interrupt(*arguments: object) -> None:
@@ -153,9 +151,7 @@ LINKS: dict[str, Callable[[Path, Path], None]] = {
 
 @pytest.mark.parametrize("kind", LINKS)
 @pytest.mark.parametrize("name", [REPORT, "a.txt", "only old.txt", "pictures/1.png"])
-def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(
-    tmp_path: Path, kind: str, name: str
-) -> None:
+def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(tmp_path: Path, kind: str, name: str) -> None:
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     write(elsewhere, {"precious": b"mine"})
     (folder / name).parent.mkdir(parents=True)

@@ -22,7 +22,5 @@ def test_decoding_turns_encoding_back():
 def test_names_of_curves():
     assert [parse_transfer(text) for text in ("auto", "linear", "srgb", "gamma:2.2")] == [1.0, 1.0, None, 2.2]
     for text in ("", "sRGB", "gamma", "gamma:", "gamma:0", "gamma:1.2.3", "gamma:99"):
-        with pytest.raises(
-            UsageError, match=r"expected auto, linear, srgb, or gamma:G with G from 0\.1 to 10"
-        ):
+        with pytest.raises(UsageError, match=r"expected auto, linear, srgb, or gamma:G with G from 0\.1 to 10"):
             parse_transfer(text)

@@ -12,9 +12,7 @@ def printable(text: object) -> str:
 
     Names of files may contain anything, also what moves a terminal's cursor or forges a line.
     """
-    return "".join(
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in str(text)
-    )
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in str(text))
 
 
 class SplinecliError(Exception):

@@ -99,13 +99,9 @@ def estimate_normals(
     normal_map[capture.mask] = normals
     del normals
     if capture.ground_truth is None:
-        return NormalEstimate(
-            capture, normal_map, seconds, confidence_map=confidence_map, capture_judged=judged
-        )
+        return NormalEstimate(capture, normal_map, seconds, confidence_map=confidence_map, capture_judged=judged)
     error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
-    return NormalEstimate(
-        capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map, judged
-    )
+    return NormalEstimate(capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map, judged)
 
 
 def _estimate(
@@ -127,9 +123,7 @@ def _estimate(
 
     def estimate(rows: Rows, light: LampLight, progress: Progress | None = None) -> None:
         if errors is not None and tells_confidence(estimator):
-            found, errors[rows] = estimator.estimate_with_error(
-                light.observations, light.directions, progress=progress
-            )
+            found, errors[rows] = estimator.estimate_with_error(light.observations, light.directions, progress=progress)
         else:
             found = estimator.estimate(light.observations, light.directions, progress=progress)
         normals[rows] = light.in_frame_of_capture(found)

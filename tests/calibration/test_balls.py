@@ -73,16 +73,12 @@ def test_several_balls_are_averaged(
     np.testing.assert_allclose(both.disagreement_deg, between / 2, atol=1e-6)
     assert between.mean() > 1
     assert combine_balls([one]).disagreement_deg.tolist() == [0] * 7
-    short = calibrate_ball(
-        find_ball_files(write(tmp_path / "short", "1.png", render_ball(lights[1]))), circle=BALL
-    )
+    short = calibrate_ball(find_ball_files(write(tmp_path / "short", "1.png", render_ball(lights[1]))), circle=BALL)
     with pytest.raises(InputError, match=r"7 images .*1 images"):
         combine_balls([one, short])
 
 
-def test_a_ball_cut_off_by_the_frame(
-    tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]
-) -> None:
+def test_a_ball_cut_off_by_the_frame(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> None:
     for number, light in enumerate(lights[:3], start=1):
         write(tmp_path / "ball", f"{number}.png", render_ball(light, x=45.0, lamp=0.9))
     with pytest.raises(InputError, match=r"not entirely inside the image\. Take images of the whole"):
@@ -105,14 +101,10 @@ def test_pictures_of_another_size(ball: Path) -> None:
 
 def test_real_balls(shared_data: Path) -> None:
     chrome = calibrate_ball(find_ball_files(shared_data / "uw/chrome"))
-    off = angle_between_deg(
-        chrome.directions, read_light_directions(shared_data / "uw/gray/light_directions.txt")
-    )
+    off = angle_between_deg(chrome.directions, read_light_directions(shared_data / "uw/gray/light_directions.txt"))
     assert off.mean() < 0.6
     assert off.max() < 1
-    probes = [
-        calibrate_ball(find_ball_files(shared_data / f"psbox/LightProbe-{number}")) for number in (1, 2)
-    ]
+    probes = [calibrate_ball(find_ball_files(shared_data / f"psbox/LightProbe-{number}")) for number in (1, 2)]
     expected = read_light_directions(shared_data / "psbox/light_directions.txt")
     for probe in probes:
         assert angle_between_deg(probe.directions, expected).mean() < 2

@@ -61,9 +61,7 @@ def calibrate(folder: Path, positions: NDArray[np.float64], *, known: bool = Tru
         for number, lamp in enumerate(positions):
             cv2.imwrite(str(folder / name / f"{number}.png"), photograph(circle, lamp))
         balls.append(
-            calibrate_ball(
-                find_ball_files(folder / name), circle=circle, camera_matrix=matrix if known else None
-            )
+            calibrate_ball(find_ball_files(folder / name), circle=circle, camera_matrix=matrix if known else None)
         )
     return balls
 
@@ -102,9 +100,7 @@ def photographed(
         return middle + focal * seen[:, :2] / -seen[:, 2:] * (1, -1)
 
     zenith, azimuth = np.radians(rng.uniform(15, 50, 6)), rng.uniform(0, 2 * np.pi, 6)
-    towards = np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
-    )
+    towards = np.stack((np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1)
     places = towards * rng.uniform(300, 700, (6, 1)) * min(1, eye[2] / 900)
     assumed = {"EXIF": focal * np.exp(0.05 * rng.normal()), "assumed distant": DISTANT}.get(source, focal)
     view = View(
@@ -124,9 +120,7 @@ def photographed(
         across = np.linalg.svd((eye - centre)[None])[2][1:]
         angle = np.arange(360)[:, None] * np.pi / 180
         rim = np.cos(angle) * across[0] + np.sin(angle) * across[1]
-        outline = image_of(
-            centre + 400 / away * (eye - centre) / away + 20 * np.sqrt(1 - (20 / away) ** 2) * rim
-        )
+        outline = image_of(centre + 400 / away * (eye - centre) / away + 20 * np.sqrt(1 - (20 / away) ** 2) * rim)
         x, y = outline.mean(axis=0)
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)

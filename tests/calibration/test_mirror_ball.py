@@ -23,9 +23,7 @@ def direction_at(ball: Circle, x: float, y: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("full_scale", [None, 1.0])
-def test_directions_come_back(
-    render_ball: Render, lights: NDArray[np.float64], full_scale: float | None
-) -> None:
+def test_directions_come_back(render_ball: Render, lights: NDArray[np.float64], full_scale: float | None) -> None:
     for light in lights:
         picture = render_ball(light)
         picture = picture if full_scale is None else picture.clip(0, full_scale)

@@ -29,9 +29,7 @@ def photographs() -> NDArray[np.uint16]:
 @pytest.fixture
 def capture_folder(tmp_path: Path, write_image: WriteImage, photographs: NDArray[np.uint16]) -> Path:
     """tmp_path/vase: four photographs and light_directions.txt, nothing else."""
-    for number, pixels in enumerate(
-        photographs, start=8
-    ):  # img8, img9, img10, img11: not in the order of text
+    for number, pixels in enumerate(photographs, start=8):  # img8, img9, img10, img11: not in the order of text
         write_image(f"vase/img{number}.png", pixels)
     np.savetxt(tmp_path / "vase/light_directions.txt", LIGHTS)
     return tmp_path / "vase"
@@ -43,9 +41,7 @@ def texts(warnings: Iterable[CaptureWarning]) -> tuple[str, ...]:
 
 def expected(photographs: NDArray[np.uint16], intensities: NDArray[np.float64]) -> NDArray[np.float64]:
     """(P, F) for the whole image, in float64."""
-    return np.asarray(
-        (photographs / 65535 / intensities[:, None, None]).mean(axis=-1).reshape(len(photographs), -1).T
-    )
+    return np.asarray((photographs / 65535 / intensities[:, None, None]).mean(axis=-1).reshape(len(photographs), -1).T)
 
 
 def test_without_intensities_and_mask(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
@@ -59,27 +55,19 @@ def test_without_intensities_and_mask(capture_folder: Path, photographs: NDArray
     np.testing.assert_allclose(capture.light_directions, LIGHTS)
 
 
-def test_channels_are_divided_by_their_own_intensity(
-    capture_folder: Path, photographs: NDArray[np.uint16]
-) -> None:
+def test_channels_are_divided_by_their_own_intensity(capture_folder: Path, photographs: NDArray[np.uint16]) -> None:
     np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
-    np.testing.assert_allclose(
-        read_capture(capture_folder).observations, expected(photographs, INTENSITIES), rtol=1e-6
-    )
+    np.testing.assert_allclose(read_capture(capture_folder).observations, expected(photographs, INTENSITIES), rtol=1e-6)
 
 
-def test_mask_and_ground_truth(
-    capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]
-) -> None:
+def test_mask_and_ground_truth(capture_folder: Path, write_image: WriteImage, photographs: NDArray[np.uint16]) -> None:
     mask = np.random.default_rng(4).random((5, 6)) < 0.5
     write_image("vase/mask.png", mask.astype(np.uint8) * 255)
     normals = np.broadcast_to([0.0, 0.6, 0.8], (5, 6, 3))
     np.save(capture_folder / "normals_gt.npy", normals)
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.mask, mask)
-    np.testing.assert_allclose(
-        capture.observations, expected(photographs, np.ones((4, 3)))[mask.ravel()], rtol=1e-6
-    )
+    np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3)))[mask.ravel()], rtol=1e-6)
     assert capture.ground_truth is not None
     np.testing.assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
 
@@ -94,9 +82,7 @@ def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDAr
     assert len(calls) == 3
     assert capture.light_indices == (3, 0, 2)
     np.testing.assert_allclose(capture.light_directions, LIGHTS[[3, 0, 2]])
-    np.testing.assert_allclose(
-        capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6
-    )
+    np.testing.assert_allclose(capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6)
     with pytest.raises(InputError, match=r"img9\.png: found neither PNG, TIFF, JPEG nor BMP"):
         source.read()
 
@@ -164,9 +150,7 @@ def test_pixels_that_no_light_reaches(
 def test_least_squares_on_diligent(shared_data: Path, name: str, n_pixels: int, mae_deg: float) -> None:
     capture = read_capture(shared_data / "DiLiGenT/pmsData" / name)
     assert (capture.name, capture.observations.shape) == (name, (n_pixels, 96))
-    solution = np.linalg.lstsq(
-        capture.light_directions, capture.observations.T.astype(np.float64), rcond=None
-    )[0]
+    solution = np.linalg.lstsq(capture.light_directions, capture.observations.T.astype(np.float64), rcond=None)[0]
     assert capture.ground_truth is not None
     truth = capture.ground_truth[capture.mask]
     scored = truth.any(axis=1)

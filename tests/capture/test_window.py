@@ -62,9 +62,7 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-def test_results_are_a_part_of_those_of_the_whole(
-    crop: str | None, scale: str | None, tmp_path: Path
-) -> None:
+def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str | None, tmp_path: Path) -> None:
     maps = {}
     for name, options in (("whole", (None, None)), ("part", (crop, scale))):
         record = InferOptions(

@@ -36,9 +36,7 @@ def write_capture(folder: Path) -> Path:
     pictures = np.rint(np.moveaxis(normals @ lights.T, 2, 0) * 60_000).astype(np.uint16)
     disc = np.hypot(*scenes.square_grid(SIZE, 1 - 1 / SIZE)) < 1
     truth = normals.astype(np.float32)
-    return scenes.write_capture(
-        folder, pictures, lights, mask=disc, normals=truth, names="image{}.png", first=1
-    )
+    return scenes.write_capture(folder, pictures, lights, mask=disc, normals=truth, names="image{}.png", first=1)
 
 
 @pytest.fixture(scope="session")

@@ -87,9 +87,7 @@ def test_two_balls_and_intensities(run):
     report = json.loads(result.out)
     # A centre 1 pixel off turns the light by about 2 / 40, 2.9 degrees; the mean lies in the middle.
     assert report["disagreement_deg"]["mean"] == pytest.approx(1.5, abs=0.2)
-    np.testing.assert_allclose(
-        np.array(report["light_intensities"])[:, 0], np.array(intensities) / 0.875, rtol=0.03
-    )
+    np.testing.assert_allclose(np.array(report["light_intensities"])[:, 0], np.array(intensities) / 0.875, rtol=0.03)
     assert np.loadtxt("calibration/light_intensities.txt").shape == (4, 3)
 
 

@@ -108,9 +108,7 @@ def test_python_gives_the_same_warnings(medallion):
     mask = cv2.imread(str(medallion / "mask.png"), cv2.IMREAD_GRAYSCALE)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        estimate = splinecli.estimate_normals(
-            images, lights, mask, light_intensities=intensities, method="ls"
-        )
+        estimate = splinecli.estimate_normals(images, lights, mask, light_intensities=intensities, method="ls")
     assert [warning.code for warning in estimate.capture.warnings] == ["images_shifted", "light_frame"]
     assert [str(warning.message) for warning in caught] == [str(w) for w in estimate.capture.warnings]
     assert all(warning.filename == __file__ for warning in caught)

@@ -64,9 +64,7 @@ def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_cap
         "--method",
         "ls",
     ]
-    done = subprocess.run(
-        arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True
-    )
+    done = subprocess.run(arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True)
     os.close(write)
     assert done.returncode == 3
     assert {path.name for path in Path("out").iterdir()} == {"index.html", "second", "sphere"}
@@ -100,9 +98,7 @@ def test_a_failure_is_a_json_document(name, run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", FAILING)
-@pytest.mark.parametrize(
-    "wrong", [("--magic",), ("--output",), ()], ids=["unknown", "no value", "no argument"]
-)
+@pytest.mark.parametrize("wrong", [("--magic",), ("--output",), ()], ids=["unknown", "no value", "no argument"])
 def test_an_error_of_the_parser_is_a_json_document(name, wrong, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = run(name, "--json", *wrong)
@@ -136,9 +132,7 @@ def test_a_subfolder_without_permission_is_skipped(command, skipped, make_captur
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expected):
     script = "import os; from splinecli.cli.main import main; main(['--version']); "
     script += "print(os.environ.get('OMP_WAIT_POLICY'))"
-    clean = {
-        name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-    }
+    clean = {name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env={**clean, **variables}
     )

@@ -81,9 +81,7 @@ COMPLETED = {
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_words_are_completed(shell):
-    script, *answers = ask(
-        [{"_SPLINECLI_COMPLETE": f"source_{shell}"}, *(question(line, shell) for line in COMPLETED)]
-    )
+    script, *answers = ask([{"_SPLINECLI_COMPLETE": f"source_{shell}"}, *(question(line, shell) for line in COMPLETED)])
     assert f"_SPLINECLI_COMPLETE=complete_{shell}" in script
     found = {line: sorted(words(out, shell)) for line, out in zip(COMPLETED, answers, strict=True)}
     assert found == {line: sorted(expected) for line, expected in COMPLETED.items()}

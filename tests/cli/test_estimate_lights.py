@@ -162,9 +162,7 @@ def test_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run) -> None:
     normals = np.load("out/clip/normals.npy")
     assert angle_between_deg(normals[mask], sphere(96)[0][mask]).mean() < 6
     # The frames are a capture of their own, and stay while the film does.
-    again = run(
-        "infer", "out/frames/clip", "--lights", "out/clip/light_directions.txt", "-o", "b", "--method", "ls"
-    )
+    again = run("infer", "out/frames/clip", "--lights", "out/clip/light_directions.txt", "-o", "b", "--method", "ls")
     assert again.code == 0, again.err
     times = [frame.stat().st_mtime_ns for frame in frames]
     assert "already done" in run(*command).err

@@ -74,9 +74,7 @@ def test_process_substitution_in_place_of_light_directions(capture, run):
 def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
     """The first megabyte is a whole light file."""
     command = f"{sys.executable} -m splinecli infer {capture} --method ls --lights"
-    result = shell(
-        f"{command} <(cat {capture}/light_directions.txt; head -c 1000000 /dev/zero | tr '\\0' ' ')"
-    )
+    result = shell(f"{command} <(cat {capture}/light_directions.txt; head -c 1000000 /dev/zero | tr '\\0' ' ')")
     assert result.returncode == 3
     assert result.stderr.endswith("found more than 1.0 MB, expected a text file of at most 1.0 MB.\n")
     assert not Path("out").exists()
@@ -142,9 +140,7 @@ def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
     elsewhere = make_capture("elsewhere")
     names = [f"../elsewhere/image{number}.png" for number in range(1, 9)]
     (capture / "filenames.txt").write_text("\n".join(names))
-    message = (
-        'splinecli: sphere/filenames.txt:1: the image "../elsewhere/image1.png" is outside of this folder.'
-    )
+    message = 'splinecli: sphere/filenames.txt:1: the image "../elsewhere/image1.png" is outside of this folder.'
     for command in (["infer", "--method", "ls"], ["info"], ["evaluate", "--method", "ls", "--n-lights", 4]):
         result = run(command[0], capture, *command[1:])
         assert result.code == 3
@@ -268,8 +264,7 @@ def test_the_dependencies_have_no_known_holes():
     text = (Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8")
     listed = tomllib.loads(text)["project"]["dependencies"]
     floors = {
-        name: tuple(int(part) for part in floor.split("."))
-        for name, floor in (item.split(">=") for item in listed)
+        name: tuple(int(part) for part in floor.split(".")) for name, floor in (item.split(">=") for item in listed)
     }
     for name, floor in {
         "torch": (2, 6),  # CVE-2025-32434: code runs from a file read with weights_only

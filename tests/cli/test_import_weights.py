@@ -60,9 +60,7 @@ def test_imported_weights_run(run, make_capture):
     result = run("infer", make_capture("sphere"), "--mask", "few.png", *weights, "--json")
     (report,) = json.loads(result.out)
     assert (report["weights"]["name"], report["n_pixels"]) == ("official", 16)
-    quiet = run(
-        "import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors", "--overwrite", "-q"
-    )
+    quiet = run("import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors", "--overwrite", "-q")
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
 

@@ -143,9 +143,7 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
     assert ("found_mask.png" in report["files"], report["n_pixels"]) == (True, np.count_nonzero(found))
     assert (found != mask).mean() < 0.02  # corners are rounded
     # What was written is a mask that the next call reads.
-    again = run(
-        "infer", capture, "--method", "ls", "--mask", "out/sphere/found_mask.png", "-o", "again", "--json"
-    )
+    again = run("infer", capture, "--method", "ls", "--mask", "out/sphere/found_mask.png", "-o", "again", "--json")
     assert json.loads(again.out)[0]["n_pixels"] == report["n_pixels"]
     both = run("infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite")
     assert (both.code, "contradict each other. Leave one out" in both.err) == (2, True)
@@ -211,19 +209,16 @@ def test_photographs_with_a_curve_and_ambient_light(capture, run):
     ]
     result = run("infer", capture, "--transfer", "rec709")
     assert (result.code, result.out) == (2, "")
-    assert (
-        "the transfer curve is 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"
-        in result.err
-    )
+    assert "the transfer curve is 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10" in result.err
 
 
 def test_lights_by_index_and_by_draw(capture, run):
     (chosen,) = json.loads(run("infer", capture, "--method", "ls", "--light-indices", "6,0,2", "--json").out)
     assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])
     draws = [
-        json.loads(
-            run("infer", capture, "--method", "ls", "--n-lights", 4, "--seed", s, "--json", "--overwrite").out
-        )[0]
+        json.loads(run("infer", capture, "--method", "ls", "--n-lights", 4, "--seed", s, "--json", "--overwrite").out)[
+            0
+        ]
         for s in (0, 0, 1)
     ]
     assert [draw["n_lights"] for draw in draws] == [4, 4, 4]
@@ -291,9 +286,7 @@ def test_ctrl_c_ends_a_real_process(capture):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "splinecli: interrupted.\n")
-    assert not [
-        path.name for path in Path("run").iterdir() if path.name.startswith(".")
-    ]  # nothing half-written
+    assert not [path.name for path in Path("run").iterdir() if path.name.startswith(".")]  # nothing half-written
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX redirections")

@@ -122,9 +122,7 @@ def test_names_that_are_no_text(capture, make_capture, run):
 
 
 def test_a_folder_that_is_given_twice_counts_once(capture, run):
-    result = run(
-        "infer", capture, capture.absolute(), "others/../sphere", "sphere/", "--method", "ls", "--json"
-    )
+    result = run("infer", capture, capture.absolute(), "others/../sphere", "sphere/", "--method", "ls", "--json")
     (document,) = json.loads(result.out)
     assert (result.code, result.err, document["capture"]) == (0, "", "sphere")
     assert not Path("out/index.html").exists()
@@ -315,9 +313,7 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize(
-    "place", [(InferOptions, "open"), (LeastSquares, "estimate")], ids=["open", "estimate"]
-)
+@pytest.mark.parametrize("place", [(InferOptions, "open"), (LeastSquares, "estimate")], ids=["open", "estimate"])
 def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch):
     """The others go on, whatever is raised and wherever."""
     names = [str(make_capture(name)) for name in (*FAILURES, "good")]

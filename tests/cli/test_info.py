@@ -94,10 +94,7 @@ def test_the_white_level_of_12_bit_data(run, capture):
     report = json.loads(run("info", capture, "--json").out)
     assert report["white_level"] == {"value": 4095, "origin": "images"}
     mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
-    shares = [
-        (cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean()
-        for path in capture.glob("image*.png")
-    ]
+    shares = [(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean() for path in capture.glob("image*.png")]
     assert report["exposure"]["saturated"] == pytest.approx(max(shares), abs=1e-4)
     assert report["exposure"]["saturated"] > 0.1
     assert report["exposure"]["bright"][1] == pytest.approx(1)

@@ -86,9 +86,7 @@ def test_an_array_of_something_else(run):
 @pytest.mark.parametrize("where", ["mask", "alpha"])
 def test_a_background_that_is_not_black(run, where):
     normals, heights, inside = sphere()
-    picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(np.uint16)[
-        ..., ::-1
-    ]
+    picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(np.uint16)[..., ::-1]
     cut = inside.astype(np.uint16) * 65_535
     cv2.imwrite("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
     cv2.imwrite("mask.png", cut)
@@ -165,9 +163,7 @@ def test_a_part_in_colour_by_perspective(run):
     assert (mesh.vertices[:, 2] < 0).all()  # before the camera, which looks along -z
     # A pixel without a size counts as a millimetre. Columns 7 to 24 are on the object.
     assert trimesh.load("out/mesh.glb").extents[0] == pytest.approx(0.017, rel=0.05)
-    sized = json.loads(
-        run("integrate", "normals.npy", *options, "-o", "sized", "--pixel-size", 2, "--json").out
-    )
+    sized = json.loads(run("integrate", "normals.npy", *options, "-o", "sized", "--pixel-size", 2, "--json").out)
     assert (sized["unit"], sized["pixel_size_mm"]) == ("millimetre", 2)
     assert sized["range"] == pytest.approx(np.multiply(report["range"], 200 * 2), rel=1e-6)
 
@@ -216,9 +212,7 @@ def test_a_decimated_mesh_and_its_textures(run):
     assert report["files"] == ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "surface.json"]
     [mesh] = trimesh.load("out/mesh.glb").geometry.values()
     assert len(mesh.faces) == report["n_triangles"]
-    assert (
-        mesh.visual.material.normalTexture.size == mesh.visual.material.baseColorTexture.size == SHAPE[::-1]
-    )
+    assert mesh.visual.material.normalTexture.size == mesh.visual.material.baseColorTexture.size == SHAPE[::-1]
     assert (trimesh.load("out/mesh.ply").visual.vertex_colors[:, :3] == (0, 180, 0)).all()
     obj = trimesh.load("out/mesh.obj", process=False)
     assert obj.visual.material.image.getpixel((5, 5))[:3] == (0, 180, 0)

@@ -35,9 +35,7 @@ __main__.run()
 @pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM"])
 def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path, signal: str) -> None:
     (tmp_path / "library.py").write_text(LIBRARY.format(signal=signal))
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND], cwd=tmp_path, capture_output=True, text=True, timeout=60
-    )
+    done = subprocess.run([sys.executable, "-c", COMMAND], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (130, "imported\n", "splinecli: interrupted.\n")
 
 
@@ -61,9 +59,7 @@ def test_an_interruption_is_told_once(capfd, monkeypatch):
     """The thread that ends the process after a SIGTERM may come when the command has told of it."""
     from splinecli.cli import main, signals
 
-    monkeypatch.setattr(
-        main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
-    )
+    monkeypatch.setattr(main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130}))
     try:
         assert main.main([]) == signals.report_interruption() == 130
     finally:

@@ -131,9 +131,7 @@ def test_an_unfinished_folder_is_computed_again(capture, run, name):
     assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
     assert elsewhere in (None, Path("elsewhere").read_bytes() if elsewhere else b"")
     report = read_report(Path("out/sphere"))
-    sizes = {
-        path.name: path.stat().st_size for path in Path("out/sphere").iterdir() if path.suffix != ".json"
-    }
+    sizes = {path.name: path.stat().st_size for path in Path("out/sphere").iterdir() if path.suffix != ".json"}
     assert report["file_sizes"] == sizes
     assert "already done, skipped" in run(*call).err
 

@@ -42,9 +42,7 @@ def test_evaluate(run, rough: np.ndarray) -> None:
     """Both protocols share a folder: trials with refined lights are other trials."""
     errors = []
     for more in ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3")):
-        result = run(
-            "evaluate", "bump", "--method", "ls", "--n-lights", "all", "--json", "-o", "scores", *more
-        )
+        result = run("evaluate", "bump", "--method", "ls", "--n-lights", "all", "--json", "-o", "scores", *more)
         assert result.code == 0, result.err
         document = json.loads(result.out)
         errors.append(document["results"][0]["mae_deg"])

@@ -25,9 +25,7 @@ def small_runs(tmp_path, monkeypatch):
     from splinecli.networks.config import NetworkConfig
     from splinecli.training import config, tasks
 
-    tiny = config.TrainingConfig(
-        network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16
-    )
+    tiny = config.TrainingConfig(network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8), batch_size=16)
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
     monkeypatch.chdir(tmp_path)
@@ -99,9 +97,7 @@ def test_a_run_on_pixel_sets(run, make_capture):
     assert values["sources"] == {str(Path("set").absolute()): 1.0, str(Path("more/set").absolute()): 1.0}
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
-    (report,) = json.loads(
-        run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out
-    )
+    (report,) = json.loads(run("infer", make_capture("sphere"), "--weights", "run/weights.safetensors", "--json").out)
     assert report["angular_error_deg"]["mean"] < 10
     # First from the same folder, then from another.
     assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet").code == 0

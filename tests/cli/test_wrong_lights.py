@@ -60,9 +60,7 @@ def test_strict_writes_nothing_and_ends_with_3(run, medallion):
     ],
     ids=["shifted", "reversed", "exchanged"],
 )
-def test_orders_are_named_although_the_intensities_are_unequal_and_unknown(
-    run, medallion, order, words, options
-):
+def test_orders_are_named_although_the_intensities_are_unequal_and_unknown(run, medallion, order, words, options):
     (medallion / "light_intensities.txt").unlink()
     for number in (3, 7, 8):
         path = str(medallion / f"{number:02}.png")
@@ -91,9 +89,8 @@ def test_info_lists_the_readings(run, medallion):
     assert "x and y exchanged  " in wrong.out
     assert "in reversed order, beginning with light" in wrong.out
     assert "advantage: evidence from curl and outline" in wrong.out
-    assert (
-        "splinecli: medallion: an input is probably wrong (light_frame), as the warnings say"
-        in wrong.err.replace(str(medallion), "medallion")
+    assert "splinecli: medallion: an input is probably wrong (light_frame), as the warnings say" in wrong.err.replace(
+        str(medallion), "medallion"
     )
 
 
@@ -116,18 +113,14 @@ def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     assert few.code == 0
     (warning,) = json.loads(few.out)[0]["warnings"]
     assert warning["code"] == "lights_unchecked"
-    assert warning["text"].endswith(
-        "their order (fewer than 6 lights, too few lit pixels, or a flat object)."
-    )
+    assert warning["text"].endswith("their order (fewer than 6 lights, too few lit pixels, or a flat object).")
     mask = np.zeros((128, 128), np.uint8)
     mask[40:90, 40:90] = 255
     cv2.imwrite(str(medallion / "mask.png"), mask)
     write_lights(medallion, lambda lights: lights * (-1, -1, 1))
     relief = run("info", medallion, "--strict")
     assert relief.code == 0
-    assert (
-        "could not be checked of the lights of light_directions.txt: whether x and y are both" in relief.err
-    )
+    assert "could not be checked of the lights of light_directions.txt: whether x and y are both" in relief.err
 
 
 def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):

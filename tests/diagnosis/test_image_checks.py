@@ -48,9 +48,7 @@ def test_the_spread_of_lights() -> None:
     ring /= np.sqrt(2)
     # x and y have a mean square of 1/4, z of 1/2.
     assert light_spread(ring)[0] == pytest.approx(0.5)
-    arc = np.array(
-        [(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))]
-    )
+    arc = np.array([(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))])
     assert light_spread(arc)[0] == pytest.approx(0.02, abs=1e-3)
     assert not light_spread(arc)[1]
     cone = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), 1) for a in np.linspace(0, 6, 9)])

@@ -16,9 +16,7 @@ def images(*, texture: float, seed: int = 0) -> np.ndarray:
     """Images (H, W, F) of a matte dome with bumps and a painted pattern, under lights on a ring, with noise."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[1 : -1 : SIDE * 1j, -1 : 1 : SIDE * 1j]
-    normals = np.stack(
-        (0.6 * x + 0.2 * np.sin(17 * y), 0.6 * y + 0.2 * np.cos(13 * x), np.ones_like(x)), axis=-1
-    )
+    normals = np.stack((0.6 * x + 0.2 * np.sin(17 * y), 0.6 * y + 0.2 * np.cos(13 * x), np.ones_like(x)), axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     albedo = 0.6 + texture * rng.uniform(-1, 1, (SIDE, SIDE))
     azimuth = 2 * np.pi * np.arange(N_LIGHTS) / N_LIGHTS

@@ -37,9 +37,7 @@ def vase() -> tuple[Array, NDArray[np.bool_]]:
     x = -x
     u, v = 0.8 * x + 0.5 * y, 1.1 * y - 0.3 * x
     inside = u**2 + 1.6 * v**2 < 0.97
-    z = np.sqrt(np.maximum(1 - u**2 - 1.6 * v**2, 0.03)) - 0.12 * np.exp(
-        -((x - 0.2) ** 2 + (y - 0.1) ** 2) / 0.05
-    )
+    z = np.sqrt(np.maximum(1 - u**2 - 1.6 * v**2, 0.03)) - 0.12 * np.exp(-((x - 0.2) ** 2 + (y - 0.1) ** 2) / 0.05)
     z_row, z_x = np.gradient(z, 2 / (SIZE - 1))
     normals = np.stack((-z_x, z_row, np.ones_like(z)), axis=2)
     return (normals / np.linalg.norm(normals, axis=2, keepdims=True))[inside], inside
@@ -187,9 +185,7 @@ def test_refused_frames(text: str) -> None:
         parse_light_frame(text)
 
 
-@pytest.mark.parametrize(
-    "name", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse"]
-)
+@pytest.mark.parametrize("name", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse"])
 def test_real_captures(shared_data: Path, name: str) -> None:
     chosen = None if "uw" in name else list(range(3, 96, 7))
     capture = read_capture(shared_data / name, light_indices=chosen)

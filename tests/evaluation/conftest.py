@@ -25,9 +25,7 @@ def dome_normals() -> NDArray[np.float64]:
 def write_dome(tmp_path: Path) -> Callable[..., Path]:
     """Write a capture folder below tmp_path: 16-bit images, mask, lights, and ground truth by default."""
 
-    def write(
-        name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0
-    ) -> Path:
+    def write(name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0) -> Path:
         lights, normals = spiral_lights(n_lights, 40, 15), dome_normals()
         photographs = np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)).astype(np.uint16)
         mask = np.pad(np.ones((SIZE - 2, SIZE - 2), bool), 1)

@@ -28,9 +28,7 @@ class Page(HtmlPage):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def evaluation_of(
-    methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10
-) -> Evaluation:
+def evaluation_of(methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10) -> Evaluation:
     generator = np.random.default_rng(3)
     return Evaluation(
         Protocol(n_lights, trials, seed=7, max_pixels=500),
@@ -44,9 +42,7 @@ def evaluation_of(
 
 
 def test_one_evaluation() -> None:
-    page = Page(
-        html_report([evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."])
-    )
+    page = Page(html_report([evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."]))
     assert page.text["h1"] == ["Photometric stereo: 2 methods on 2 captures"]
     protocol = dict(zip(page.text["dt"], page.text["dd"], strict=True))
     assert protocol == {

@@ -204,9 +204,7 @@ def test_progress(write_dome: WriteDome) -> None:
     assert done == sorted(done)
     assert done[-1] == 6
     notes = [note for _, _, note in seen]
-    assert [note for note in notes if "reading b" in note] == [
-        f"reading b, image {i} of 8" for i in range(1, 9)
-    ]
+    assert [note for note in notes if "reading b" in note] == [f"reading b, image {i} of 8" for i in range(1, 9)]
     assert notes[-1] == "trial 6 of 6"
 
 
@@ -217,12 +215,8 @@ def test_trials_at_a_time_change_nothing(write_dome: WriteDome) -> None:
     one_by_one = evaluate_all(folders, estimators, protocols)
     together = evaluate_all(folders, estimators, protocols, jobs=3)
     for before, after in zip(one_by_one, together, strict=True):
-        assert [(r.method, r.capture) for r in before.results] == [
-            (r.method, r.capture) for r in after.results
-        ]
-        np.testing.assert_allclose(
-            [r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5
-        )
+        assert [(r.method, r.capture) for r in before.results] == [(r.method, r.capture) for r in after.results]
+        np.testing.assert_allclose([r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5)
 
 
 def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> None:
@@ -246,9 +240,7 @@ def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> 
     assert len(path.read_text().splitlines()) == 4
 
 
-@pytest.mark.parametrize(
-    "change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw", "reading"]
-)
+@pytest.mark.parametrize("change", ["photograph", "lights", "seed", "pixels", "noise", "method", "draw", "reading"])
 def test_a_trial_of_something_else_does_not_count(write_dome: WriteDome, tmp_path: Path, change: str) -> None:
     folder, path = write_dome(), tmp_path / "trials.jsonl"
     settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
@@ -313,9 +305,7 @@ def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     every = Fake(folders[0])
     evaluate(folders, [every], Protocol(skip_first={"*": 4, "other": 1}))
     assert [len(lights) for lights in every.lights] == [4, 7]
-    with pytest.raises(
-        UsageError, match="no capture named 'cow' to skip images of; there are bearPNG, other"
-    ):
+    with pytest.raises(UsageError, match="no capture named 'cow' to skip images of; there are bearPNG, other"):
         evaluate(folders, [fake], Protocol(skip_first={"cow": 1}))
 
 

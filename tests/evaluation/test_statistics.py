@@ -52,16 +52,12 @@ def test_holm_by_hand() -> None:
 def test_every_pair_on_every_capture_and_on_their_average() -> None:
     generator = np.random.default_rng(1)
     draws = {
-        capture: {
-            method: tuple(generator.normal(mean, 0.5, 8)) for method, mean in (("a", 5), ("b", 6), ("c", 5.2))
-        }
+        capture: {method: tuple(generator.normal(mean, 0.5, 8)) for method, mean in (("a", 5), ("b", 6), ("c", 5.2))}
         for capture in ("ball", "cat", "cow")
     }
     comparisons = compare(evaluation_of(**draws))
     assert [(c.capture, c.first, c.second) for c in comparisons] == [
-        (capture, *pair)
-        for capture in ("ball", "cat", "cow", AVERAGE)
-        for pair in (("a", "b"), ("a", "c"), ("b", "c"))
+        (capture, *pair) for capture in ("ball", "cat", "cow", AVERAGE) for pair in (("a", "b"), ("a", "c"), ("b", "c"))
     ]
     for c in comparisons:
         captures = draws.values() if c.capture == AVERAGE else [draws[c.capture]]

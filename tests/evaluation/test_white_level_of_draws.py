@@ -28,9 +28,7 @@ def folder(tmp_path: Path) -> Path:
     rng = np.random.default_rng(3)
     albedo = rng.uniform(0.6, 1, (SIDE, SIDE, 1))
     intensities = np.where(np.arange(N_LIGHTS) < CLIPPED, 1.6, 0.5)
-    values = (
-        intensities * LEVEL * albedo * shade(normals, lights) * rng.normal(1, 0.01, (SIDE, SIDE, N_LIGHTS))
-    )
+    values = intensities * LEVEL * albedo * shade(normals, lights) * rng.normal(1, 0.01, (SIDE, SIDE, N_LIGHTS))
     images = np.moveaxis(np.minimum(np.rint(values), LEVEL).astype(np.uint16), 2, 0)
     assert ((images == LEVEL).any(axis=(1, 2)) == (np.arange(N_LIGHTS) < CLIPPED)).all()
     colours = np.repeat(intensities[:, None], 3, axis=1)

@@ -131,11 +131,7 @@ class KilledCommand:
         self._run_again()
         after = self._state(self.case)
         if self.replacement.target == "normals":  # the lost report named the earlier files that were to go
-            after = {
-                name: value
-                for name, value in after.items()
-                if name in self.new or value != self.old.get(name)
-            }
+            after = {name: value for name, value in after.items() if name in self.new or value != self.old.get(name)}
         if after != self.new:
             yield "the next run ends with other files"
 
@@ -171,9 +167,7 @@ class KilledCommand:
 
     def _problems(self, state: dict[str, bytes]) -> Iterator[str]:
         """Yield what is wrong with the files after a kill."""
-        if self.replacement.folder == "out/set" and b'"complete": false' in state.get(
-            "set/manifest.json", b""
-        ):
+        if self.replacement.folder == "out/set" and b'"complete": false' in state.get("set/manifest.json", b""):
             return  # a pixel set says itself that it is not finished
         for name, value in state.items():
             if value not in (self.old.get(name), self.new.get(name)):
@@ -210,9 +204,7 @@ class KilledCommand:
     def _state(self, folder: Path) -> dict[str, bytes]:
         """Return the content of the output by name, without what differs from run to run: the log has minutes."""
         files = content(folder / "out").items()
-        return {
-            name: _without_measurements(name, value) for name, value in files if name != "run/metrics.csv"
-        }
+        return {name: _without_measurements(name, value) for name, value in files if name != "run/metrics.csv"}
 
 
 def _without_measurements(name: str, value: bytes) -> bytes:
@@ -244,12 +236,8 @@ def _print_problems(what: str, problems: Iterable[str]) -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--kills", type=int, default=200, help="kills at random times, beside those at every step"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200, help="kills at random times, beside those at every step")
     parser.add_argument("--steps", type=int, help="kill at so many of the steps only, evenly chosen")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--command", action="append", choices=REPLACEMENTS)
@@ -262,9 +250,7 @@ def main() -> int:
             command = KilledCommand(name, Path(work))
             failures += _print_problems(name, command.missing_syncs())
             total = command.count_steps()
-            steps = sorted(
-                {int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))}
-            )
+            steps = sorted({int(step) for step in np.linspace(0, total - 1, min(total, options.steps or total))})
             for step in steps:
                 failures += _print_problems(f"{name}, step {step}", command.kill(step=step))
             for _ in range(options.kills // len(names)):

@@ -54,11 +54,7 @@ def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
         elif not place.name.startswith("."):
             if kind == "rename" and path not in synced:
                 yield f"{place.name} is renamed before its content is on the disk"
-            unsynced = (
-                changed.values()
-                if place.name == report
-                else [n for n in changed.values() if n.name == report]
-            )
+            unsynced = changed.values() if place.name == report else [n for n in changed.values() if n.name == report]
             for name in unsynced:
                 yield f"{place.name} changes before {name.name} is on the disk"
             changed[place.parent] = place

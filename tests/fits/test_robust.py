@@ -17,9 +17,7 @@ ROBUST = ("iw12", "l1", "ls-trimmed")
 Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
-def estimate(
-    name: str, observations: NDArray[np.floating], lights: NDArray[np.float64]
-) -> NDArray[np.floating]:
+def estimate(name: str, observations: NDArray[np.floating], lights: NDArray[np.float64]) -> NDArray[np.floating]:
     return make_estimator(name, MethodOptions(device="cpu")).estimate(observations.astype(np.float32), lights)
 
 

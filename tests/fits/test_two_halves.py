@@ -48,9 +48,7 @@ def test_noise_is_as_large_as_the_random_errors(count: int, square: bool) -> Non
     lights = torch.tensor(ring if square else spiral_lights(count, 55))
     truth, observations = noisy_pixels(lights, 0.01)
     found = compare_halves(observations, lights, alternating_signs(lights))
-    noise, error = (
-        values.square().sum(dim=1).mean().sqrt() for values in (found.noise, found.normals - truth)
-    )
+    noise, error = (values.square().sum(dim=1).mean().sqrt() for values in (found.noise, found.normals - truth))
     assert noise == pytest.approx(float(error), rel=0.07)  # means of 2,000 squares
 
 
@@ -78,8 +76,7 @@ def test_it_turns_with_the_lights() -> None:
     _, observations = noisy_pixels(LIGHTS, 0.01)
     turn = torch.tensor(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), dtype=torch.float64)
     found, turned = (
-        compare_halves(observations, lights, alternating_signs(lights))
-        for lights in (LIGHTS, LIGHTS @ turn.T)
+        compare_halves(observations, lights, alternating_signs(lights)) for lights in (LIGHTS, LIGHTS @ turn.T)
     )
     torch.testing.assert_close(turned.normals, found.normals @ turn.T)
     torch.testing.assert_close(turned.change, found.change @ turn.T)

@@ -108,9 +108,7 @@ def light_files(folder: Path) -> None:
     for number, light in enumerate(LIGHTS):
         cv2.imwrite(str(folder / f"{number}.png"), shaded(light))
     azimuth = np.degrees(np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0]))
-    np.savetxt(
-        folder / "azel.txt", np.stack((azimuth, np.degrees(np.arcsin(LIGHTS[:, 2]))), axis=1), fmt="%.3f"
-    )
+    np.savetxt(folder / "azel.txt", np.stack((azimuth, np.degrees(np.arcsin(LIGHTS[:, 2]))), axis=1), fmt="%.3f")
     np.save(folder / "vectors.npy", LIGHTS)
     rows = [" ".join(f"{value:.6f}" for value in light) for light in LIGHTS]
     (folder / "utf16.txt").write_text("x y z\n" + "\n".join(rows), "utf-16")

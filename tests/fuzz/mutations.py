@@ -182,8 +182,7 @@ def _bomb(suffix: str) -> bytes:
         )
         chunks = (kind + content for kind, content in parts)
         return b"\x89PNG\r\n\x1a\n" + b"".join(
-            struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-            for chunk in chunks
+            struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
         )
     buffer = io.BytesIO()
     if suffix == ".mat":
@@ -252,9 +251,7 @@ def npy_header(data: bytes, rng: random.Random) -> bytes:
         )
         header = re.sub(r"'shape': \([^)]*\)", f"'shape': {shape}", header)
     else:
-        kind = rng.choice(
-            ("|O", "<U9", "<c16", "|b1", ">f2", "<f16", "|V8", "<M8[s]", "|S99999999", "<i8", "<u1", "x")
-        )
+        kind = rng.choice(("|O", "<U9", "<c16", "|b1", ">f2", "<f16", "|V8", "<M8[s]", "|S99999999", "<i8", "<u1", "x"))
         header = re.sub(r"'descr': '[^']*'", f"'descr': '{kind}'", header)
     text = header.encode("latin-1")
     return data[:8] + struct.pack("<H", len(text)) + text + data[end:]
@@ -280,9 +277,7 @@ def _tag(data: bytes, rng: random.Random) -> bytes:
     if rng.random() < 0.7:
         curve = data.find(rng.choice((b"para", b"curv")))
         place = max(curve, 0) + 4 * rng.randrange(9)
-    word = rng.choice(
-        (b"para", b"curv", *(struct.pack(">i", n) for n in (0, 1, 3 << 16, 4, -1, -(2**31), 2**31 - 1)))
-    )
+    word = rng.choice((b"para", b"curv", *(struct.pack(">i", n) for n in (0, 1, 3 << 16, 4, -1, -(2**31), 2**31 - 1))))
     return data[:place] + word + data[place + 4 :]
 
 

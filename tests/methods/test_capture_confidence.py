@@ -48,9 +48,7 @@ def relief(lights: Doubles, *, widths: float | None = None) -> Capture:
     noise = 1 + 0.002 * np.random.default_rng(2).normal(size=shading.shape)
     observations = (albedo * shading.clip(min=0) * noise).clip(min=0).astype(np.float32)
     truth = normals.reshape(SIZE, SIZE, 3).astype(np.float32)
-    return Capture(
-        "relief", observations, lights, tuple(range(len(lights))), np.ones((SIZE, SIZE), np.bool_), truth
-    )
+    return Capture("relief", observations, lights, tuple(range(len(lights))), np.ones((SIZE, SIZE), np.bool_), truth)
 
 
 def encoded(capture: Capture) -> Capture:

@@ -66,11 +66,7 @@ def log_median(degrees: float) -> tuple[float, float]:
 
 def noisy(normals: Floats, degrees: float, seed: int = 5) -> Floats:
     """Return normals turned by about so many degrees."""
-    noise = (
-        np.random.default_rng(seed).normal(size=normals.shape)
-        * math.radians(degrees)
-        / math.sqrt(math.pi / 2)
-    )
+    noise = np.random.default_rng(seed).normal(size=normals.shape) * math.radians(degrees) / math.sqrt(math.pi / 2)
     return unit(normals + noise - normals * (normals * noise).sum(axis=1, keepdims=True))
 
 

@@ -105,9 +105,7 @@ def test_a_dark_background_changes_nothing() -> None:
     place[320:384, 320:384] = MASK
     normals[place], observations[place] = BOWL, direct + indirect
     normals, observations = normals[mask], observations[mask]
-    found = find_indirect_light(
-        mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals
-    )
+    found = find_indirect_light(mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), normals)
     assert alone is not None
     assert found is not None
     ratio = found.at(np.flatnonzero(place)) / alone.at(EVERYWHERE)
@@ -178,9 +176,7 @@ def test_the_refinement_sees_what_is_left() -> None:
 
         return nullcontext(count)
 
-    def refine(
-        _: NetworkRefiner, __: object, ___: object, light_of: LightOf, *____: object, **_____: object
-    ) -> None:
+    def refine(_: NetworkRefiner, __: object, ___: object, light_of: LightOf, *____: object, **_____: object) -> None:
         seen.append(light_of(EVERYWHERE).observations)
 
     seen: list[Floats] = []

@@ -25,6 +25,4 @@ def test_solves_the_normal_equations() -> None:
     directions = spiral_lights(10)
     estimate = LeastSquares().estimate(observations, directions)
     expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T
-    np.testing.assert_allclose(
-        estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12
-    )
+    np.testing.assert_allclose(estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12)

@@ -135,8 +135,6 @@ def test_the_python_door_takes_positions() -> None:
     capture = near("dome", 4.0)
     images = np.zeros((10, SIDE, SIDE), np.float32)
     images[:, capture.mask] = capture.observations.T
-    estimate = splinecli.estimate_normals(
-        images, LIGHTS * 4.0, capture.mask, pixel_size=2 / SIDE, method="iw12"
-    )
+    estimate = splinecli.estimate_normals(images, LIGHTS * 4.0, capture.mask, pixel_size=2 / SIDE, method="iw12")
     expected = estimate_normals(capture, make_estimator("iw12"))
     np.testing.assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)

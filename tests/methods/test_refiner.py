@@ -131,9 +131,7 @@ def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -
             return LampLight(observations[rows], LIGHTS, turns[rows] if turned else None)
 
         found, errors = normals.copy(), np.tile(np.float32((-3, 1)), (900, 1))
-        NetworkRefiner(net, "float32").refine(
-            np.ones((30, 30), np.bool_), observations, light_of, found, errors
-        )
+        NetworkRefiner(net, "float32").refine(np.ones((30, 30), np.bool_), observations, light_of, found, errors)
         return found
 
     at_once = refined(True)

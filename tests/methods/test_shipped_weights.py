@@ -49,9 +49,7 @@ def test_file(name):
 def test_glossy_pixels_under_any_number_of_lights(n_lights):
     """Far better than least squares where highlights mislead it; three lights only have to give unit normals."""
     normals, lights, observations = glossy_pixels(n_lights)
-    estimated = make_estimator("spline-net", MethodOptions(precision="float32")).estimate(
-        observations, lights
-    )
+    estimated = make_estimator("spline-net", MethodOptions(precision="float32")).estimate(observations, lights)
     np.testing.assert_allclose(np.linalg.norm(estimated, axis=1), 1, atol=1e-5)
     if n_lights >= 8:
         least_squares = make_estimator("ls").estimate(observations, lights)
@@ -71,9 +69,7 @@ def test_confidence_on_generated_pixels():
     config = PixelGeneratorConfig(min_lights=10, usual_lights=10, max_lights=10)
     batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(3000)
     with torch.inference_mode():
-        normals, error = resolve_weights("spline-net").network(
-            batch.observations, batch.light_directions, batch.valid
-        )
+        normals, error = resolve_weights("spline-net").network(batch.observations, batch.light_directions, batch.valid)
     assert error is not None
     error_deg = angle_between_deg(normals.numpy(), batch.truth.normals.numpy())
     confidence = probability_within(error, CONFIDENT_DEG).numpy()

@@ -25,23 +25,17 @@ GROOVES = normalize(torch.stack((-SLOPE, torch.zeros_like(SLOPE), torch.ones_lik
 """True normals of grooves of one pixel."""
 
 
-def photographed(
-    truth: Tensor, noise: float, lights: Tensor = LIGHTS, *, seen: Tensor | None = None
-) -> Tensor:
+def photographed(truth: Tensor, noise: float, lights: Tensor = LIGHTS, *, seen: Tensor | None = None) -> Tensor:
     """Features (CHANNELS, SIDE, SIDE) of a matte surface, where SPLINE-Net has seen the normals `seen` (the truth)."""
     generator = torch.Generator().manual_seed(4)
     errors = noise * torch.randn(SIDE**2, len(lights), generator=generator)
     observations = (truth.flatten(1).T @ lights.T + errors).clamp(min=0)
     normals = (truth if seen is None else seen).flatten(1).T
-    features = refine_features(
-        observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, alternating_signs(lights)
-    )
+    features = refine_features(observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, alternating_signs(lights))
     return features.T.reshape(CHANNELS, SIDE, SIDE)
 
 
-@pytest.mark.parametrize(
-    ("noise", "least", "most"), [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)]
-)
+@pytest.mark.parametrize(("noise", "least", "most"), [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)])
 def test_grooves_come_back_where_they_exceed_the_noise(noise: float, least: float, most: float) -> None:
     """All of x comes back. Its share of the unit vector is smaller by the cosine, because z is no detail."""
     found = restore_detail(FLAT, photographed(GROOVES, noise), EVERYWHERE)
@@ -69,9 +63,7 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
     assert (found - truth).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
 
-@pytest.mark.parametrize(
-    ("noise", "least", "most"), [(0.05, 0.85, 1.01), (0.1, 0.1, 0.4), (0.15, -0.01, 0.05)]
-)
+@pytest.mark.parametrize(("noise", "least", "most"), [(0.05, 0.85, 1.01), (0.1, 0.1, 0.4), (0.15, -0.01, 0.05)])
 def test_the_more_noise_the_less_comes_back(noise: float, least: float, most: float) -> None:
     """The noise has 9, 27 and 45 % of the energy of what is missing here."""
     noisy = photographed(GROOVES, noise)

@@ -188,14 +188,10 @@ def test_files_of_old_and_without_statistics(
     old = tmp_path / "old-G.ckpt", tmp_path / "old-D.ckpt"
     for network, path in zip(authors, old, strict=True):
         state = {
-            name: tensor
-            for name, tensor in network.state_dict().items()
-            if not name.endswith("num_batches_tracked")
+            name: tensor for name, tensor in network.state_dict().items() if not name.endswith("num_batches_tracked")
         }
         torch.save(state, path, _use_new_zipfile_serialization=False)
-    tracked = dict.fromkeys(
-        name for name in authors[0].state_dict() if "running" in name or "num_batches" in name
-    )
+    tracked = dict.fromkeys(name for name in authors[0].state_dict() if "running" in name or "num_batches" in name)
     assert len(tracked) == 3 * 17
     for paths in (old, changed(tracked)):
         for ours, again in zip(

@@ -45,9 +45,7 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     lights = torch.nn.functional.normalize(
         torch.randn(8, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
     )
-    normals = (
-        torch.randn(3, HEIGHT, WIDTH, generator=generator) + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
-    )
+    normals = torch.randn(3, HEIGHT, WIDTH, generator=generator) + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
     normals = torch.nn.functional.normalize(normals, dim=0)
     error = torch.randn(2, HEIGHT, WIDTH, generator=generator)
     shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)

@@ -58,9 +58,7 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
 ) -> None:
     observations, lights = pixels
     network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)).double()
-    expected = torch.nn.functional.normalize(
-        fit_lambertian(observations / map_scale(observations), lights), dim=1
-    )
+    expected = torch.nn.functional.normalize(fit_lambertian(observations / map_scale(observations), lights), dim=1)
     visible = expected[:, 2] > 0.05
     assert visible.sum() > 50
     with torch.no_grad():
@@ -125,9 +123,7 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
 def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
     observations, lights = pixels
     network = random_network().double()
-    views = network.build_maps(
-        observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror)
-    )
+    views = network.build_maps(observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror))
     vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
     torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
     # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or not.

@@ -27,9 +27,7 @@ def pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_they_are_the_methods_of_these_names(name: str) -> None:
     observations, directions = pixels(20, 12)
     shared = directions[0]
-    expected = make_estimator(name, MethodOptions(device="cpu")).estimate(
-        observations.numpy(), shared.double().numpy()
-    )
+    expected = make_estimator(name, MethodOptions(device="cpu")).estimate(observations.numpy(), shared.double().numpy())
     found = fit_normals([name], observations, shared)[:, 0]
     torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
 

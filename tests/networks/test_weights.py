@@ -179,9 +179,7 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
 def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights, "SHIPPED", saved.parent)
     entry = {"file": saved.name, "sha256": hashlib.sha256(saved.read_bytes()).hexdigest()}
-    (saved.parent / "weights.json").write_text(
-        json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}})
-    )
+    (saved.parent / "weights.json").write_text(json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}}))
     assert resolve_weights("good").name == "good"
     assert resolve_weights(str(saved)).name == "tiny"
     with pytest.raises(ModelError, match="the shipped weights 'bad' were changed"):

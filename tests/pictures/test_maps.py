@@ -88,9 +88,7 @@ def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int], top_deg: float) 
     bar = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     assert len(bar) > 200
     assert bar.shape[1] >= 18
-    np.testing.assert_array_equal(
-        bar[:, 0], colour_errors(np.linspace(top_deg, 0, len(bar))[:, None], top_deg)[:, 0]
-    )
+    np.testing.assert_array_equal(bar[:, 0], colour_errors(np.linspace(top_deg, 0, len(bar))[:, None], top_deg)[:, 0])
     # Text: black ink right of the bar, and none cut at the picture's edges.
     right = picture[:, columns[-1] + 1 :]
     assert (right < 64).all(axis=2).sum() > 200

@@ -29,9 +29,7 @@ def draw(
     estimate[mask] = unit(np.array([1.0, 0.0, 1.0]))
     errors = np.where(mask, np.float32(error_deg), np.float32(np.nan))
     return decode(
-        method_maps(
-            truth, mask, dict.fromkeys(methods, estimate), dict.fromkeys(methods, errors), title=title
-        )
+        method_maps(truth, mask, dict.fromkeys(methods, estimate), dict.fromkeys(methods, errors), title=title)
     )
 
 
@@ -58,9 +56,7 @@ def test_colours_stand_where_they_belong(height: int, width: int, n_methods: int
     assert len(normals) == len(errors) == n_methods
     # Cut to the mask's box and enlarged by a whole factor, all alike.
     factor = truth[2] // (height - 4)
-    assert {place[2:] for place in (truth, *normals, *errors)} == {
-        (factor * (height - 4), factor * (width - 4))
-    }
+    assert {place[2:] for place in (truth, *normals, *errors)} == {(factor * (height - 4), factor * (width - 4))}
     # One row of normals, ground truth first; each method's errors below its normals.
     assert {place[0] for place in normals} == {truth[0]}
     assert truth[1] < normals[0][1]

@@ -27,9 +27,7 @@ def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
-@pytest.mark.parametrize(
-    "text", ["", "1", "0/3", "4/3", "1/0", "-1/3", "a/b", "1/3/5", "1.0/3", "9" * 30 + "/1"]
-)
+@pytest.mark.parametrize("text", ["", "1", "0/3", "4/3", "1/0", "-1/3", "a/b", "1/3/5", "1.0/3", "9" * 30 + "/1"])
 def test_other_shards_are_refused(text):
     with pytest.raises(UsageError, match="--shard is"):
         Shard.parse(text)

@@ -99,9 +99,7 @@ def test_a_task_for_no_worker(client, work):
         results = run(client, work(worker_tasks.double), [*numbered(range(2), GB), Item((2,), "big", 5 * GB)])
     finally:
         client.run(worker_tasks.set_resources, MEMORY=1000 * GB)
-    assert str(results.pop(2)).startswith(
-        "big: it takes about 5.0 GB of memory, but the largest worker has 4.0 GB."
-    )
+    assert str(results.pop(2)).startswith("big: it takes about 5.0 GB of memory, but the largest worker has 4.0 GB.")
     assert results == {0: 0, 1: 2}
 
 
@@ -171,10 +169,7 @@ def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, 
     together = documents("-o", "out", "--cluster", cluster.scheduler_address)
     assert comparable(together) == comparable(alone)
     assert results_in("out") == expected
-    rows = [
-        re.findall(r'<th scope="row">.*', Path(f"{place}/index.html").read_text())
-        for place in ("out", "alone")
-    ]
+    rows = [re.findall(r'<th scope="row">.*', Path(f"{place}/index.html").read_text()) for place in ("out", "alone")]
     assert rows[0] == rows[1] and len(rows[0]) == len(names)
     assert sorted(path.name for path in Path("out").iterdir()) == ["a", "b", "c", "d", "index.html"]
     # What is done is skipped: the reports have the seconds of the first run.

@@ -188,9 +188,7 @@ def test_a_manifest_of_something_else_is_left_alone(tmp_path: Path) -> None:
 
 def test_an_unfinished_set_is_refused(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    with pytest.raises(
-        InputError, match=r"not finished\. Run the same 'splinecli prepare' again to finish it\."
-    ):
+    with pytest.raises(InputError, match=r"not finished\. Run the same 'splinecli prepare' again to finish it\."):
         open_pixel_set(tmp_path)
     with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
         PixelSetWriter(tmp_path / "empty").finish()

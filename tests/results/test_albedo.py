@@ -14,9 +14,7 @@ from splinecli.capture import open_capture
 from splinecli.results.albedo import albedo_map
 
 SIZE = 40
-INTENSITIES = np.array(
-    [(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)]
-)
+INTENSITIES = np.array([(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)])
 LIGHTS = np.array([(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)])
 
 

@@ -119,9 +119,7 @@ def test_names_are_text() -> None:
 
 def test_the_normals_survive() -> None:
     random = np.random.default_rng(0)
-    normals = unit(random.normal(size=(70, 90, 3))).astype(
-        np.float32
-    )  # all round, those seen from behind, too
+    normals = unit(random.normal(size=(70, 90, 3))).astype(np.float32)  # all round, those seen from behind, too
     mask = random.random((70, 90)) < 0.8
     decoded = Page(result_page(REPORT, normals * mask[..., None], mask)).normals()
     assert (decoded.any(axis=2) == mask).all()
@@ -164,9 +162,7 @@ async (fragment) => {
 """
 
 
-def views(
-    open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bool = True
-) -> list[NDArray[np.int64]]:
+def views(open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bool = True) -> list[NDArray[np.int64]]:
     """Screenshots of the view, (SIDE, SIDE, 3) RGB, one screen pixel for each pixel of the map."""
     # At the window's edge the view would be under the place where a headless browser's pointer rests.
     edge = 64
@@ -176,9 +172,7 @@ def views(
     )
     page = open_page(html.replace("</head>", f"<style>{style}</style></head>"), fragments[0], webgl=webgl)
     page.evaluate("splinecli.ready")
-    assert page.evaluate("document.getElementById('view').dataset.renderer") == (
-        "webgl" if webgl else "software"
-    )
+    assert page.evaluate("document.getElementById('view').dataset.renderer") == ("webgl" if webgl else "software")
     seen = []
     for fragment in fragments:
         if fragment != fragments[0]:
@@ -207,24 +201,16 @@ def test_a_matte_sphere_is_lit_by_the_cosine(open_page: OpenPage, webgl: bool) -
 def test_a_glossy_sphere_of_two_colours(open_page: OpenPage) -> None:
     """The view shows Blinn and Phong's normalised lobe, and the albedo as its picture stores it."""
     normals, mask = ball()
-    albedo = np.where(
-        np.arange(SIDE)[:, None] < 100, np.float32([0.8, 0.2, 0.1]), np.float32([0.1, 0.3, 0.5])
-    )
+    albedo = np.where(np.arange(SIDE)[:, None] < 100, np.float32([0.8, 0.2, 0.1]), np.float32([0.1, 0.3, 0.5]))
     albedo = albedo[:, None].repeat(SIDE, 1).reshape(SIDE, SIDE, 3) * mask[..., None]
     gain, shininess, light = 0.2, 64, light_at(-0.5, 0.4)
     cosine = np.maximum(normals @ light, 0)[..., None]
-    lobe = (
-        (shininess + 8)
-        / 8
-        * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
-    )
+    lobe = (shininess + 8) / 8 * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
     stored = decode_transfer(albedo_picture(albedo, mask).astype(np.float32) / 255, None)
 
     html = result_page(REPORT, normals, mask, albedo=albedo)
     fragment = f"light=-0.5,0.4&specular={gain}&shininess={shininess}"
-    for base, seen in zip(
-        (stored, 1), views(open_page, html, [fragment, f"{fragment}&albedo=0"]), strict=True
-    ):
+    for base, seen in zip((stored, 1), views(open_page, html, [fragment, f"{fragment}&albedo=0"]), strict=True):
         expected = encode_srgb(((1 - gain) * base + gain * lobe) * cosine)
         assert np.abs(seen - expected).max() <= 3
 

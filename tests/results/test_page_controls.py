@@ -28,9 +28,7 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
     errors = np.where(mask, np.float32(3), np.nan)
     confidence = mask.astype(np.float32)
-    html = result_page(
-        report, normals, mask, albedo=normals + 1, confidence_map=confidence, error_map_deg=errors
-    )
+    html = result_page(report, normals, mask, albedo=normals + 1, confidence_map=confidence, error_map_deg=errors)
     page = open_page(html, width=400, height=800, webgl=webgl)
     page.evaluate("splinecli.ready")
     canvas = page.locator("#view")

@@ -49,12 +49,8 @@ def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):
 
 def test_the_report_fits_a_narrow_screen(open_page: OpenPage):
     png = cv2.imencode(".png", np.repeat(RED, 50, axis=1))[1].tobytes()
-    results = tuple(
-        Result(m, c, 10, (5.0, 5.5, 6.0), 0.1) for m in ("ls", "iw12") for c in ("x" * 60, "y" * 60)
-    )
-    page = open_page(
-        html_report([Evaluation(Protocol(10, 3), results, ())], [("figure", png)], []), width=400
-    )
+    results = tuple(Result(m, c, 10, (5.0, 5.5, 6.0), 0.1) for m in ("ls", "iw12") for c in ("x" * 60, "y" * 60))
+    page = open_page(html_report([Evaluation(Protocol(10, 3), results, ())], [("figure", png)], []), width=400)
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
     assert page.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)") == 400
 

@@ -79,9 +79,7 @@ def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
     assert without.mean() > 10
 
 
-def test_tangents_are_those_that_viewers_compute(
-    decimated: SurfaceMesh, camera: NDArray[np.float64] | None
-) -> None:
+def test_tangents_are_those_that_viewers_compute(decimated: SurfaceMesh, camera: NDArray[np.float64] | None) -> None:
     """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a vertex."""
     corners = decimated.vertices[decimated.triangles].astype(float)
     uvs = decimated.uvs[decimated.triangles].astype(float)

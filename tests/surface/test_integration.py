@@ -158,9 +158,7 @@ def test_perspective_plane() -> None:
     rays = seen(CAMERA, 90, 120)
     normal = unit(np.array([0.3, -0.4, 0.8]))
     depth = geometric_mean_1(-1 / (rays @ normal))
-    found = integrate_normals(
-        np.broadcast_to(normal, rays.shape), np.ones((90, 120), bool), camera_matrix=CAMERA
-    )
+    found = integrate_normals(np.broadcast_to(normal, rays.shape), np.ones((90, 120), bool), camera_matrix=CAMERA)
     # A step of log(depth) is not quite linear in its slope.
     assert error_share(found, depth, np.ones((90, 120), bool)) < 5e-4
     np.testing.assert_allclose(found, depth, rtol=1e-3)
@@ -226,9 +224,7 @@ def dense(normals: Floats, mask: Mask, stiffness: float, iterations: int) -> Flo
             share = 1 / (1 + np.exp(-stiffness * (iteration > 0) * gaps)) - 0.5
             weights.append(0.5 + share * (1 - np.exp(-((np.maximum(*residuals) / CONTRADICTION) ** 2))))
         root = np.sqrt(np.concatenate(weights))
-        heights = np.linalg.lstsq(
-            root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants)
-        )[0]
+        heights = np.linalg.lstsq(root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants))[0]
     return heights
 
 
@@ -360,9 +356,7 @@ def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> No
     """Steep waves whose normals have smooth errors of 8 degrees. The published weights tear 1.4 % of the pairs."""
     x, y = grid(160, 160)
     truth = 20 * np.sin(x / 8) * np.cos(y / 12)
-    normals = normals_of_slopes(
-        2.5 * np.cos(x / 8) * np.cos(y / 12), -20 / 12 * np.sin(x / 8) * np.sin(y / 12)
-    )
+    normals = normals_of_slopes(2.5 * np.cos(x / 8) * np.cos(y / 12), -20 / 12 * np.sin(x / 8) * np.sin(y / 12))
     errors = gaussian_filter(np.random.default_rng(2).normal(size=normals.shape), (2, 2, 0))
     noisy = unit(normals + np.radians(8) * errors / errors.std())
     torn = {}

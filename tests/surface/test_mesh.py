@@ -41,9 +41,7 @@ DEPTH, ALL = wave(3, 4), np.ones((3, 4), bool)
 def test_four_pixels() -> None:
     depth = np.array([[5.0, 0.0], [1.0, 4.0]])
     mesh = surface_mesh(depth, np.ones((2, 2), bool))
-    np.testing.assert_array_equal(
-        mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]]
-    )
+    np.testing.assert_array_equal(mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]])
     # The edge between pixels 0 and 3, which are nearly as high.
     assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {
         frozenset({0, 2, 3}),

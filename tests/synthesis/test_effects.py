@@ -53,9 +53,7 @@ def mirror(pixels: int) -> PrincipledMaterial:
 
 def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
     normals = draw_visible_normals(50, generator(1))
-    wall = replace(
-        draw_wall(normals, 1.0, generator()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool)
-    )
+    wall = replace(draw_wall(normals, 1.0, generator()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool))
     directions, inside = cell_directions()
     cosine = dot(wall.facing, directions[inside]).clamp(min=0)
     arriving = (normals * wall.towards).sum(dim=1, keepdim=True).clamp(min=0)

@@ -126,9 +126,7 @@ def test_light_intensities() -> None:
 
 def test_restoring_half_of_the_clipped_pixels() -> None:
     lights = tilted_lights(400, 12)
-    normals = torch.nn.functional.normalize(
-        torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1))
-    )
+    normals = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1)))
     truth = (lights * normals[:, None]).sum(dim=2).clamp(min=0)
     truth = 1.4 * truth / truth.amax(dim=1, keepdim=True)
     valid = torch.arange(12).expand(400, 12) < 10

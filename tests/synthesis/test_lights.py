@@ -73,9 +73,7 @@ def test_rings_have_one_elevation() -> None:
     assert stats.kstest(polar_deg.mean(axis=1), stats.uniform(15, 60).cdf).statistic < 0.08
     assert np.median(polar_deg.std(axis=1)) == pytest.approx(2, abs=0.15)
     # The mean direction of a whole ring is the view axis. An arc of A has sin(A / 2) / (A / 2) of a ring's radius.
-    off_axis = np.linalg.norm(directions[..., :2].mean(axis=1), axis=1) / np.sin(
-        np.radians(polar_deg.mean(axis=1))
-    )
+    off_axis = np.linalg.norm(directions[..., :2].mean(axis=1), axis=1) / np.sin(np.radians(polar_deg.mean(axis=1)))
     assert 0.4 < (off_axis < 0.03).mean() < 0.6
     assert off_axis.max() < math.sin(math.radians(60)) / math.radians(60) + 0.05
 

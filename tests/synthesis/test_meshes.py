@@ -61,9 +61,7 @@ def test_a_ball_inside_out_is_turned(tmp_path: Path) -> None:
 
 def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
     box = trimesh.creation.box((1.0, 1.0, 1.0))
-    mesh = Mesh(
-        box.vertices.astype(np.float32), box.faces.astype(np.int32), box.vertex_normals.astype(np.float32)
-    )
+    mesh = Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32), box.vertex_normals.astype(np.float32))
     fine = split_long_edges(mesh, longest=0.1)
     assert len(fine.faces) > 600
     assert area(fine) == pytest.approx(area(mesh), rel=1e-6)

@@ -96,9 +96,7 @@ def block_means(values: Floats, mask: NDArray[np.bool_]) -> Floats:
     return means
 
 
-def test_normals_and_frame_agree(
-    scene: Scene, rendered: dict[int, RenderedScene], benchmark: ModuleType
-) -> None:
+def test_normals_and_frame_agree(scene: Scene, rendered: dict[int, RenderedScene], benchmark: ModuleType) -> None:
     ours = rendered[0]
     shapes = benchmark.mitsuba_shapes(scene, "diffuse")
     theirs = benchmark.render_with_mitsuba(shapes, SIZE, 256, None)[ours.mask]

@@ -107,9 +107,7 @@ def test_each_pixel_is_turned_by_its_own_angle() -> None:
 
 def test_dense_map_has_no_holes_in_the_disc_and_nothing_outside() -> None:
     # With some ambient light everywhere, every possible light leaves something to see.
-    scene = draw_scene(
-        500, replace(PixelGeneratorConfig(), ambient_share=1.0), torch.Generator().manual_seed(0)
-    )
+    scene = draw_scene(500, replace(PixelGeneratorConfig(), ambient_share=1.0), torch.Generator().manual_seed(0))
     dense = scene.dense_map()
     _, inside = cell_directions()
     assert dense.shape == (500, 1, 32, 32)
@@ -152,9 +150,7 @@ def test_mixed_pixels_lie_between_their_surfaces() -> None:
     alone = replace(scene, mixed=None, mixed_weight=None).radiance(lights)
     second, blended = scene.mixed.radiance(lights), scene.radiance(lights)
     weight = scene.mixed_weight
-    torch.testing.assert_close(
-        blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5
-    )
+    torch.testing.assert_close(blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5)
     assert torch.equal(blended[200:], alone[200:])
     # Edges have another normal and the same material; blends the reverse.
     edge = torch.arange(200) % 2 == 0

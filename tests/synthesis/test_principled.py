@@ -29,14 +29,8 @@ NAMES = (
 
 
 def material(**values: float) -> PrincipledMaterial:
-    plain = (
-        dict.fromkeys(NAMES, 0.0)
-        | {"base": 0.5, "roughness": 0.5, "minnaert": 1.0, "tail_exponent": 2.0}
-        | values
-    )
-    return PrincipledMaterial(
-        **{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()}
-    )
+    plain = dict.fromkeys(NAMES, 0.0) | {"base": 0.5, "roughness": 0.5, "minnaert": 1.0, "tail_exponent": 2.0} | values
+    return PrincipledMaterial(**{name: torch.tensor([[value]], dtype=torch.float64) for name, value in plain.items()})
 
 
 def hemisphere(count: int, seed: int = 0) -> Vectors:
@@ -159,9 +153,7 @@ def hemispherical_reflectance(
         (material(base=0.0, roughness=0.3, specular=1.0), 0.3),
     ],
 )
-def test_no_more_light_comes_out_than_goes_in(
-    surface: PrincipledMaterial, limit: float, tilt_deg: float
-) -> None:
+def test_no_more_light_comes_out_than_goes_in(surface: PrincipledMaterial, limit: float, tilt_deg: float) -> None:
     normal = np.array([np.sin(np.radians(tilt_deg)), 0.0, np.cos(np.radians(tilt_deg))])
     reflectance = hemispherical_reflectance(surface, normal)
     assert 0 < reflectance <= limit
@@ -208,9 +200,7 @@ def test_drawn_materials_have_the_stated_classes() -> None:
     assert (values["minnaert"] != 1).mean() == pytest.approx(0.7, abs=0.01)
     assert (values["tail_exponent"] < 2).mean() == pytest.approx(0.5, abs=0.01)
     # Half of what is no metal is log-uniform from 0.02, of which log10(2.5) / 1.7 lies under 0.05.
-    assert (values["base"] < 0.05)[~metal].mean() == pytest.approx(
-        0.5 * np.log10(0.05 / 10**-1.7) / 1.7, abs=0.01
-    )
+    assert (values["base"] < 0.05)[~metal].mean() == pytest.approx(0.5 * np.log10(0.05 / 10**-1.7) / 1.7, abs=0.01)
     assert values["base"][metal].min() >= 0.05
     rough = values["roughness"]
     assert 0.1 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9

@@ -38,9 +38,7 @@ class Matte:
 def _no_lobes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A matte surface has no sharp lobes that the renderer would soften."""
     soften = rendering.soften
-    monkeypatch.setattr(
-        rendering, "soften", lambda found: found if isinstance(found, Matte) else soften(found)
-    )
+    monkeypatch.setattr(rendering, "soften", lambda found: found if isinstance(found, Matte) else soften(found))
 
 
 def matte(reflectance: float) -> dict[str, Matte]:
@@ -54,9 +52,7 @@ def ball(radius: float, *, polar: float, inward: bool, rings: int = 120, sectors
     t, p = (grid.ravel() for grid in np.meshgrid(theta, phi, indexing="ij"))
     sign = -1 if inward else 1
     unit = np.stack((np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), sign * np.cos(t)), axis=1)
-    row, column = (
-        grid.ravel() for grid in np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
-    )
+    row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij"))
     a, b = row * sectors + column, row * sectors + (column + 1) % sectors
     c, d = a + sectors, b + sectors
     # Anticlockwise from outside at +z, and from inside at -z: the same order of the azimuth either way.
@@ -95,9 +91,7 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
     # Cells of the terminator are half lit; elsewhere the mean over a pixel is its middle's value, nearly.
     assert np.abs(direct - expected)[well_inside].max() < 0.02
     assert np.abs(direct - expected)[well_inside].mean() < 0.002
-    indirect = render_indirect(*parts, directions=16, bounces=3, generator=torch.Generator().manual_seed(0))[
-        "matte"
-    ]
+    indirect = render_indirect(*parts, directions=16, bounces=3, generator=torch.Generator().manual_seed(0))["matte"]
     assert indirect.abs().max() == 0
 
 
@@ -139,9 +133,9 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
     visible = find_visible_surface(tracer, 24, 3)
     lights = directions((0, 0, 1))
     parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
-    indirect = render_indirect(
-        *parts, directions=256, bounces=bounces, generator=torch.Generator().manual_seed(0)
-    )["matte"].numpy()[:, 0]
+    indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=torch.Generator().manual_seed(0))[
+        "matte"
+    ].numpy()[:, 0]
     again = rho / 2
     expected = rho * rho / 4 * (1 - again**bounces) / (1 - again)
     assert indirect.mean() == pytest.approx(expected, rel=0.02)

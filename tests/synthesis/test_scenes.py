@@ -30,9 +30,7 @@ def tent() -> Mesh:
     corners = np.array([(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32)
     faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)], np.int32)
     slope = np.sqrt(0.5)
-    normals = np.array(
-        [(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2
-    )
+    normals = np.array([(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2)
     return Mesh(corners, faces, normals.astype(np.float32))
 
 
@@ -94,9 +92,7 @@ def test_patches_are_connected_areas_of_about_one_size() -> None:
     faces = np.concatenate(
         (np.stack((corner, corner + 1, corner + 32), 1), np.stack((corner, corner + 32, corner + 31), 1))
     )
-    mesh = Mesh(
-        vertices, faces.astype(np.int32), np.tile(np.array([[0, 0, 1]], np.float32), (len(vertices), 1))
-    )
+    mesh = Mesh(vertices, faces.astype(np.int32), np.tile(np.array([[0, 0, 1]], np.float32), (len(vertices), 1)))
     patches = draw_patches(mesh, 20, rng)
     assert patches.shape == (1800,)
     assert set(np.unique(patches)) <= set(range(20))

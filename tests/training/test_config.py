@@ -60,9 +60,7 @@ def test_refused(values: dict[str, Any], message: str) -> None:
 
 def test_presets_by_name() -> None:
     compact = preset("compact")
-    assert compact.network == NetworkConfig(
-        map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64
-    )
+    assert compact.network == NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64)
     assert (compact.pixels.min_lights, compact.pixels.usual_lights, compact.pixels.max_lights) == (4, 10, 96)
     # The paper's section 4; its code where that is silent (docs/train.md).
     paper = preset("paper")

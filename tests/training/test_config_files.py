@@ -171,7 +171,5 @@ def test_removed_settings_of_earlier_versions(tmp_path: Path) -> None:
     unused = write(tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n")
     assert configure("compact", unused) == preset("compact")
     used = write(tmp_path / "used.toml", "[pixels]\nmeasured_share = 0.5\n")
-    with pytest.raises(
-        ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"
-    ):
+    with pytest.raises(ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"):
         configure("compact", used)

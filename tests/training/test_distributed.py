@@ -25,9 +25,7 @@ STEPS = 6
 
 
 def environment(**more: str) -> dict[str, str]:
-    kept = {
-        name: text for name, text in os.environ.items() if not name.startswith(("TORCHELASTIC", "PYTEST"))
-    }
+    kept = {name: text for name, text in os.environ.items() if not name.startswith(("TORCHELASTIC", "PYTEST"))}
     return kept | {"OMP_NUM_THREADS": "1"} | more
 
 

@@ -82,9 +82,7 @@ def losses(trainer: Trainer, steps: int) -> list[float]:
     return [trainer.step()[0].item() for _ in range(steps)]
 
 
-@pytest.mark.parametrize(
-    ("updates", "pixels"), [("joint", "generator"), ("joint", "set"), ("alternating", "both")]
-)
+@pytest.mark.parametrize(("updates", "pixels"), [("joint", "generator"), ("joint", "set"), ("alternating", "both")])
 def test_a_run_taken_up_goes_on_as_if_never_stopped(
     tiny: TrainingConfig, tmp_path: Path, make_set: MakeSet, updates: Any, pixels: str
 ) -> None:
@@ -101,17 +99,13 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(
     assert losses(first, 3) == expected[:3]
     first.save()
     torch.rand(100)  # what others draw in between does not matter
-    second = Trainer(
-        read_checkpoint_config(tmp_path / "halves" / CHECKPOINT), tmp_path / "halves", CPU, resume=True
-    )
+    second = Trainer(read_checkpoint_config(tmp_path / "halves" / CHECKPOINT), tmp_path / "halves", CPU, resume=True)
     assert second.counters == first.counters
     # The same operations on the same numbers; only their places in memory differ.
     assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
         for name, tensor in getattr(whole, network).state_dict().items():
-            torch.testing.assert_close(
-                getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7
-            )
+            torch.testing.assert_close(getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7)
 
 
 def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_path: Path) -> None:
@@ -154,9 +148,7 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
             replace(tiny, **settings)
 
 
-def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(
-    tiny: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(tiny: TrainingConfig, tmp_path: Path) -> None:
     first = Trainer(tiny, tmp_path / "first", CPU)
     first.run()
     grown = replace(tiny.network, set_width=16, set_layers=1)
@@ -173,9 +165,7 @@ def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(
     assert any(value.any() for value in second.network.ne_net.join.parameters())
 
 
-def test_a_run_writes_its_files(
-    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "REPORT_STEPS", 4)
     seen: list[tuple[float, Metrics]] = []
     trainer = Trainer(replace(tiny, steps=10), tmp_path, CPU)
@@ -238,9 +228,7 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(
     files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     weights = [p.detach().clone() for p in (*trainer.network.parameters(), *trainer.average.parameters())]
     poison(trainer, what)
-    with pytest.raises(
-        ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"
-    ):
+    with pytest.raises(ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"):
         trainer.run()
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
     after = (*trainer.network.parameters(), *trainer.average.parameters())
@@ -250,9 +238,7 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(
     assert math.isfinite(losses(Trainer(trainer.config, tmp_path, CPU, resume=True), 1)[0])
 
 
-def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(
-    tiny: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(tiny, tmp_path, CPU).run()
     before = {name: (tmp_path / name).read_bytes() for name in (CHECKPOINT, WEIGHTS)}
     longer = Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True)
@@ -268,9 +254,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(
     assert Trainer(replace(tiny, steps=9), tmp_path, CPU, resume=True).counters.step == 6
 
 
-def test_checkpoints_come_by_the_clock(
-    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_checkpoints_come_by_the_clock(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     readings = itertools.count()
     monkeypatch.setattr("splinecli.training.loop.time.monotonic", lambda: next(readings) * 5.0)
     trainer = Trainer(replace(tiny, steps=14), tmp_path, CPU)

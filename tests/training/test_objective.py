@@ -148,18 +148,12 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
     dense = dense_truth_in_frame(seen, views, size=32)
     normals = to_pixel_frame(seen.truth.normals, views)
     turned = torch.stack((-lights[:, 1], lights[:, 0], lights[:, 2]), dim=1)
-    expected_normals = torch.stack(
-        (-seen.truth.normals[:, 1], *seen.truth.normals[:, [0, 2]].unbind(1)), dim=1
-    )
+    expected_normals = torch.stack((-seen.truth.normals[:, 1], *seen.truth.normals[:, [0, 2]].unbind(1)), dim=1)
     if mirror:
-        turned, expected_normals = (
-            vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals)
-        )
+        turned, expected_normals = (vectors * torch.tensor((1.0, -1.0, 1.0)) for vectors in (turned, expected_normals))
     sparse = sparse_map(observations / views.scale, turned)
     assert sparse.occupied[0].sum() == len(lights)
-    torch.testing.assert_close(
-        dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4
-    )
+    torch.testing.assert_close(dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
     torch.testing.assert_close(normals, expected_normals)
     assert dense.values.max() == 1  # highlights that no light has hit are cut
     assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))

@@ -43,9 +43,7 @@ def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tenso
 
 def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
     radiance, directions = scene()
-    observations, calibrated = photograph_scene(
-        radiance, directions, FLAWLESS, torch.Generator().manual_seed(0)
-    )
+    observations, calibrated = photograph_scene(radiance, directions, FLAWLESS, torch.Generator().manual_seed(0))
     exposure = (observations / radiance)[radiance < 0.9].unique()
     assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
     torch.testing.assert_close(exposure, exposure[0].expand(len(exposure)))
@@ -120,9 +118,7 @@ def refining(tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.Monk
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
-    refining: TrainingConfig, tmp_path: Path
-) -> None:
+def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining: TrainingConfig, tmp_path: Path) -> None:
     trainer = Trainer(refining, tmp_path / "run", CPU)
     before = {name: tensor.clone() for name, tensor in trainer.network.state_dict().items()}
     first_deg = trainer.task.validation_deg(trainer.average, bfloat16=False)
@@ -134,9 +130,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
     assert changed and all(name.startswith("refine_net.") for name in changed)
 
 
-def test_captures_of_a_pool(
-    refining: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refinement, "_ENLARGED_SHARE", 0.0)
     torch.manual_seed(0)
     network = SplineNet(refining.network)

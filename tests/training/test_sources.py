@@ -66,9 +66,7 @@ def entries_of(*scenes: str) -> list[Entry]:
         (("a", "b", "c"), 0.0, 0),
     ],
 )
-def test_validation_takes_whole_scenes_and_never_all(
-    scenes: tuple[str, ...], share: float, n_validation: int
-) -> None:
+def test_validation_takes_whole_scenes_and_never_all(scenes: tuple[str, ...], share: float, n_validation: int) -> None:
     entries = entries_of(*scenes)
     training, validation = split_scenes(entries, share)
     for_validation = {entry.scene for entry in validation}
@@ -118,9 +116,7 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
 
     def draw(seed: int, count: int) -> tuple[list[PixelBatch], list[PixelBatch]]:
         opened = open_sources(config, seeded(seed), seeded(seed + 1))
-        return [opened.training.draw(5) for _ in range(count)], [
-            opened.validation.draw(5) for _ in range(count // 4)
-        ]
+        return [opened.training.draw(5) for _ in range(count)], [opened.validation.draw(5) for _ in range(count // 4)]
 
     (training, validation), again = draw(5, 120), draw(5, 8)
     for batches, others in ((training, again[0]), (validation, again[1])):
@@ -139,9 +135,7 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     assert {batch.truth.dense_truth(32).values.shape for batch in training} == {(5, 1, 32, 32)}
 
 
-def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
-    make_set: MakeSet, tiny: TrainingConfig
-) -> None:
+def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(make_set: MakeSet, tiny: TrainingConfig) -> None:
     # Both sets have the same three shapes under other names.
     one = make_set("one", entries=[("a", "a", 20, 20), ("b", "b", 20, 20), ("c", "c", 20, 20)])
     other = make_set("other", entries=[("x", "x", 20, 20), ("y", "y", 20, 20), ("z", "z", 20, 20)])
@@ -155,9 +149,7 @@ def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
     rest = make_set("rest", entries=[(name, name, 20, 20) for name in order])
     alone = make_set("alone", entries=[("a", "a", 20, 20)])
     with pytest.raises(InputError, match="all scenes of the set are used for validation"):
-        open_sources(
-            replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}), seeded(), seeded()
-        )
+        open_sources(replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}), seeded(), seeded())
 
 
 def test_sources_without_weight_are_not_opened(tiny: TrainingConfig) -> None:

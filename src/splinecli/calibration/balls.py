@@ -149,9 +149,7 @@ def calibrate_ball(
         stored = decode_image(path, expected)
         expected = expected or ExpectedSize(stored.shape, path.name)
         if not circle.inside(stored.shape[:2]).any():
-            raise InputError(
-                "the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels"
-            )
+            raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
             highlight = find_highlight(
                 to_linear(stored, path).mean(axis=2),
@@ -190,8 +188,7 @@ def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
     counts = [len(ball.directions) for ball in balls]
     if len(set(counts)) > 1:
         raise InputError(
-            "the balls have "
-            + ", ".join(f"{n} images ({b.files.folder})" for n, b in zip(counts, balls, strict=True)),
+            "the balls have " + ", ".join(f"{n} images ({b.files.folder})" for n, b in zip(counts, balls, strict=True)),
             hint="Every ball needs one image for each light, in the same order",
         )
     stacked = np.stack([ball.directions for ball in balls])

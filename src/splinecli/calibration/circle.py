@@ -49,9 +49,7 @@ class Circle:
     def outline(self) -> NDArray[np.float64]:
         """The points (N, 2) of the outline near the circle. A near camera sees an ellipse, which is no circle."""
         if self.points is not None:
-            return self.points[
-                _distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius
-            ]
+            return self.points[_distance(self.points, (self.x, self.y, self.radius)) < _SEARCH_BAND * self.radius]
         angle = np.arange(RAYS) * (2 * np.pi / RAYS)
         return np.column_stack((self.x + self.radius * np.cos(angle), self.y + self.radius * np.sin(angle)))
 
@@ -162,9 +160,7 @@ def _refine(values: NDArray[np.float32], guess: Circle) -> Circle | None:
             values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
             borderValue=float("nan"),
         )  # fmt: skip
-        edge = np.abs(
-            cv2.GaussianBlur(sampled, (9, 1), 2)[:, 2:] - cv2.GaussianBlur(sampled, (9, 1), 2)[:, :-2]
-        )
+        edge = np.abs(cv2.GaussianBlur(sampled, (9, 1), 2)[:, 2:] - cv2.GaussianBlur(sampled, (9, 1), 2)[:, :-2])
         edge[~np.isfinite(edge)] = 0
         peak = edge[:, 1:-1].argmax(axis=1) + 1
         strength = edge[np.arange(RAYS), peak]

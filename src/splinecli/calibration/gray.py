@@ -104,9 +104,7 @@ def _target_normals(
     if target == "card":
         return mask, np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     if files.mask is None:
-        raise InputError(
-            "the images of the gray ball need a mask", path=files.folder, hint="Add one as mask.png"
-        )
+        raise InputError("the images of the gray ball need a mask", path=files.folder, hint="Add one as mask.png")
     circle = circle_from_mask(mask)
     mask &= Circle(circle.x, circle.y, _USED_RADIUS * circle.radius).inside(shape)
     y, x = np.nonzero(mask)

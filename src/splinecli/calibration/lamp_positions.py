@@ -61,14 +61,11 @@ class LampPositions:
     def known(self) -> bool:
         """Whether every lamp has a position in front of the balls that the rays determine well."""
         return bool(
-            (self.positions[:, 2] > 0).all()
-            and (self.uncertainty <= LARGEST_UNCERTAINTY * self.distances).all()
+            (self.positions[:, 2] > 0).all() and (self.uncertainty <= LARGEST_UNCERTAINTY * self.distances).all()
         )
 
 
-def triangulate_lamps(
-    balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
-) -> LampPositions | None:
+def triangulate_lamps(balls: Sequence[BallCalibration], *, ball_diameter: float | None = None) -> LampPositions | None:
     """Return the positions of the lamps from balls that one camera photographed; None for balls at one place.
 
     The uncertainty comes from repeating the computation with other pixels (PIXEL_ERROR), heights of the balls and
@@ -116,9 +113,7 @@ def _positions(
     plane = float(depths.mean() * (1 + (shares * error(len(balls))).mean()))
     # The most probable depths, and their errors, given those from the outlines and HEIGHT_SPREAD.
     weights = HEIGHT_SPREAD**2 / (HEIGHT_SPREAD**2 + (shares * depths) ** 2)
-    likely = (
-        plane + weights * (depths - depths.mean()) + np.sqrt(weights) * shares * depths * error(len(balls))
-    )
+    likely = plane + weights * (depths - depths.mean()) + np.sqrt(weights) * shares * depths * error(len(balls))
     centres *= (likely / depths)[:, None]
     height, width = balls[0].shape
     origin = np.array(((width - 1) / 2, (height - 1) / 2, 1.0)) @ ray_basis(matrix) * plane
@@ -126,9 +121,7 @@ def _positions(
         reflect(centre, ball.points + PIXEL_ERROR * error(*ball.points.shape), matrix)
         for centre, ball in zip(centres, balls, strict=True)
     ]
-    starts = np.array(
-        [centre - origin + normals for centre, (normals, _) in zip(centres, found, strict=True)]
-    )
+    starts = np.array([centre - origin + normals for centre, (normals, _) in zip(centres, found, strict=True)])
     points, miss = intersect_rays(starts, np.array([directions for _, directions in found]))
     pixel = plane / focal_length(matrix)  # in radii of the balls
     unit = 1 / pixel if ball_diameter is None else ball_diameter / 2

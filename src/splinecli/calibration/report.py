@@ -52,9 +52,7 @@ def calibration_report(
         "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg, "mean", "largest"),
         "compared": None
         if known_directions is None
-        else _mean_and_largest(
-            angle_between_deg(known_directions, lights.directions), "mean_deg", "largest_deg"
-        ),
+        else _mean_and_largest(angle_between_deg(known_directions, lights.directions), "mean_deg", "largest_deg"),
         "warnings": [
             *_outline_warnings(lights, picture),
             *_distance_warnings(lamps),

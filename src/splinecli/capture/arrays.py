@@ -62,14 +62,8 @@ def capture_from_arrays(
     if light_directions is None and find_lights is None:
         raise UsageError("found neither light directions nor a function that finds them")
     if light_directions is None and pixel_size is not None:
-        raise UsageError(
-            "light_directions is None, but near lamps need positions", hint="Leave pixel_size out"
-        )
-    directions = (
-        placeholders(n_lights)
-        if light_directions is None
-        else _checked_directions(light_directions, n_lights)
-    )
+        raise UsageError("light_directions is None, but near lamps need positions", hint="Leave pixel_size out")
+    directions = placeholders(n_lights) if light_directions is None else _checked_directions(light_directions, n_lights)
     intensities = _checked_intensities(light_intensities, n_lights)
     inside = np.ones(shape, np.bool_) if mask is None else _inside(np.asarray(mask))
     if inside.shape != shape:
@@ -121,9 +115,7 @@ def _checked_images(images: ArrayLike | Sequence[NDArray[Any]]) -> list[NDArray[
                 f"found an image of shape {image.shape} at images[{index}], expected {stack[0].shape} as images[0]"
             )
         if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
-            raise UsageError(
-                f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)"
-            )
+            raise UsageError(f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H, W, 3)")
         if image.dtype not in _KINDS and image.dtype.kind != "f":
             raise UsageError(
                 f"found images of type {image.dtype}, expected uint8, uint16 or floating point",

@@ -161,9 +161,7 @@ def images_left_out(light_file: str, n_named: int, n_images: int) -> CaptureWarn
 
 def other_pictures(names: Sequence[str]) -> CaptureWarning:
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    text = (
-        f"{names[0]}{more}: left out, because the name says that it is no photograph under one of the lights."
-    )
+    text = f"{names[0]}{more}: left out, because the name says that it is no photograph under one of the lights."
     return CaptureWarning(IMAGES_LEFT_OUT, f"{text} To use it, list all images in filenames.txt.")
 
 
@@ -214,9 +212,7 @@ def not_distilled(angle_deg: float, expected_deg: float) -> CaptureWarning:
 
 
 def different_sizes(n_sizes: int) -> CaptureWarning:
-    return CaptureWarning(
-        DIFFERENT_SIZES, f"The images have {n_sizes} different sizes; all images need the same size."
-    )
+    return CaptureWarning(DIFFERENT_SIZES, f"The images have {n_sizes} different sizes; all images need the same size.")
 
 
 def saturated_images(n_images: int, worst: str, worst_share: float) -> CaptureWarning:

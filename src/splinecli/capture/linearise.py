@@ -41,9 +41,7 @@ class RadiometricCalibration:
     flat_field: tuple[Path, ...] = ()
     automatic: bool = False
 
-    def with_stated_curve(
-        self, images: Sequence[ImageFacts]
-    ) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
+    def with_stated_curve(self, images: Sequence[ImageFacts]) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
         """Return this calibration with the curve that all images state, if it is automatic, and warnings."""
         if self.curve != 1:
             return self, []

@@ -33,9 +33,7 @@ def _read_boundaries(files: CaptureFiles, shape: tuple[int, ...]) -> NDArray[np.
         union |= read_boundary(path, ExpectedSize(shape, files.images[0].name, "a mask"))
     if not union.any():
         names = " and ".join(path.name for path in files.boundaries)
-        raise InputError(
-            f"the mask is empty: every pixel of {names} is zero", path=files.boundaries[0].parent
-        )
+        raise InputError(f"the mask is empty: every pixel of {names} is zero", path=files.boundaries[0].parent)
     return union
 
 

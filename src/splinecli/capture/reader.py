@@ -87,16 +87,12 @@ def open_capture(
             )
         overrides, form = replace(overrides, lights=near.positions), "positions"
     if near is not None and near.used and not window.is_whole:
-        raise UsageError(
-            "--crop and --scale are for distant lights; under near lamps, the whole image has to be read"
-        )
+        raise UsageError("--crop and --scale are for distant lights; under near lamps, the whole image has to be read")
     files = find_capture_files(folder, overrides)
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
     stamp = stamp_files(files, radiometry.flat_field, () if near is None else near.stamp)
-    source = replace(
-        _read_lights(files, radiometry, light_frame, form, near, equal=equal), find_lights=find_lights
-    )
+    source = replace(_read_lights(files, radiometry, light_frame, form, near, equal=equal), find_lights=find_lights)
     files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)

@@ -76,9 +76,7 @@ class Capture:
         object.__setattr__(self, "mask", np.asarray(self.mask, np.bool_))
         object.__setattr__(self, "warnings", tuple(self.warnings))
         if self.estimated_intensities is not None:
-            object.__setattr__(
-                self, "estimated_intensities", np.asarray(self.estimated_intensities, np.float64)
-            )
+            object.__setattr__(self, "estimated_intensities", np.asarray(self.estimated_intensities, np.float64))
         if self.restored is not None:
             object.__setattr__(self, "restored", np.asarray(self.restored, np.bool_))
         self._check_lights()
@@ -111,9 +109,7 @@ class Capture:
             observations=self.observations[:, chosen],
             light_directions=self.light_directions[chosen],
             light_indices=tuple(self.light_indices[i] for i in chosen),
-            estimated_intensities=None
-            if self.estimated_intensities is None
-            else self.estimated_intensities[chosen],
+            estimated_intensities=None if self.estimated_intensities is None else self.estimated_intensities[chosen],
             restored=None if self.restored is None else self.restored[:, chosen],
             lamps=None if self.lamps is None else self.lamps.choose_lights(chosen),
             light_errors_deg=None if self.light_errors_deg is None else self.light_errors_deg[chosen],
@@ -177,8 +173,7 @@ class Capture:
         expected = (n_pixels, self.n_lights)
         if self.observations.shape != expected:
             raise InputError(
-                f"{self.name}: observations of shape {self.observations.shape},"
-                f" expected (pixels, lights) = {expected}"
+                f"{self.name}: observations of shape {self.observations.shape}, expected (pixels, lights) = {expected}"
             )
         if self.restored is not None and self.restored.shape != expected:
             raise InputError(
@@ -190,9 +185,7 @@ class Capture:
     def _check_ground_truth(self, normals: NDArray[np.float32]) -> None:
         expected = (*self.mask.shape, 3)
         if normals.shape != expected:
-            raise InputError(
-                f"{self.name}: ground truth of shape {normals.shape}, expected (H, W, 3) = {expected}"
-            )
+            raise InputError(f"{self.name}: ground truth of shape {normals.shape}, expected (H, W, 3) = {expected}")
         for block in _blocks(normals.reshape(-1, 3)):
             length = np.linalg.norm(block, axis=1)
             # In this form, NaN fails the check, too.

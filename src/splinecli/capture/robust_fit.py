@@ -43,9 +43,7 @@ def shade(scaled_normals: Array, light_directions: Array) -> Array:
     return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
 
 
-def fit_scaled_normals(
-    observations: Array, weights: Array, light_directions: Array, *, prior: float = _PRIOR
-) -> Array:
+def fit_scaled_normals(observations: Array, weights: Array, light_directions: Array, *, prior: float = _PRIOR) -> Array:
     """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
 
     The arguments are those of predict. `prior` pulls b towards 0.

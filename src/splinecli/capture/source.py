@@ -112,9 +112,7 @@ class CaptureSource:
     ) -> StoredCapture:
         """Return the stored values under the chosen lights and the data needed to restore them; see read."""
         indices = (
-            tuple(range(self.n_lights))
-            if light_indices is None
-            else check_light_indices(light_indices, self.n_lights)
+            tuple(range(self.n_lights)) if light_indices is None else check_light_indices(light_indices, self.n_lights)
         )
         mask = self._read_mask_if_room(indices)
         ground_truth, upside_down = None, False

@@ -79,9 +79,7 @@ class StoredCapture:
         Args:
             rows: rows of the observations, in rising order.
         """
-        return replace(
-            self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows)
-        )
+        return replace(self, capture=self.capture.choose_pixels(rows), saturation=self.saturation.choose_pixels(rows))
 
     def estimate_intensities(self) -> NDArray[np.float64] | None:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""

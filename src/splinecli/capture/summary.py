@@ -92,9 +92,7 @@ class CaptureSummary:
             if worst is None
             else capture_warnings.saturated_images(len(saturated), worst.path.name, worst.saturated),
             capture_warnings.dark_images(len(dark), dark[0].path.name, DARK) if dark else None,
-            capture_warnings.few_lights(len(self.images), FEW_LIGHTS)
-            if len(self.images) < FEW_LIGHTS
-            else None,
+            capture_warnings.few_lights(len(self.images), FEW_LIGHTS) if len(self.images) < FEW_LIGHTS else None,
             capture_warnings.high_lights(NARROW_DEG) if self.axis_angles_deg.max() < NARROW_DEG else None,
         ]
         given = (warning for warning in found if warning is not None)
@@ -141,9 +139,7 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
         closeup = Sample(observations[inside[taken]], mask[seen_closely], 1)
     _, of_lamps = source.near_lamps(mask)
-    return CaptureSummary(
-        source, summaries, int(np.count_nonzero(mask)), level, sample, closeup, tuple(of_lamps)
-    )
+    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample, closeup, tuple(of_lamps))
 
 
 def _pixels_of_all(

@@ -61,20 +61,13 @@ class Command(TyperCommand):
             return _without_end_of_file(super().invoke, ctx)
         except Exception as error:
             # infer prints its list itself, with what it has done until then.
-            if (
-                ctx.params.get("as_json")
-                and ctx.info_name != INFER
-                and not isinstance(error, typer.Exit | typer.Abort)
-            ):
+            if ctx.params.get("as_json") and ctx.info_name != INFER and not isinstance(error, typer.Exit | typer.Abort):
                 print_error_document(error, as_list=False)
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line, without the braces that Typer sets about arguments."""
-        return [
-            piece.translate({ord(brace): None for brace in "{}"})
-            for piece in super().collect_usage_pieces(ctx)
-        ]
+        return [piece.translate({ord(brace): None for brace in "{}"}) for piece in super().collect_usage_pieces(ctx)]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the help of the arguments, then of the options, panel by panel."""
@@ -115,9 +108,7 @@ def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
         term, meaning = record
         if parameter.param_type_name == "argument":
             # The record has the Python type beside the name.
-            arguments.append(
-                (str(parameter.metavar or parameter.name), _tidy(meaning.removesuffix("[required]")))
-            )
+            arguments.append((str(parameter.metavar or parameter.name), _tidy(meaning.removesuffix("[required]"))))
         else:
             long_name = max(parameter.opts, key=len)
             options[long_name] = (term, _tidy(meaning))

@@ -70,9 +70,7 @@ def evaluate(
         EvaluateOptions,
         given,
         methods=tuple(
-            name
-            for text in method or [DEFAULT_METHOD]
-            for name in (method_names() if text == "all" else [text])
+            name for text in method or [DEFAULT_METHOD] for name in (method_names() if text == "all" else [text])
         ),
         method_options=MethodOptions(weights, rotations, device=device.value, precision=precision.value),
         n_lights=tuple(parse_light_count(text) for text in n_lights or []),
@@ -115,10 +113,7 @@ def _print_table(evaluation: Evaluation) -> None:
 
     rows = table_rows(evaluation)
     best = best_cells(rows)
-    cells = [
-        [Text(cell, "bold" if (r, c) in best else "") for c, cell in enumerate(row)]
-        for r, row in enumerate(rows)
-    ]
+    cells = [[Text(cell, "bold" if (r, c) in best else "") for c, cell in enumerate(row)] for r, row in enumerate(rows)]
     console = Console(highlight=False)
     if sum(max(len(row[column]) for row in rows) + 3 for column in range(len(rows[0]))) > console.width:
         cells = [list(column) for column in zip(*cells, strict=True)]

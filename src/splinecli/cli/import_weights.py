@@ -23,9 +23,7 @@ def import_weights(
     if output.is_dir():
         raise OutputError("is a folder, expected a file", path=output, hint="Name a file with -o")
     if output.exists() and not overwrite:
-        raise OutputError(
-            "exists already", path=output, hint="Add --overwrite, or choose another place with -o"
-        )
+        raise OutputError("exists already", path=output, hint="Add --overwrite, or choose another place with -o")
 
     from splinecli.networks.official import import_official
     from splinecli.networks.weights import save_weights

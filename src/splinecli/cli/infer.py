@@ -126,9 +126,7 @@ def infer(
             shard=None if shard is None else Shard.parse(shard),
             cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
         )
-        return _show_all(
-            batch, output, messages, documents, summaries=not (quiet or as_json or as_json_lines)
-        )
+        return _show_all(batch, output, messages, documents, summaries=not (quiet or as_json or as_json_lines))
 
 
 def _show_all(

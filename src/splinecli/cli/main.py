@@ -37,9 +37,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _run_command(args: Sequence[str] | None) -> int:
     command = typer.main.get_command(app)
     try:
-        result = command.main(
-            args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False
-        )
+        result = command.main(args=None if args is None else list(args), prog_name="splinecli", standalone_mode=False)
     except KeyboardInterrupt:
         result = INTERRUPTED
     except Exception as error:

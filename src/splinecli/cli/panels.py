@@ -103,9 +103,7 @@ OTHERS = "Options"
 
 def sort_into_panels(command: str, options: list[str]) -> dict[str, list[str]]:
     """Return the title of each panel and those of the options (their long names) that stand in it."""
-    panels = {
-        title: [name for name in names if name in options] for title, names in PANELS.get(command, {}).items()
-    }
+    panels = {title: [name for name in names if name in options] for title, names in PANELS.get(command, {}).items()}
     named = {name for names in panels.values() for name in names}
     panels[OTHERS] = [name for name in options if name not in named]
     return {title: names for title, names in panels.items() if names}

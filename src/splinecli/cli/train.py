@@ -58,9 +58,7 @@ def train(
     if minutes is not None:
         settings = replace(settings, minutes=minutes)
     warn = Messages(quiet=quiet).warn
-    with open_run(
-        settings, output, device.value, resume=resume, tensorboard=tensorboard, warn=warn
-    ) as trainer:
+    with open_run(settings, output, device.value, resume=resume, tensorboard=tensorboard, warn=warn) as trainer:
         _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
         if not quiet and trainer.workers.leads:
             print(printable(output / WEIGHTS))
@@ -99,9 +97,7 @@ def _run(trainer: Trainer, messages: Messages) -> None:
         messages.warn(f"metrics.csv was damaged and is now {trainer.log.set_aside}")
     shown = trainer.progress
     if shown >= 1:
-        messages.say(
-            f"{trainer.folder}: the run is at its end already. Give it more --steps or --minutes to go on."
-        )
+        messages.say(f"{trainer.folder}: the run is at its end already. Give it more --steps or --minutes to go on.")
     with messages.progress("training", 1.0, start=shown) as advance:
 
         def report(progress: float, metrics: Metrics) -> None:

@@ -16,9 +16,7 @@ from splinecli.methods.estimator import Estimator
 Floats = NDArray[np.float32]
 
 
-def correct_errors(
-    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Floats, errors: Floats
-) -> bool:
+def correct_errors(capture: Capture, estimator: Estimator, light_of: LightOf, normals: Floats, errors: Floats) -> bool:
     """Correct the distributions of errors (P, 2) in place; return whether that was possible.
 
     It is not where the capture is too small, or where the correction was not made for the estimator's weights. A pixel

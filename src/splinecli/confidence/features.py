@@ -130,9 +130,7 @@ def capture_features(
     n_lights = len(lights)
     if n_lights < FEWEST_LIGHTS:
         return None
-    rows = np.arange(
-        0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2))
-    )
+    rows = np.arange(0, len(normals), -(-len(normals) // max(_SAMPLE, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2)))
     light = light_of(rows)
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, _BRIGHT_QUANTILE))

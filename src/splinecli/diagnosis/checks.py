@@ -134,9 +134,7 @@ def unequal_intensities(seen: Evidence) -> list[CaptureWarning]:
     return [CaptureWarning(codes.UNEQUAL_INTENSITIES, text)]
 
 
-DOUBTED = frozenset(
-    {codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_CROWDED}
-)
+DOUBTED = frozenset({codes.IMAGES_SHIFTED, codes.IMAGE_ODD, codes.LIGHT_ORDER, codes.LIGHT_FRAME, codes.LIGHTS_CROWDED})
 """After these warnings, nothing that relies on the lights can be told."""
 
 EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
@@ -243,6 +241,4 @@ def refuse_if_strict(warnings: Iterable[CaptureWarning], name: str, *, strict: b
     """Raise InputError for the first warning that says that an input is probably wrong, if `strict`."""
     wrong = next((warning for warning in warnings if warning.code in PROBABLY_WRONG), None)
     if strict and wrong is not None:
-        raise InputError(
-            f"{name}: {wrong.text.removesuffix('.')}", hint="Leave --strict out to go on nevertheless"
-        )
+        raise InputError(f"{name}: {wrong.text.removesuffix('.')}", hint="Leave --strict out to go on nevertheless")

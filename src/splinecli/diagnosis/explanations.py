@@ -48,8 +48,7 @@ def encoded_values(sample: Sample, light_directions: Array) -> list[CaptureWarni
     if not len(values):
         return []
     before, after = (
-        _misfits(values, light_directions, gamma, shadow=_ENCODED_SHADOW_SHARE)[0]
-        for gamma in (1.0, DISPLAY_EXPONENT)
+        _misfits(values, light_directions, gamma, shadow=_ENCODED_SHADOW_SHARE)[0] for gamma in (1.0, DISPLAY_EXPONENT)
     )
     if before < _MIN_MISFIT or after >= ENCODED_RATIO * before:
         return []
@@ -140,8 +139,6 @@ def _roundness(values: Array, lights: Array, places: NDArray[np.integer]) -> flo
     """Return the share of the variance of places (p, 2) that a cubic function of the slopes of normals predicts."""
     lit = (values > _SHADOW_SHARE).astype(np.float64)
     across = unit(fit_scaled_normals(values, lit, lights))[:, :2]
-    terms = np.concatenate(
-        (across, across * (across**2).sum(axis=1, keepdims=True), np.ones((len(across), 1))), axis=1
-    )
+    terms = np.concatenate((across, across * (across**2).sum(axis=1, keepdims=True), np.ones((len(across), 1))), axis=1)
     missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
     return float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))

@@ -82,9 +82,7 @@ class RoughNormals:
         return float((along * self.outward[steep]).sum(axis=1).mean())
 
 
-def rough_normals(
-    observations: NDArray[np.floating], light_directions: Array, mask: NDArray[np.bool_]
-) -> RoughNormals:
+def rough_normals(observations: NDArray[np.floating], light_directions: Array, mask: NDArray[np.bool_]) -> RoughNormals:
     """Return smoothed normals of a fit of least absolute deviations.
 
     Args:

@@ -34,9 +34,7 @@ def check_ground_truth(
     if not known.any():
         return []
     normals = rough_normals(sample.observations, light_directions, sample.mask).normals[known]
-    angles = [
-        float(np.median(angle_between_deg(normals, truth[known] @ frame.matrix.T))) for frame in _FRAMES
-    ]
+    angles = [float(np.median(angle_between_deg(normals, truth[known] @ frame.matrix.T))) for frame in _FRAMES]
     best = int(np.argmin(angles))
     if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
         return []

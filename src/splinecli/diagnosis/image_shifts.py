@@ -59,9 +59,7 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     if found and len(still) >= _MIN_PREDICTORS:
         # A shifted image also disturbs the prediction of others.
         found = _shifts_against(values, still, sample.mask, inner)
-    return [
-        ImageShift(place, right * sample.step, down * sample.step) for place, (right, down) in found.items()
-    ]
+    return [ImageShift(place, right * sample.step, down * sample.step) for place, (right, down) in found.items()]
 
 
 def _shifts_against(

@@ -102,10 +102,7 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
         {"reading": candidate.name, **{name: _rounded(getattr(candidate, name)) for name in figures}}
         for candidate in check.candidates
     ]
-    orders = [
-        {"reading": words, **dict.fromkeys(figures), "misfit": _rounded(misfit)}
-        for words, misfit in check.tried
-    ]
+    orders = [{"reading": words, **dict.fromkeys(figures), "misfit": _rounded(misfit)} for words, misfit in check.tried]
     return frames + orders
 
 

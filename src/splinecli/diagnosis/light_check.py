@@ -104,17 +104,13 @@ class LightCheck:
         """What the images do not tell about the lights, in words."""
         missing = []
         if self.given_misfit is None:
-            missing.append(
-                f"their order (fewer than {MIN_LIGHTS} lights, too few lit pixels, or a flat object)"
-            )
+            missing.append(f"their order (fewer than {MIN_LIGHTS} lights, too few lit pixels, or a flat object)")
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
             missing.append("their frame (too few pixels)")
         elif 2 * RIM_WEIGHT * self.outline_counts * abs(self.given.rim or 0) < 1:
-            missing.append(
-                "whether x and y are both negated (the mask's edge is no clear outline of the object)"
-            )
+            missing.append("whether x and y are both negated (the mask's edge is no clear outline of the object)")
         return missing
 
 
@@ -166,9 +162,7 @@ def _check_frame_and_order(
         weight = 0.0
     weight = float(np.clip(weight, 0, 1))
     frames = [
-        _candidate(
-            frame.describe() or _AS_GIVEN, frame, normals.transformed(frame.matrix), found.misfit, weight
-        )
+        _candidate(frame.describe() or _AS_GIVEN, frame, normals.transformed(frame.matrix), found.misfit, weight)
         for frame in PLANE_FRAMES
         if frame.signs[0] > 0
     ]

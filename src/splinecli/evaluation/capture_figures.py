@@ -104,9 +104,7 @@ def file_stems(names: Sequence[str]) -> list[str]:
     return stems
 
 
-def _maps_figure(
-    capture: Capture, estimates: Mapping[str, NormalEstimate], stem: str, title: str
-) -> CaptureFigure:
+def _maps_figure(capture: Capture, estimates: Mapping[str, NormalEstimate], stem: str, title: str) -> CaptureFigure:
     assert capture.ground_truth is not None
     png = method_maps(
         capture.ground_truth,
@@ -123,9 +121,7 @@ def _errors(estimate: NormalEstimate) -> NDArray[np.float32]:
     return estimate.error_map_deg
 
 
-def _chosen_pixels(
-    capture: Capture, estimate: NormalEstimate, pixels: Sequence[tuple[int, int]]
-) -> NDArray[np.intp]:
+def _chosen_pixels(capture: Capture, estimate: NormalEstimate, pixels: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
     """Return the (row, column) of the pixels to show, (N, 2). Raises UsageError for one without ground truth."""
     errors = _errors(estimate)
     chosen = np.array(pixels or _typical_pixels(errors))

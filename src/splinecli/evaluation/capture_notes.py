@@ -25,9 +25,7 @@ def capture_notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str,
             f"{name}: the first {damaged} images are known to be damaged and are used;"
             f" --skip-first {name}={damaged} leaves them out."
         )
-    notes += [
-        f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN
-    ]
+    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN]
     if capture.ground_truth is not None:
         sample = sample_observations(capture.observations, capture.mask)
         wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)

@@ -40,9 +40,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         "methods": {name: dict(settings) for name, settings in evaluations[0].settings.items()},
         "results": [
             {**record, "maes_deg": [round(mae_deg, _DEGREE_DIGITS) for mae_deg in result.maes_deg]}
-            for record, result in zip(
-                _records(evaluations), (r for e in evaluations for r in e.results), strict=True
-            )
+            for record, result in zip(_records(evaluations), (r for e in evaluations for r in e.results), strict=True)
         ],
         "averages": _averages(evaluations),
         "comparisons": comparison_records(evaluations),
@@ -144,10 +142,7 @@ def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         return dict(averages[0])
     keys = _keys([evaluation.protocol for evaluation in evaluations])
     methods = dict.fromkeys(method for average in averages for method in average)
-    return {
-        method: {key: average[method] for key, average in zip(keys, averages, strict=True)}
-        for method in methods
-    }
+    return {method: {key: average[method] for key, average in zip(keys, averages, strict=True)} for method in methods}
 
 
 def _keys(protocols: Sequence[Protocol]) -> list[str]:

@@ -31,9 +31,7 @@ def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
         _panels(
             evaluations,
             x=_mean_lights,
-            tick=lambda evaluation, x: (
-                f"{x:.0f}\n(all)" if evaluation.protocol.n_lights is None else f"{x:g}"
-            ),
+            tick=lambda evaluation, x: f"{x:.0f}\n(all)" if evaluation.protocol.n_lights is None else f"{x:g}",
             series=lambda evaluation: f"light noise {evaluation.protocol.light_noise_deg:g} deg",
         ),
         label="number of lights",

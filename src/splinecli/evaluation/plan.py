@@ -118,9 +118,7 @@ class CaptureJob:
             for estimator, trials in zip(estimators, by_method, strict=True):
                 task.trials[name, estimator.name] = trials
             # All methods of a draw come together: they share its capture, and the remaining time can be estimated.
-            job.draws += [
-                list(zip(trials, estimators, strict=True)) for trials in zip(*by_method, strict=True)
-            ]
+            job.draws += [list(zip(trials, estimators, strict=True)) for trials in zip(*by_method, strict=True)]
         return job if job.tasks else None
 
     def missing(self, store: TrialStore) -> list[list[Unit]]:
@@ -182,15 +180,12 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     draws_file = read_draws(protocol.draws_file)
     if protocol.n_lights not in (None, draws_file.n_lights):
         raise UsageError(
-            f"{protocol.n_lights} lights were requested, but the draws in {draws_file.path} have"
-            f" {draws_file.n_lights}"
+            f"{protocol.n_lights} lights were requested, but the draws in {draws_file.path} have {draws_file.n_lights}"
         )
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 
-def draws_for(
-    source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None
-) -> list[Draw]:
+def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
     """Return the draws of a capture, one for each trial.
 
     Raises:

@@ -54,9 +54,7 @@ class Protocol:
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)
         if not 0 <= self.light_noise_deg <= LARGEST_SIGMA_DEG:
-            raise UsageError(
-                f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}"
-            )
+            raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}")
         if self.max_pixels is not None and self.max_pixels < 1:
             raise UsageError(f"--max-pixels is {self.max_pixels}; expected at least 1")
         for name, count in self.skip_first.items():

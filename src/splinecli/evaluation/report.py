@@ -45,9 +45,7 @@ Table = list[list[Cell]]
 """A header row, then rows whose first cell is a header."""
 
 
-def html_report(
-    evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]
-) -> str:
+def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]) -> str:
     """Return the report of one evaluation, or of several that differ in the lights or the light noise.
 
     Args:

@@ -226,9 +226,7 @@ class _Progress:
 
 def _tasks(job: CaptureJob, draws: Sequence[Sequence[Unit]]) -> list[DrawTask]:
     """Return the tasks of a capture: one for each draw, or one for the notes on it."""
-    numbers = {
-        trial: (number, unit) for number, draw in enumerate(job.draws) for unit, (trial, _) in enumerate(draw)
-    }
+    numbers = {trial: (number, unit) for number, draw in enumerate(job.draws) for unit, (trial, _) in enumerate(draw)}
     missing = tuple((numbers[draw[0][0]][0], tuple(numbers[trial][1] for trial, _ in draw)) for draw in draws)
     positions: Sequence[int | None] = range(len(draws)) if draws else [None]
     return [DrawTask(job.folder, job.name, missing, position) for position in positions]

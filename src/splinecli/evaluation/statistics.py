@@ -70,9 +70,7 @@ def compare(evaluation: Evaluation) -> tuple[Comparison, ...]:
     """
     comparisons: list[Comparison] = []
     for capture in evaluation.captures:
-        comparisons += _compare_all(
-            capture, {r.method: r.maes_deg for r in evaluation.results if r.capture == capture}
-        )
+        comparisons += _compare_all(capture, {r.method: r.maes_deg for r in evaluation.results if r.capture == capture})
     averages = {method: trial_averages(evaluation, method) for method in evaluation.methods}
     return (*comparisons, *_compare_all(AVERAGE, averages))
 
@@ -119,9 +117,7 @@ def _compare_all(capture: str, maes_deg: dict[str, tuple[float, ...]]) -> list[C
     return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in compared]
 
 
-def _compare(
-    capture: str, first: str, second: str, a: NDArray[np.float64], b: NDArray[np.float64]
-) -> Comparison:
+def _compare(capture: str, first: str, second: str, a: NDArray[np.float64], b: NDArray[np.float64]) -> Comparison:
     differences = a - b
     interval, p_value = _paired_test(differences)
     mean, std = float(differences.mean()), float(differences.std())

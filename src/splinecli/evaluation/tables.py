@@ -87,9 +87,7 @@ def _escape_markdown(text: str) -> str:
 
 
 def _latex_table(evaluation: Evaluation) -> str:
-    head, *rows = (
-        " & ".join(row) + r" \\" for row in _marked_rows(evaluation, _escape_latex, r"\textbf{{{}}}")
-    )
+    head, *rows = (" & ".join(row) + r" \\" for row in _marked_rows(evaluation, _escape_latex, r"\textbf{{{}}}"))
     best = " The best of each column in bold." if len(rows) > 1 else ""
     narrow = [r"  \footnotesize\setlength{\tabcolsep}{2pt}"] if len(evaluation.captures) > _MOST_WIDE else []
     lines = [

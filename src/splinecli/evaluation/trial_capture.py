@@ -114,9 +114,7 @@ class SharedDraw:
         progress = None if begin is None else begin(capture.n_pixels)
         estimate = estimate_normals(capture, estimator, progress=progress)
         estimated = capture.estimated_intensities is not None
-        return Score(
-            self._mean_error_deg(estimate), estimate.seconds, estimated, self._light_error_deg(capture)
-        )
+        return Score(self._mean_error_deg(estimate), estimate.seconds, estimated, self._light_error_deg(capture))
 
     def _light_error_deg(self, capture: Capture) -> float | None:
         if capture.light_errors_deg is None:
@@ -135,9 +133,7 @@ class SharedDraw:
 
     def _mean_error_deg(self, estimate: NormalEstimate) -> float:
         """Return the mean error of an estimate over the scored pixels."""
-        assert (
-            estimate.errors is not None and estimate.error_map_deg is not None
-        )  # or it would have no trials
+        assert estimate.errors is not None and estimate.error_map_deg is not None  # or it would have no trials
         rows = self._source.rows
         if rows is None or estimate.capture.n_pixels == len(rows):
             return estimate.errors.mean

@@ -48,9 +48,7 @@ class Trial:
     finds_lights: bool = False
 
     @classmethod
-    def of(
-        cls, capture: str, method: str, number: int, lights: Draw, protocol: Protocol, *, made_of: str
-    ) -> Trial:
+    def of(cls, capture: str, method: str, number: int, lights: Draw, protocol: Protocol, *, made_of: str) -> Trial:
         """Return a trial of a protocol."""
         return cls(
             capture,
@@ -155,8 +153,7 @@ def plan_trials(
     """Return the trials of one method on one capture, given the stamp of the capture's files."""
     made_of = digest([__version__, estimator.fingerprint, *stamp])
     return [
-        Trial.of(capture, estimator.name, number, draw, protocol, made_of=made_of)
-        for number, draw in enumerate(draws)
+        Trial.of(capture, estimator.name, number, draw, protocol, made_of=made_of) for number, draw in enumerate(draws)
     ]
 
 

@@ -14,9 +14,7 @@ RIDGE = 1e-12
 _TWICE_OFF_DIAGONAL = (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
 
 
-def weighted_least_squares(
-    observations: Tensor, light_directions: Tensor, weight: Tensor
-) -> tuple[Tensor, Tensor]:
+def weighted_least_squares(observations: Tensor, light_directions: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Return b = C L' W I with C = (L' W L + ridge)^-1, and the diagonal of L C L', which are the variances of L b.
 
     All arguments are float64, because weights may differ by many orders of magnitude.

@@ -171,9 +171,7 @@ def _exchange(blocks: Blocks, covered: Doubles, normals: Doubles, sent: Doubles)
     return np.asarray(factors @ sent.astype(np.float32))
 
 
-def _exposure(
-    indirect: IndirectLight, observations: Floats, light_of: LightOf, normals: Floats
-) -> float | None:
+def _exposure(indirect: IndirectLight, observations: Floats, light_of: LightOf, normals: Floats) -> float | None:
     """Return what relates the albedos, in the observations' unit, to true ones; None where indirect light is not seen.
 
     It is fitted to the attached shadows, together with ambient light that arrives everywhere alike. In a round bowl

@@ -102,9 +102,7 @@ def _boundary(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(mask & ~binary_erosion(filled, np.ones((3, 3))))
 
 
-def _rim(
-    observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array
-) -> tuple[Array, Array]:
+def _rim(observations: NDArray[np.float32], mask: NDArray[np.bool_], light_directions: Array) -> tuple[Array, Array]:
     """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards, with z = 0."""
     rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False

@@ -123,9 +123,7 @@ def find_lights(
             hint="Show the whole outline of the object and give its mask, add images with other lights, or measure the"
             " lights with 'splinecli calibrate'",
         )
-    return FoundLights(
-        directions, errors_deg, None if intensities_known else intensities / intensities.mean()
-    )
+    return FoundLights(directions, errors_deg, None if intensities_known else intensities / intensities.mean())
 
 
 def _is_better(fit: LightFit) -> bool:
@@ -174,9 +172,7 @@ def _ask_network(
     return mean.numpy(), (own + between).sqrt().rad2deg().numpy(), log_intensities.mean(dim=0).exp().numpy()
 
 
-def _view(
-    network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool
-) -> LightGuess:
+def _view(network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool) -> LightGuess:
     """Return what the network reads off turned, then mirrored images, in the frame of the images as they are."""
     images, inside = torch.rot90(images, turns, (1, 2)), torch.rot90(inside, turns, (0, 1))
     if mirrored:

@@ -35,8 +35,7 @@ def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "ev
     """Return the flat cell index row * size + column (...), int64, of unit light directions (..., 3)."""
     if grid == "cnn-ps":
         column, rising = (
-            ((light_directions[..., axis] + 1) * ((size - 1) / 2)).long().clamp(0, size - 1)
-            for axis in (0, 1)
+            ((light_directions[..., axis] + 1) * ((size - 1) / 2)).long().clamp(0, size - 1) for axis in (0, 1)
         )
         return (size - 1 - rising) * size + column
     column = ((light_directions[..., 0] + 1) * (size / 2)).long().clamp(0, size - 1)

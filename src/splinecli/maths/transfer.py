@@ -35,9 +35,9 @@ def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
     values = np.clip(linear, 0, 1)
     power = 1.055 * np.maximum(values, _LINEAR_BELOW) ** (1 / 2.4) - 0.055
-    encoded: NDArray[np.uint8] = np.rint(
-        255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)
-    ).astype(np.uint8)
+    encoded: NDArray[np.uint8] = np.rint(255 * np.where(values <= _LINEAR_BELOW, 12.92 * values, power)).astype(
+        np.uint8
+    )
     return encoded
 
 
@@ -57,9 +57,7 @@ def parse_transfer(text: str) -> float | None:
             gamma = 0.0
         if GAMMAS[0] <= gamma <= GAMMAS[1]:
             return gamma
-    raise UsageError(
-        f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"
-    )
+    raise UsageError(f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10")
 
 
 def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArray[np.float32]:

@@ -98,9 +98,7 @@ def estimate_in_batches(
         columns: number of columns that `solve` returns. Those behind the normal are not changed.
         progress: called after each batch with the number of its pixels.
     """
-    shared = (
-        torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
-    )
+    shared = torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
     results = np.empty((len(observations), columns), np.float32)
     for start in range(0, len(observations), batch_size):
         batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)

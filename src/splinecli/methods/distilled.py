@@ -40,9 +40,7 @@ _HELD_OUT = 1 / 8  # of the sample
 _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
 _RARE_SHARE = 0.01  # of the pixels, and
 _RARE_PER_SAMPLE = 2  # times the sample are the most pixels of rare kinds that go through the network
-_LARGEST_SHARE = (
-    0.7  # of the expected error; on rendered pixels, more cost 0.3 degrees and more against the truth
-)
+_LARGEST_SHARE = 0.7  # of the expected error; on rendered pixels, more cost 0.3 degrees and more against the truth
 
 
 @dataclass(frozen=True)
@@ -131,9 +129,7 @@ class DistilledEstimator:
         return normals, errors
 
     @torch.inference_mode()
-    def _apply(
-        self, observations: Observations
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    def _apply(self, observations: Observations) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """Return the perceptron's normals and errors of some pixels, and which pixels are rare or unlike the sample."""
         inputs = self._perceptron.inputs(torch.as_tensor(observations).to(self.device))
         found = self._perceptron(inputs, bfloat16=self.precision == "bfloat16")
@@ -177,13 +173,9 @@ def distil(
         inputs = perceptron.inputs(torch.as_tensor(candidates).to(teacher.device))
         rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / len(observations))
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
-        taught = teacher.estimate_with_error(
-            candidates[sample.rows.numpy()], light_directions, progress=progress
-        )
+        taught = teacher.estimate_with_error(candidates[sample.rows.numpy()], light_directions, progress=progress)
         inputs = inputs[sample.rows.to(inputs.device)]
-        normals, errors = (
-            torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught
-        )
+        normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
         held = round(_HELD_OUT * len(inputs))  # the first pixels are an even sample of all
         share = len(inputs) / size.steps
         done = 0.0

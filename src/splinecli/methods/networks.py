@@ -68,14 +68,10 @@ class NetworkEstimator:
         self.batch_size = batch_size
         self.network = loaded.network.to(device)
         refine_net = self.network.refine_net
-        self.refiner = (
-            NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
-        )
+        self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.refiner is not None:
-            self.fingerprint += (
-                f", without indirect light, refined in {self.refiner.turns} turns, with detail"
-            )
+            self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
 
     def estimate(
@@ -161,9 +157,7 @@ class NetworkEstimator:
         dense = network.interpolate(maps)
         assert dense is not None, "CNN-PS has no dense maps"
         turned = rotate_about_view_axis(
-            torch.as_tensor(all_directions, dtype=torch.float32, device=device).expand(
-                len(observations), -1, 3
-            ),
+            torch.as_tensor(all_directions, dtype=torch.float32, device=device).expand(len(observations), -1, 3),
             maps.cosine[:, None],
             maps.sine[:, None],
         )

@@ -32,9 +32,7 @@ class PixelSample:
 
     def unlike(self, features: Tensor) -> Tensor:
         """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than any group reaches."""
-        from_rare, from_others = (
-            _nearest(features, self.centres[group]) for group in (self.rare, ~self.rare)
-        )
+        from_rare, from_others = (_nearest(features, self.centres[group]) for group in (self.rare, ~self.rare))
         # Rounding must not make a pixel unlike itself.
         return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
 
@@ -48,9 +46,7 @@ def _nearest(features: Tensor, centres: Tensor) -> Tensor:
     return (rest + features.square().sum(dim=1)).clamp(min=0).sqrt()
 
 
-def draw_sample(
-    features: Tensor, size: int, generator: torch.Generator, *, rare_share: float = 0.0
-) -> PixelSample:
+def draw_sample(features: Tensor, size: int, generator: torch.Generator, *, rare_share: float = 0.0) -> PixelSample:
     """Draw a sample of `size` pixels, or half of all pixels if that is less.
 
     The pixels are grouped around centres: each further centre is the pixel farthest from all centres so far (Gonzalez,

@@ -109,9 +109,7 @@ class NetworkConfig:
         if config.set_width and config.size != "compact":
             raise ModelError("network setting 'set_width' needs the size 'compact'")
         if config.set_width % HEAD_WIDTH:
-            raise ModelError(
-                f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}"
-            )
+            raise ModelError(f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}")
         if config.grid != "even" and config.size != "paper":
             raise ModelError(f"network grid is {config.grid!r}; it needs the size 'paper'")
         return config

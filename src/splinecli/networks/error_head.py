@@ -20,9 +20,7 @@ class ErrorHead(nn.Module):
 
     def __init__(self, features: int, normals: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(features + 3 * normals, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 2)
-        )
+        self.layers = nn.Sequential(nn.Linear(features + 3 * normals, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 2))
 
     def forward(self, features: Tensor, normals: Tensor) -> Tensor:
         """Estimate from features (P, C) and normals (P, K, 3): those of the fits, and the estimate before scaling."""

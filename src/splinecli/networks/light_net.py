@@ -77,9 +77,7 @@ class LightNet(nn.Module):
         height = softplus(found[..., 2:3] + 1)
         sharpness = (3 + found[..., 3]).clamp(_LEAST_SHARPNESS, _LARGEST_SHARPNESS)
         intensities = found[..., 4] - found[..., 4].mean(dim=1, keepdim=True)
-        return LightGuess(
-            normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities
-        )
+        return LightGuess(normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities)
 
 
 def _with_all(x: Tensor, lights: int) -> Tensor:

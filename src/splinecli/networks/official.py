@@ -94,8 +94,7 @@ def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
             width = torch.Size([module.num_features])
             shapes = (width, width, torch.Size([]))
             tracked |= {
-                f"{name}.{key}".replace(ours, theirs): shape
-                for key, shape in zip(_TRACKED, shapes, strict=True)
+                f"{name}.{key}".replace(ours, theirs): shape for key, shape in zip(_TRACKED, shapes, strict=True)
             }
     return _rename(path, _read_state(path), li_net, names, tracked)
 
@@ -168,8 +167,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     except Exception as error:  # damaged pickles raise many kinds of errors
         raise ModelError("not a PyTorch checkpoint, or damaged", path=path, hint=hint) from error
     if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor)
-        for name, tensor in state.items()
+        isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor) for name, tensor in state.items()
     ):
         raise ModelError("not a state dictionary (tensors by name)", path=path, hint=hint)
     return state

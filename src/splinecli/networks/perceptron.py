@@ -80,9 +80,7 @@ class Perceptron(nn.Module):
         optimiser = torch.optim.AdamW(
             self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99), fused=True
         )
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, _LEARNING_RATE, total_steps=steps + 1, pct_start=0.1
-        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _LEARNING_RATE, total_steps=steps + 1, pct_start=0.1)
         order = torch.empty(0, dtype=torch.long)
         for _ in range(steps):
             if len(order) < BATCH:

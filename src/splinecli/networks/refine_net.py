@@ -88,9 +88,7 @@ class RefineNet(nn.Module):
         # In place where possible: a tile's maps of 32 channels decide how much memory is needed.
         read = features[:, :READ], *towards, mask
         x = self.enter(_joined(read, border, layers)).mul_(masks[0]).to(stream)
-        mask, normals, error, *towards = (
-            maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards)
-        )
+        mask, normals, error, *towards = (maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards))
         passed = []
         for scale, blocks in enumerate(self.encode):
             if scale:
@@ -137,17 +135,14 @@ def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype)
 
 def _grown(part: Part, margin: int) -> Part:
     """Return a part with a margin, up to whole pixels of the coarsest scale. It may end behind the map."""
-    rows, columns = (
-        slice(max(0, side.start - margin), side.stop + -side.stop % COARSEST + margin) for side in part
-    )
+    rows, columns = (slice(max(0, side.start - margin), side.stop + -side.stop % COARSEST + margin) for side in part)
     return rows, columns
 
 
 def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
     """Return the index of a part in a map of a scale that begins at the pixel `origin`."""
     rows, columns = (
-        slice(side.start - start >> scale, side.stop - start >> scale)
-        for side, start in zip(part, origin, strict=True)
+        slice(side.start - start >> scale, side.stop - start >> scale) for side, start in zip(part, origin, strict=True)
     )
     return ..., rows, columns
 

@@ -90,9 +90,7 @@ class _AttentionLayer(nn.Module):
         return out
 
 
-def _token_features(
-    observed: Tensor, lights: Tensor, residual: Tensor, normals: Tensor
-) -> tuple[Tensor, ...]:
+def _token_features(observed: Tensor, lights: Tensor, residual: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
     half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
     return (
         lights,

@@ -152,9 +152,7 @@ class SplineNet(nn.Module):
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
         angle = torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
         cosine, sine = angle.cos(), angle.sin()
-        lights = rotate_about_view_axis(
-            light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
-        )
+        lights = rotate_about_view_axis(light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None])
         scaled_normals = rotate_about_view_axis(torch.stack((x, y, z), dim=-1), cosine, sine)
         fitted = fit_normals(self.config.fits, observed, light_directions, valid)
         fitted = rotate_about_view_axis(fitted, cosine[:, None], sine[:, None])
@@ -206,9 +204,7 @@ class SplineNet(nn.Module):
             normals = torch.cat((maps.lambertian_normals[:, None], maps.fitted_normals), dim=1)
             features = None
             if self.set_branch is not None:
-                features, fitted = self.set_branch(
-                    maps.observed, maps.lights, maps.residuals, maps.valid, normals
-                )
+                features, fitted = self.set_branch(maps.observed, maps.lights, maps.residuals, maps.valid, normals)
                 normals = torch.cat((normals, fitted[:, None]), dim=1)
             raw, error = self.ne_net(torch.cat((*channels, *interpolated), dim=1), normals, features)
         return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)

@@ -217,9 +217,7 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         path = Path(name_or_file).expanduser()
         if path.suffix != ".safetensors" and path.parent == Path() and not _exists(path):
             names = ", ".join(shipped_names())
-            raise ModelError(
-                f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file"
-            )
+            raise ModelError(f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors file")
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:
         _check_shipped(path, entry["sha256"], name_or_file)

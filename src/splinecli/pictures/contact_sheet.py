@@ -65,6 +65,4 @@ def _fit(picture: NDArray[np.unsignedinteger], tile: int) -> Picture:
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
     missing = (tile - size[1], tile - size[0])
-    return np.pad(
-        small, ((missing[0] // 2, -(-missing[0] // 2)), (missing[1] // 2, -(-missing[1] // 2)), (0, 0))
-    )
+    return np.pad(small, ((missing[0] // 2, -(-missing[0] // 2)), (missing[1] // 2, -(-missing[1] // 2)), (0, 0)))

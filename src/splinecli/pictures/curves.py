@@ -84,16 +84,12 @@ def error_curves(panels: Sequence[Panel], *, label: str, logarithmic: bool = Fal
 
 def _draw_curve(axes: Axes, points: Sequence[Point], style: MethodStyle, dashes: _Dashes) -> None:
     x, mae_deg, std_deg = np.array(points).T
-    axes.plot(
-        x, mae_deg, color=style.colour, marker=style.marker, markersize=4, linewidth=1.2, linestyle=dashes
-    )
+    axes.plot(x, mae_deg, color=style.colour, marker=style.marker, markersize=4, linewidth=1.2, linestyle=dashes)
     if std_deg.any():
         axes.fill_between(x, mae_deg - std_deg, mae_deg + std_deg, color=style.colour, alpha=0.2, linewidth=0)
 
 
-def _add_legend(
-    figure: Figure, styles: Mapping[str, MethodStyle], dashes: Mapping[str, _Dashes], across: int
-) -> None:
+def _add_legend(figure: Figure, styles: Mapping[str, MethodStyle], dashes: Mapping[str, _Dashes], across: int) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
@@ -101,9 +97,7 @@ def _add_legend(
         for method, style in styles.items()
     ]
     if len(dashes) > 1:
-        handles += [
-            Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in dashes.items()
-        ]
+        handles += [Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in dashes.items()]
     columns = min(len(handles), 2 * across)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=_SMALL)
 

@@ -45,9 +45,7 @@ def error_map_picture(error_map_deg: NDArray[np.floating], *, top_deg: float = T
     factor = max(1, min(-(-_SMALLEST_HEIGHT // height), _LARGEST_ENLARGED // width))
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
     missing = max(0, _SMALLEST_HEIGHT - len(picture))
-    picture = np.pad(
-        picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=_BACKGROUND
-    )
+    picture = np.pad(picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=_BACKGROUND)
     return np.hstack([picture, _colour_bar(len(picture), top_deg)])
 
 

@@ -92,9 +92,7 @@ def _outcomes(
     yield from _on_workers(members, options, observer, redo, cluster)
 
 
-def _one_by_one(
-    members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo
-) -> Iterator[Outcome]:
+def _one_by_one(members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo) -> Iterator[Outcome]:
     """Yield the outcomes of captures that this process computes."""
     estimator: Estimator | None = None
 

@@ -59,9 +59,7 @@ def distil_for(
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-                distilled = distil(
-                    estimator, capture.observations, capture.light_directions, size, progress=advance
-                )
+                distilled = distil(estimator, capture.observations, capture.light_directions, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
             return _refuse(wanted, f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:

@@ -86,9 +86,7 @@ class Work:
         """Make this worker ready. Raises UsageError or InputError if it does not fit, and what `prepare` raises."""
         for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
             if found != expected:
-                raise UsageError(
-                    f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS
-                )
+                raise UsageError(f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS)
         try:
             os.chdir(self.folder)
         except OSError as error:
@@ -98,9 +96,7 @@ class Work:
         deadline = time.monotonic() + _PROBE_SECONDS
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
-                raise InputError(
-                    "the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE
-                )
+                raise InputError("the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE)
             time.sleep(0.1)
         keep_freed_memory()
         self.prepare(self.settings)

@@ -70,9 +70,7 @@ def estimate_capture(
             return observer.progress(f"{capture.name}: {name}", capture.n_pixels, unit="pixels")
 
         advance = stages.enter_context(stage("estimating"))
-        estimate = estimate_normals(
-            capture, distilled or estimator, progress=progress or advance, stage=stage
-        )
+        estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
     warnings += [*found, *_untrained_lights(estimator, capture), *check_confidence(estimate.expected_under_5)]
     refuse_if_strict(warnings, capture.name, strict=strict)
     return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled

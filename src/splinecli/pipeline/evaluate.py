@@ -236,9 +236,7 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
-            raise UsageError(
-                f"{protocol.n_lights} lights were requested, but the captures have at most {most}"
-            )
+            raise UsageError(f"{protocol.n_lights} lights were requested, but the captures have at most {most}")
 
 
 def _default_jobs(estimators: Sequence[Estimator]) -> int:
@@ -275,9 +273,7 @@ def _draw_figures(
     with observer.progress("drawing", len(names)) as advance:
         for name, stem in zip(names, file_stems(names), strict=True):
             try:
-                figures += capture_figures(
-                    folders[name], name, stem, estimators, evaluation.protocol, pixels, advance
-                )
+                figures += capture_figures(folders[name], name, stem, estimators, evaluation.protocol, pixels, advance)
             except (InputError, UsageError) as error:
                 problems.append(str(error))
     return figures, problems
@@ -291,6 +287,4 @@ def _untrained(evaluations: Sequence[Evaluation]) -> list[str]:
     from splinecli.networks.weights import untrained_warning
 
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
-    return [
-        warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)
-    ]
+    return [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]

@@ -127,9 +127,7 @@ def make_method(options: InferOptions) -> Estimator:
     if options.weights is not None and estimator.weights is None:
         raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
     if "confidence" in options.maps and not tells_confidence(estimator):
-        raise UsageError(
-            f"method {options.method} gives no confidence", hint="Leave confidence out of --maps"
-        )
+        raise UsageError(f"method {options.method} gives no confidence", hint="Leave confidence out of --maps")
     return estimator
 
 

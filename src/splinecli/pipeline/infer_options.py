@@ -76,9 +76,7 @@ class InferOptions(Reading):
         if self.mask is not None and self.auto_mask:
             raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
         if self.finds_lights and self.refine_lights:
-            raise UsageError(
-                "--lights estimate refines the lights that it finds", hint="Leave --refine-lights out"
-            )
+            raise UsageError("--lights estimate refines the lights that it finds", hint="Leave --refine-lights out")
         check_method(self.method)
         check_pixel_size(self.pixel_size if self.surface else None)
         if not (isfinite(self.stiffness) and self.stiffness >= 0):
@@ -97,9 +95,7 @@ class InferOptions(Reading):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as JSON values."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> InferOptions:

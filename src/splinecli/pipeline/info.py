@@ -207,9 +207,7 @@ def _sky_plot(source: CaptureSource, found: FoundLights | None) -> bytes:
 
 def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any]:
     source, files, level = summary.source, summary.source.files, summary.white_level
-    kinds = sorted(
-        {(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images}
-    )
+    kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
     seconds = STARTING_SECONDS + _seconds(summary)
@@ -222,8 +220,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "first_image": summary.images[0].path.name,
         "last_image": summary.images[-1].path.name,
         "image_kinds": [
-            {"size": [width, height], "channels": channels, "type": dtype}
-            for width, height, channels, dtype in kinds
+            {"size": [width, height], "channels": channels, "type": dtype} for width, height, channels, dtype in kinds
         ],
         "reads": source.window.in_words(),
         "n_pixels": summary.n_pixels,

@@ -179,8 +179,7 @@ def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[report["unit"]]
     low, high = report["range"]
     return (
-        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit},"
-        f" {report['seconds']:.1f} s"
+        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit}, {report['seconds']:.1f} s"
     )
 
 
@@ -206,9 +205,7 @@ def _find_normal_map(folder: Path) -> Path:
         problem = f"the folder has no whole results of infer: it {error}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
-    raise InputError(
-        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
-    )
+    raise InputError(problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files")
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:

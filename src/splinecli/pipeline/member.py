@@ -76,9 +76,7 @@ def run_member(
         return outcome
     estimator = method()
     try:
-        return Outcome(
-            member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator)
-        )
+        return Outcome(member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator))
     except Exception as error:
         return _failure(member, error)
 

@@ -103,9 +103,7 @@ def _add_captures(
     return skipped
 
 
-def _add_capture(
-    writer: PixelSetWriter, name: str, folder: Path, options: PrepareOptions
-) -> SplinecliError | None:
+def _add_capture(writer: PixelSetWriter, name: str, folder: Path, options: PrepareOptions) -> SplinecliError | None:
     """Add a capture, or return why it cannot be used. Raises OutputError if the set cannot be written."""
     try:
         add_capture(
@@ -123,9 +121,7 @@ def _add_capture(
     return None
 
 
-def _add_scenes(
-    writer: PixelSetWriter, options: PrepareOptions, observer: Observer, advance: Advance
-) -> None:
+def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Observer, advance: Advance) -> None:
     plan = options.scenes
     cluster = None if options.cluster is None else options.cluster.on_cores(len(plan.names))
     if cluster is not None:

@@ -51,9 +51,7 @@ def make_surface(
 
     depth = integrate_normals(normal_map, mask, camera_matrix, stiffness=stiffness, progress=progress)
     if n_triangles is None:
-        mesh = surface_mesh(
-            depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step
-        )
+        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
     else:
         fine = mesh_to_decimate(
             depth,
@@ -108,14 +106,10 @@ def view_of_report(
 def check_pixel_size(pixel_size: float | None) -> None:
     """Raise UsageError for a pixel size (mm) out of range."""
     if pixel_size is not None and not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
-        raise UsageError(
-            f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"
-        )
+        raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}")
 
 
-def _report(
-    surface: Surface, perspective: bool, stiffness: float, pixel_size_mm: float | None
-) -> dict[str, Any]:
+def _report(surface: Surface, perspective: bool, stiffness: float, pixel_size_mm: float | None) -> dict[str, Any]:
     import numpy as np
 
     return {

@@ -111,9 +111,7 @@ def _changed(name: str, difference: str, folder: Path) -> CaptureChangedError:
     problem = f"its entry {name} was made with {difference}"
     if difference.startswith("files ="):
         problem = f"its files changed since the entry {name} was made"
-    return CaptureChangedError(
-        problem, path=folder, hint="Add --update to read it again, or choose another -o"
-    )
+    return CaptureChangedError(problem, path=folder, hint="Add --update to read it again, or choose another -o")
 
 
 def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:

@@ -156,9 +156,7 @@ def load_rendered(path: Path, kind: str) -> Pixels:
         return Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS})
 
 
-def render_planned(
-    plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None
-) -> RenderedScene:
+def render_planned(plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None) -> RenderedScene:
     """Render a scene of the plan. Raises what add_scene raises."""
     mesh_file = plan.meshes[position] if position < len(plan.meshes) else None
     mesh = None if mesh_file is None else read_mesh(mesh_file)

@@ -41,9 +41,7 @@ class SampledPixels:
     def rotate(self, cosine: Tensor, sine: Tensor) -> SampledPixels:
         """Rotate each pixel about the view axis by its own angle, given as cosine (P,) and sine (P,)."""
         lights = rotate_about_view_axis(self.light_directions, cosine[:, None], sine[:, None])
-        return SampledPixels(
-            rotate_about_view_axis(self.normals, cosine, sine), self.radiance, lights, self.known
-        )
+        return SampledPixels(rotate_about_view_axis(self.normals, cosine, sine), self.radiance, lights, self.known)
 
     def dense_truth(self, size: int) -> DenseMap:
         """Return the observation maps (P, 1, size, size) of all lights, with gaps interpolated."""
@@ -88,9 +86,7 @@ class PixelSetSource:
         )
         order, valid = self._choose_lights(truth, counts)
         directions = truth.light_directions.gather(1, order[..., None].expand(*order.shape, 3))
-        return photograph(
-            truth, truth.radiance.gather(1, order), directions, valid, self.config, self.generator
-        )
+        return photograph(truth, truth.radiance.gather(1, order), directions, valid, self.config, self.generator)
 
     def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
         """Return light indices (P, K) and which of them are used, counts (P,) in each row."""
@@ -125,9 +121,7 @@ class PixelSetSource:
             self._bytes_read += len(rows) * (_READ_AHEAD_BYTES + observations[0].nbytes)
         if self._bytes_read > _MAPPED_BYTES:
             self._observations, self._bytes_read = {}, 0
-        return SampledPixels(
-            *(torch.from_numpy(array).to(device) for array in (normals, radiance, directions, known))
-        )
+        return SampledPixels(*(torch.from_numpy(array).to(device) for array in (normals, radiance, directions, known)))
 
     def _arrays(self, index: int) -> tuple[NDArray[np.floating], NDArray[np.float32], NDArray[np.float32]]:
         """Return an entry's observations, which stay on disk, its normals and its light directions."""

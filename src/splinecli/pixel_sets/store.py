@@ -125,9 +125,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise InputError(f"not JSON ({error})", path=path) from error
     found = manifest.get("format") if isinstance(manifest, dict) else None
     if found != FORMAT:
-        raise InputError(
-            f"not the manifest of a pixel set: found format {found!r}, expected {FORMAT!r}", path=path
-        )
+        raise InputError(f"not the manifest of a pixel set: found format {found!r}, expected {FORMAT!r}", path=path)
     valid: dict[str, Any] = manifest
     return valid
 

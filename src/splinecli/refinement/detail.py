@@ -49,8 +49,7 @@ def restore_detail(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
     normals, least_squares = features[:3], features[:3] + features[channels("plain")]
     mask = mask * least_squares.any(dim=0)  # black pixels show nothing
     removed, missing, noise = (
-        _detail(maps, mask)
-        for maps in (normals - refined, least_squares - refined, features[channels("noise")])
+        _detail(maps, mask) for maps in (normals - refined, least_squares - refined, features[channels("noise")])
     )
 
     def energy(one: Tensor, other: Tensor) -> Tensor:

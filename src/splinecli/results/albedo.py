@@ -63,9 +63,7 @@ def albedo_map(
             colours /= np.float32(capture.estimated_intensities[position])
         weight = cosine
         if capture.restored is not None:
-            weight = cosine * np.where(
-                capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1)
-            )
+            weight = cosine * np.where(capture.restored[:, position], np.float32(RESTORED_WEIGHT), np.float32(1))
         colours *= weight[:, None]  # in place, because large captures need the memory
         total += colours
         squares += weight * cosine

@@ -142,9 +142,7 @@ def read_report(folder: Path) -> dict[str, Any]:
         raise UnfinishedError(f"has no {REPORT}")
     report: dict[str, Any] = read_json(folder / REPORT)
     files, sizes = report["files"], report.get("file_sizes", {})  # earlier versions stated no sizes
-    if not (
-        isinstance(files, list) and all(isinstance(name, str) for name in files) and isinstance(sizes, dict)
-    ):
+    if not (isinstance(files, list) and all(isinstance(name, str) for name in files) and isinstance(sizes, dict)):
         raise ValueError("the report has no list of files, or no sizes")
     # The mask is made to be edited, and `integrate` may have replaced the surface.
     changeable = (
@@ -158,9 +156,7 @@ def read_report(folder: Path) -> dict[str, Any]:
         if path.parent != folder or not is_plain(path):
             raise UnfinishedError(f"contains earlier results, but {name} is missing")
         if name in sizes and path.stat().st_size != sizes[name]:
-            raise UnfinishedError(
-                f"contains earlier results, but {name} has another size than {REPORT} states"
-            )
+            raise UnfinishedError(f"contains earlier results, but {name} has another size than {REPORT} states")
     return report
 
 
@@ -184,9 +180,7 @@ def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], conventi
     else:
         import tifffile
 
-        tifffile.imwrite(
-            file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}"
-        )
+        tifffile.imwrite(file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}")
 
 
 def write_error_map(error_map_deg: NDArray[np.float32], new: NewFiles) -> None:

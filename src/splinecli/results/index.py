@@ -156,6 +156,4 @@ def check_index_free(folder: Path, *, overwrite: bool) -> None:
     """Raise OutputError if the folder has an index.html that splinecli did not write and may not replace."""
     path = folder / INDEX
     if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
-        raise OutputError(
-            "was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o"
-        )
+        raise OutputError("was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o")

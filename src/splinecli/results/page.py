@@ -171,9 +171,7 @@ def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> lis
 def _seconds(of_stages: Mapping[str, float]) -> list[str]:
     """Return the seconds of the stages up to this page."""
     return [
-        f"{name.replace('_', ' ')} {seconds:g}"
-        for name, seconds in of_stages.items()
-        if seconds and name != "total"
+        f"{name.replace('_', ' ')} {seconds:g}" for name, seconds in of_stages.items() if seconds and name != "total"
     ]
 
 

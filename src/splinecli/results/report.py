@@ -52,9 +52,7 @@ def report_of(
         "light_indices": list(capture.light_indices),
         "light_file": None if light_file is None else str(light_file.absolute()),
         "light_directions": capture.light_directions.round(6).tolist(),
-        "light_errors_deg": None
-        if capture.light_errors_deg is None
-        else capture.light_errors_deg.round(2).tolist(),
+        "light_errors_deg": None if capture.light_errors_deg is None else capture.light_errors_deg.round(2).tolist(),
         "near_lamps": None if capture.lamps is None else capture.lamps.as_dict(),
         "estimated_intensities": None if intensities is None else intensities.round(4).tolist(),
         "n_pixels": capture.n_pixels,

@@ -54,9 +54,7 @@ def decimate(
     simplify = import_extra("fast_simplification", "mesh").simplify
     # The thresholds of the library are lengths: give it pixels.
     pixel = 1 if camera_matrix is None else 1 / focal_length(camera_matrix)
-    vertices, triangles = simplify(
-        mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles
-    )
+    vertices, triangles = simplify(mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles)
     if not len(triangles):
         raise InputError(f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate")
     vertices = vertices * pixel

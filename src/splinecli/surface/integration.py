@@ -143,9 +143,7 @@ def _mask_of_normals(normal_map: NDArray[np.floating]) -> NDArray[np.bool_]:
     return mask
 
 
-def _depth_map(
-    heights: Floats, mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None
-) -> Floats:
+def _depth_map(heights: Floats, mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None) -> Floats:
     from scipy.ndimage import label
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
@@ -159,9 +157,7 @@ def _check_maps(normal_map: NDArray[np.floating], mask: NDArray[np.bool_]) -> No
     if mask.ndim != 2 or mask.dtype != np.bool_:
         raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
     if normal_map.shape != (*mask.shape, 3):
-        raise UsageError(
-            f"the normal map has shape {normal_map.shape}, expected {(*mask.shape, 3)} for this mask"
-        )
+        raise UsageError(f"the normal map has shape {normal_map.shape}, expected {(*mask.shape, 3)} for this mask")
     if not mask.any():
         raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
     wrong = mask.copy()

@@ -60,9 +60,7 @@ class LaplacianSolver:
         matrix = self._laplacian(weights + _DAMPING_OF_GAPS)
         if self._n_pixels > MULTIGRID_PIXELS:
             inverse = diags(1 / matrix.diagonal())
-            detail, _ = cg(
-                matrix, self._divergence(flows), rtol=precision, maxiter=_STEPS_OF_DETAIL, M=inverse
-            )
+            detail, _ = cg(matrix, self._divergence(flows), rtol=precision, maxiter=_STEPS_OF_DETAIL, M=inverse)
             return np.asarray(detail, np.float64)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.

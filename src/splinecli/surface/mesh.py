@@ -159,9 +159,7 @@ def _triangles(heights: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
     # The corners of each square, counter-clockwise from the top left (y is up).
-    squares = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1).reshape(
-        -1, 4
-    )
+    squares = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1).reshape(-1, 4)
     inside = squares >= 0
     whole = squares[inside.all(axis=1)]
     step = np.abs(heights[whole[:, :2]] - heights[whole[:, 2:]])
@@ -188,9 +186,7 @@ def _check(
     if depth.shape != mask.shape:
         raise UsageError(f"the depth has shape {depth.shape}, expected {mask.shape} for this mask")
     if colours is not None and (colours.shape != (*mask.shape, 3) or colours.dtype != np.uint8):
-        raise UsageError(
-            f"the colours are {colours.dtype} {colours.shape}, expected uint8 {(*mask.shape, 3)}"
-        )
+        raise UsageError(f"the colours are {colours.dtype} {colours.shape}, expected uint8 {(*mask.shape, 3)}")
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
     if not mask.any():

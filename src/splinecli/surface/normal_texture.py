@@ -16,9 +16,7 @@ from splinecli.maths.normals import unit
 from splinecli.surface.mesh import fill_outside
 
 _TRIANGLES = 50_000  # at a time
-_OUTSIDE = (
-    1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
-)
+_OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
 _FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing
 _LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
 

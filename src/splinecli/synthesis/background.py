@@ -18,9 +18,7 @@ _WIDEST_RIM = 12
 """Most pixels by which a careless mask is too wide."""
 
 
-def add_background(
-    maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that shows some of it.
 
     A third of the backgrounds are nearly dark. The others are plates of draw_engraved in the shadow of the object, at

@@ -131,9 +131,7 @@ def join_batches(batches: Sequence[PixelBatch]) -> PixelBatch:
         fields = [getattr(batch, name) for batch in batches]
         return torch.cat(
             [
-                torch.cat(
-                    (field, field.new_zeros(len(field), lights - field.shape[1], *field.shape[2:])), dim=1
-                )
+                torch.cat((field, field.new_zeros(len(field), lights - field.shape[1], *field.shape[2:])), dim=1)
                 for field in fields
             ]
         )
@@ -156,9 +154,7 @@ def photograph(
     generator: torch.Generator,
 ) -> PixelBatch:
     """Photograph radiance (P, F) under directions (P, F, 3) with the faults of a camera and of a calibration."""
-    intensities = draw_light_intensities(
-        len(radiance), radiance.shape[1], config.unequal_lights_share, generator
-    )
+    intensities = draw_light_intensities(len(radiance), radiance.shape[1], config.unequal_lights_share, generator)
     radiance = radiance * valid
     exposure = draw_exposure(radiance * intensities, config.saturated_share, generator)
     exposed = (radiance * intensities * exposure).clamp(max=1)
@@ -166,9 +162,7 @@ def photograph(
     if config.sensor_noise:
         exposed = quantise(add_sensor_noise(exposed, generator), config.eight_bit_share, generator)
     exposed = torch.where(clipped, 1, exposed)
-    observed = disturb_light_intensities(
-        exposed * valid / intensities, config.light_intensity_error_share, generator
-    )
+    observed = disturb_light_intensities(exposed * valid / intensities, config.light_intensity_error_share, generator)
     calibrated = disturb_light_directions(directions, config.light_direction_error_share, generator)
     restored = restore(observed, clipped & valid, calibrated, valid, generator)
     return PixelBatch(restored, calibrated, valid, truth, exposure)

@@ -50,9 +50,7 @@ class Wall:
         along = dot(self.azimuth, directions)
         quarter_turn = torch.stack((-self.azimuth[:, 1], self.azimuth[:, 0], self.azimuth[:, 2]), dim=-1)
         across = dot(quarter_turn, directions).abs()
-        depth = torch.minimum(
-            self.tan_height * along - directions[..., 2], self.tan_half_width * along - across
-        )
+        depth = torch.minimum(self.tan_height * along - directions[..., 2], self.tan_half_width * along - across)
         return 1 - (depth / self.softness).clamp(0, 1)
 
     def reflected(self, normals: Tensor, material: PrincipledMaterial, directions: Tensor) -> Tensor:

@@ -107,9 +107,7 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
     return torch.where(eight & (kind < 0.5), encoded, torch.where(eight & (kind < 0.75), cut, rounded))
 
 
-def restore(
-    observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator
-) -> Tensor:
+def restore(observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
     """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full scale.
 
     Args:

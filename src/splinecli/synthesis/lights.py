@@ -115,10 +115,7 @@ def _draw_line(pixels: int, lights: int, generator: torch.Generator) -> Points:
 
     They are off the line by a sigma of sin U(1, 10) degrees, so that they lie nearly in one plane.
     """
-    x = (
-        draw_uniform(generator, pixels, lights, low=-1)
-        * _uniform_deg(generator, pixels, 1, low=30, high=85).sin()
-    )
+    x = draw_uniform(generator, pixels, lights, low=-1) * _uniform_deg(generator, pixels, 1, low=30, high=85).sin()
     sigma = _uniform_deg(generator, pixels, 1, low=1, high=10).sin()
     return x, draw_uniform(generator, pixels, 1, high=0.5) + sigma * _normal(generator, pixels, lights)
 

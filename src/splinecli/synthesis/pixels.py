@@ -112,9 +112,7 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     normals = draw_visible_normals(pixels, generator)
     material = draw_material(pixels, generator)
     walls = tuple(
-        draw_wall(
-            normals, share, generator, shadows=config.cast_shadows, interreflections=config.interreflections
-        )
+        draw_wall(normals, share, generator, shadows=config.cast_shadows, interreflections=config.interreflections)
         for share in (config.wall_share, config.second_wall_share)
         if share > 0 and (config.cast_shadows or config.interreflections)
     )
@@ -142,9 +140,7 @@ class PixelGenerator:
         """Draw a batch of P pixels, each with its own rig. F is the largest number of lights."""
         config, generator = self.config, self.generator
         scene = draw_scene(pixels, config, generator)
-        counts = draw_light_counts(
-            pixels, config.min_lights, config.max_lights, config.usual_lights, generator
-        )
+        counts = draw_light_counts(pixels, config.min_lights, config.max_lights, config.usual_lights, generator)
         true_directions = draw_light_directions(pixels, int(counts.max()), generator)
         valid = torch.arange(true_directions.shape[1], device=counts.device) < counts[:, None]
         return photograph(scene, scene.radiance(true_directions), true_directions, valid, config, generator)

@@ -166,9 +166,7 @@ def draw_material(
     )
 
 
-def draw_class(
-    name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False
-) -> PrincipledMaterial:
+def draw_class(name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False) -> PrincipledMaterial:
     """Draw materials of one of CLASSES; see draw_material.
 
     Args:
@@ -187,9 +185,7 @@ def with_one_gloss(material: PrincipledMaterial) -> PrincipledMaterial:
     return replace(first, base=material.base)
 
 
-def _facets(
-    n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor
-) -> Tensor:
+def _facets(n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor) -> Tensor:
     """Return the facets' distribution times their shadowing; GGX where the tail exponent is 2."""
     alpha_squared = (roughness**4).clamp(min=1e-4)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1

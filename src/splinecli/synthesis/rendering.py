@@ -66,9 +66,7 @@ def render_direct(
             some = slice(first * visible.samples_per_pixel, (first + block) * visible.samples_per_pixel)
             target = slice(start + first, min(start + first + block, pixels))
             for name, material in materials.items():
-                shaded = material.take(patches[some]).shade(
-                    cosines[some], normals[some, 2:], directions[:, 2]
-                )
+                shaded = material.take(patches[some]).shade(cosines[some], normals[some, 2:], directions[:, 2])
                 shape = (-1, visible.samples_per_pixel, len(lights))
                 torch.mean(shaded.view(shape), dim=1, out=radiance[name][target])
         progress((rows[-1] + 1) / pixels)

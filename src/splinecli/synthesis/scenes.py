@@ -114,9 +114,7 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     render_seed = int(rng.integers(2**62))
     materials: dict[str, PrincipledMaterial] = {}
     for name in CLASSES:
-        torch.rand(
-            (), generator=generator
-        )  # not used, but drawn by earlier versions, whose scenes stay the same
+        torch.rand((), generator=generator)  # not used, but drawn by earlier versions, whose scenes stay the same
         materials[name] = draw_class(name, patches, generator, one_gloss=one_gloss)
     # The shape comes last, because the number of random values that it needs varies.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
@@ -126,9 +124,7 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     return Scene(f"{index:05d}", shape, mesh, lights, materials, patch_of_face, render_seed)
 
 
-def render_scene(
-    scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None
-) -> RenderedScene:
+def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
     """Render the scene in all its materials.
 
     Args:

@@ -113,12 +113,8 @@ def _draw_folds(rng: np.random.Generator, frequencies: Range, slopes: Range) -> 
 
 def draw_carved(rng: np.random.Generator) -> Mesh | None:
     """Draw three to seven merged and bent solids with three to eight pieces cut out, often with folds."""
-    solids = [
-        _place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5)) for _ in range(rng.integers(3, 8))
-    ]
-    tools = [
-        _place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7)) for _ in range(rng.integers(3, 9))
-    ]
+    solids = [_place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5)) for _ in range(rng.integers(3, 8))]
+    tools = [_place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7)) for _ in range(rng.integers(3, 9))]
     blend, seam = rng.uniform(0.05, 0.25), rng.uniform(0.02, 0.08)
     bend = _draw_waves(rng, (0.4, 0.9), (0.1, 0.5), outputs=3)
     folds = _draw_folds(rng, (0.9, 2.2), (0.2, 0.8)) if rng.random() < 0.55 else None
@@ -143,9 +139,7 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
     detail = drawn(rng, (1.2, 2.4), (0.2, 0.7))
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
     craters = [
-        _place(
-            ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8)
-        )
+        _place(ellipsoid((rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)), rng, (0.5, 0.8))
         for _ in range(rng.integers(0, 9))
     ]
 
@@ -165,9 +159,7 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
     """Draw a slab that fills the frame, folded into ridges, valleys and overhangs."""
     swell, folds = _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), _draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
     bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
-    pits = [
-        _place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0)) for _ in range(rng.integers(0, 6))
-    ]
+    pits = [_place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0)) for _ in range(rng.integers(0, 6))]
     slab = box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
 
     def distance(points: Floats) -> Floats:
@@ -190,9 +182,7 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     flutes, twist = int(rng.integers(3, 13)), rng.uniform(-2, 2)
     depth = rng.uniform(0.1, 0.5) / flutes if rng.random() < 0.5 else 0.0
     folds = _draw_folds(rng, (0.8, 2.0), (0.1, 0.4)) if rng.random() < 0.5 else None
-    extras = [
-        _place(_draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6)) for _ in range(rng.integers(0, 4))
-    ]
+    extras = [_place(_draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6)) for _ in range(rng.integers(0, 4))]
     if rng.random() < 0.5:
         extras = []
     floor = np.float32(-half_height + 2 * wall)

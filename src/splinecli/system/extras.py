@@ -43,6 +43,4 @@ def import_extra(
         return importlib.import_module(module)
     except ImportError as cause:
         alternative = f", or {otherwise}" if otherwise else ""
-        raise error(
-            _PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
-        ) from cause
+        raise error(_PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}") from cause

@@ -131,9 +131,7 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         # NumPy tells only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
-        raise OutputError(
-            f"cannot be written ({reason})", path=path, hint="Choose another place with -o"
-        ) from error
+        raise OutputError(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
 
 
 def check_writable(folder: Path) -> None:
@@ -153,9 +151,7 @@ def check_writable(folder: Path) -> None:
             "found a file, expected a folder for the results", path=place, hint="Choose another place with -o"
         )
     if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError(
-            "no permission to write into this folder", path=place, hint="Choose another place with -o"
-        )
+        raise OutputError("no permission to write into this folder", path=place, hint="Choose another place with -o")
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:

@@ -27,9 +27,7 @@ UNDONE = "an interrupted run left unfinished files, which are removed"
 
 
 @contextmanager
-def held_folder(
-    folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False
-) -> Iterator[None]:
+def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False) -> Iterator[None]:
     """Make a folder, lock it, and remove the unfinished files that a killed process left directly in it.
 
     A folder that was made here and is empty at the end is removed, as are its parents.
@@ -141,9 +139,7 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
 def refuse_link(folder: Path) -> None:
     """Raise OutputError if a link stands in the place of a folder: it may lead anywhere."""
     if folder.is_symlink():
-        raise RefusedFolderError(
-            "found a link, expected a folder", path=folder, hint="Remove it, or choose another -o"
-        )
+        raise RefusedFolderError("found a link, expected a folder", path=folder, hint="Remove it, or choose another -o")
 
 
 def is_plain(path: Path) -> bool:

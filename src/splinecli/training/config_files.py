@@ -32,9 +32,7 @@ def read_config_file(path: Path) -> Settings:
     except RecursionError:
         raise ModelError("is nested too deeply", path=path) from None
     except ValueError as error:  # raised by both decoders
-        raise ModelError(
-            f"is not {'JSON' if path.suffix == '.json' else 'TOML'} ({error})", path=path
-        ) from error
+        raise ModelError(f"is not {'JSON' if path.suffix == '.json' else 'TOML'} ({error})", path=path) from error
     if not isinstance(values, dict):
         raise ModelError("is not a table of settings", path=path)
     return values
@@ -74,9 +72,7 @@ def parse_light_counts(text: str) -> dict[str, int]:
     try:
         fewest, most = int(low), int(high if dash else low)
     except ValueError:
-        raise UsageError(
-            f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96"
-        ) from None
+        raise UsageError(f"--n-lights is {text!r}; expected a number such as 10, or a range such as 4-96") from None
     if not 3 <= fewest <= most:
         raise UsageError(f"--n-lights is {text!r}; expected at least 3 lights, the smaller number first")
     return {"min_lights": fewest, "max_lights": most, "usual_lights": min(max(10, fewest), most)}
@@ -166,9 +162,7 @@ def configure_resumed(
 
 def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:
     """Make paths absolute, so that a run can continue from another working folder."""
-    sources = {
-        name if name == GENERATOR else _absolute(name): weight for name, weight in config.sources.items()
-    }
+    sources = {name if name == GENERATOR else _absolute(name): weight for name, weight in config.sources.items()}
     start_from = config.start_from
     if start_from not in shipped_names() and Path(start_from).suffix == ".safetensors":
         start_from = _absolute(start_from)

@@ -107,9 +107,7 @@ class Trainer:
         self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
         self.counters = RunCounters()
         if resume:
-            self.counters = load_checkpoint(
-                folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets
-            )
+            self.counters = load_checkpoint(folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)

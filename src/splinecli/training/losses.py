@@ -45,9 +45,7 @@ def map_loss(dense: Tensor, truth: Tensor, known: Tensor, norm: Norm = "mean") -
     return _over(known, (dense - truth).abs(), norm)
 
 
-def masked_map_loss(
-    dense: Tensor, truth: Tensor, known: Tensor, occupied: Tensor, norm: Norm = "mean"
-) -> Tensor:
+def masked_map_loss(dense: Tensor, truth: Tensor, known: Tensor, occupied: Tensor, norm: Norm = "mean") -> Tensor:
     """Return |M_s o (D - D_gt)|, over the cells of the sparse map alone.
 
     Args:

@@ -70,9 +70,7 @@ def compute_losses(
     are updated, the losses are added and the angle counts once. The loss of the error head is minus the log-likelihood
     of the angle.
     """
-    maps = network.build_maps(
-        batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored)
-    )
+    maps = network.build_maps(batch.observations, batch.light_directions, batch.valid, Rotation(turn_deg, mirrored))
     normal_truth = to_pixel_frame(batch.truth.normals, maps)
     autocast = torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16)
     if part == "error_head":
@@ -128,9 +126,7 @@ def _special(
         fine, coarse = asymmetries(maps, axes, dense_truth.filled)
         share = 1 / cells if norm == "mean" else 1
         symmetric = symmetric + share * symmetric_loss(fine)
-        asymmetric = asymmetric + share * asymmetric_loss(
-            fine, coarse, eta=config.eta, lambda_c=config.lambda_c
-        )
+        asymmetric = asymmetric + share * asymmetric_loss(fine, coarse, eta=config.eta, lambda_c=config.lambda_c)
     return symmetric, asymmetric
 
 

@@ -124,9 +124,7 @@ class ScenePool:
         """Draw `count` captures, turn and mirror each, and stack them as float32 (count, ...)."""
         drawn = [
             _turned(self.examples[int(index)], generator)
-            for index in torch.randint(
-                len(self.examples), (count,), generator=generator, device=generator.device
-            )
+            for index in torch.randint(len(self.examples), (count,), generator=generator, device=generator.device)
         ]
         return stack_maps(drawn)
 
@@ -150,9 +148,7 @@ def _photograph(
     kept = torch.zeros_like(mask)
     kept[box] = mask[box]
     rows = kept[mask].numpy()
-    values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(
-        np.float32
-    )
+    values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(np.float32)
     maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
     return _after_network(network, maps, lights[chosen], mask, config, generator)
 
@@ -207,10 +203,7 @@ def _draw_box(mask: Tensor, side: int, generator: torch.Generator) -> tuple[slic
     places = mask.nonzero()
     middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
     lowest, highest = places.amin(dim=0).tolist(), (places.amax(dim=0) + 1).tolist()
-    starts = [
-        max(low, min(at - side // 2, high - side))
-        for at, low, high in zip(middle, lowest, highest, strict=True)
-    ]
+    starts = [max(low, min(at - side // 2, high - side)) for at, low, high in zip(middle, lowest, highest, strict=True)]
     top, left = (slice(start, min(start + side, high)) for start, high in zip(starts, highest, strict=True))
     return top, left
 
@@ -237,9 +230,7 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
     height, width = (max(capture.mask.shape[axis] for capture in captures) for axis in (-2, -1))
     return SceneMaps(
         *(
-            torch.stack(
-                [pad(maps.float(), (0, width - maps.shape[-1], 0, height - maps.shape[-2])) for maps in field]
-            )
+            torch.stack([pad(maps.float(), (0, width - maps.shape[-1], 0, height - maps.shape[-2])) for maps in field])
             for field in zip(*captures, strict=True)
         )
     )

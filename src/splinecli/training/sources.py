@@ -29,9 +29,7 @@ class PixelSource(Protocol):
 class MixedSource:
     """Draws each batch from one of several sources, with probabilities proportional to their weights."""
 
-    def __init__(
-        self, sources: Sequence[PixelSource], weights: Sequence[float], generator: torch.Generator
-    ) -> None:
+    def __init__(self, sources: Sequence[PixelSource], weights: Sequence[float], generator: torch.Generator) -> None:
         self.sources = tuple(sources)
         self.weights = torch.tensor(weights, dtype=torch.float64)
         self.generator = generator
@@ -57,9 +55,7 @@ def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], l
     Returns:
         Training entries, validation entries.
     """
-    scenes = sorted(
-        {entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest()
-    )
+    scenes = sorted({entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest())
     count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
     validation = set(scenes[: min(count, len(scenes) - 1)])
     return (
@@ -85,9 +81,7 @@ class Sources:
     single_scene_sets: tuple[str, ...]
 
 
-def open_sources(
-    config: TrainingConfig, generator: torch.Generator, validation_generator: torch.Generator
-) -> Sources:
+def open_sources(config: TrainingConfig, generator: torch.Generator, validation_generator: torch.Generator) -> Sources:
     """Open the sources of a configuration.
 
     Validation draws from the validation scenes, under `usual_lights` lights. A set with a single scene has no

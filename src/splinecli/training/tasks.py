@@ -182,10 +182,7 @@ class RefinementTask:
     @torch.no_grad()
     def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
         network.eval()
-        found = [
-            refinement_losses(network, maps.to(self.device), bfloat16=bfloat16).angle
-            for maps in self.validation
-        ]
+        found = [refinement_losses(network, maps.to(self.device), bfloat16=bfloat16).angle for maps in self.validation]
         return math.degrees(float(torch.stack(found).mean()))
 
     def sample_maps(self, network: SplineNet) -> None:

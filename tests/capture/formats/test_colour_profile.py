@@ -57,13 +57,7 @@ def write(path: Path, icc: bytes | None, pixels: NDArray[Any] = PIXELS) -> Path:
         png = cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
         if icc is not None:
             body = b"iCCP" + b"p\0\0" + zlib.compress(icc)
-            png = (
-                png[:33]
-                + struct.pack(">I", len(body) - 4)
-                + body
-                + struct.pack(">I", zlib.crc32(body))
-                + png[33:]
-            )
+            png = png[:33] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[33:]
         path.write_bytes(png)
     return path
 
@@ -195,6 +189,4 @@ def test_profiles_are_read_by_others_too(tmp_path: Path) -> None:
         path = write(tmp_path / f"a{suffix}", SRGB_PROFILE, PIXELS // 257 if suffix == ".tif" else PIXELS)
         with Image.open(path) as image:
             content = image.info["icc_profile"]
-        assert ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(content))).startswith(
-            "sRGB"
-        )
+        assert ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(content))).startswith("sRGB")

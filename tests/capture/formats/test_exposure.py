@@ -17,9 +17,7 @@ from splinecli.errors import InputError
 EXIF = 0x8769
 
 
-def write(
-    path: Path, seconds: tuple[int, int] | None = (1, 60), f_number: float = 8.0, iso: int = 100
-) -> Path:
+def write(path: Path, seconds: tuple[int, int] | None = (1, 60), f_number: float = 8.0, iso: int = 100) -> Path:
     image = Image.fromarray(np.full((6, 8, 3), 90, np.uint8))
     tags = Image.Exif()
     tags[0x010F] = "Maker"  # without any tag of its own Pillow leaves all out

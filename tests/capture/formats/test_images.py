@@ -24,9 +24,7 @@ RGB8 = (RGB16 >> 8).astype(np.uint8)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "A.TIFF"])
-@pytest.mark.parametrize(
-    "stored", [RGB16, RGB8, RGB16[..., 0], RGB8[..., 0]], ids=["rgb16", "rgb8", "gray16", "gray8"]
-)
+@pytest.mark.parametrize("stored", [RGB16, RGB8, RGB16[..., 0], RGB8[..., 0]], ids=["rgb16", "rgb8", "gray16", "gray8"])
 def test_integers_are_scaled_by_their_full_range(
     write_image: WriteImage, name: str, stored: NDArray[np.uint16]
 ) -> None:
@@ -112,9 +110,7 @@ def test_truncated_images(
 
 
 @pytest.mark.parametrize("name", ["a.png", "deflate.tif"])
-def test_damaged_images(
-    tmp_path: Path, write_image: WriteImage, capfd: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_damaged_images(tmp_path: Path, write_image: WriteImage, capfd: pytest.CaptureFixture[str], name: str) -> None:
     path = tmp_path / name
     if name == "a.png":
         write_image(name, RGB16)
@@ -138,9 +134,7 @@ def test_the_c_library_is_silent_and_gamma_is_not_applied(
 ) -> None:
     path = write_image("a.png", RGB16)
     data = path.read_bytes()
-    bad_profile = chunk(b"gAMA", struct.pack(">I", 45455)) + chunk(
-        b"iCCP", b"x\0\0" + zlib.compress(b"no profile")
-    )
+    bad_profile = chunk(b"gAMA", struct.pack(">I", 45455)) + chunk(b"iCCP", b"x\0\0" + zlib.compress(b"no profile"))
     path.write_bytes(data[:33] + bad_profile + data[33:])
     np.testing.assert_array_equal(read_image(path), RGB16 / np.float32(65535))
     assert capfd.readouterr() == ("", "")
@@ -227,9 +221,7 @@ def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path: Path, name: str, sca
     np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
 
 
-@pytest.mark.parametrize(
-    "alpha", [np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]]
-)
+@pytest.mark.parametrize("alpha", [np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]])
 def test_alpha_that_cuts_nothing_out_leaves_the_mask_to_the_colours(tmp_path: Path, alpha: object) -> None:
     cv2.imwrite(str(tmp_path / "mask.png"), np.dstack([CUT_OUT] * 3 + [np.asarray(alpha, np.uint8)]))
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), CUT_OUT > 127)

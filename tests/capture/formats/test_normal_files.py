@@ -29,9 +29,7 @@ MASK[0] = False
 @pytest.fixture
 def normals() -> NDArray[np.float64]:
     """(4, 5, 3) unit normals, zero at [1, 2] and outside the mask."""
-    field = (
-        unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1]) * MASK[..., None]
-    )
+    field = unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1]) * MASK[..., None]
     field[1, 2] = 0
     return np.asarray(field)
 
@@ -55,9 +53,7 @@ def write(path: Path, normals: NDArray[np.float64]) -> Path:
 
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.txt", "a.tif"])
 @pytest.mark.parametrize("length", [1, 0.95, 40])
-def test_floating_point_sources(
-    tmp_path: Path, normals: NDArray[np.float64], name: str, length: float
-) -> None:
+def test_floating_point_sources(tmp_path: Path, normals: NDArray[np.float64], name: str, length: float) -> None:
     read = read_normals(write(tmp_path / name, normals * length), SHAPE, MASK)
     assert read.dtype == np.float32
     np.testing.assert_allclose(read, normals, atol=2e-7)
@@ -99,14 +95,10 @@ def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> N
     scipy.io.savemat(path, {"N": normals, "mask": MASK})
     np.testing.assert_allclose(read_normals(path, SHAPE, MASK), normals, atol=1e-6)
     scipy.io.savemat(path, {"N": normals, "M": normals})
-    with pytest.raises(
-        InputError, match="found no Normal_gt, and of other H x W x 3 arrays N, M, expected one"
-    ):
+    with pytest.raises(InputError, match="found no Normal_gt, and of other H x W x 3 arrays N, M, expected one"):
         read_normals(path, SHAPE, MASK)
     scipy.io.savemat(path, {"mask": MASK})
-    with pytest.raises(
-        InputError, match="found no Normal_gt, and of other H x W x 3 arrays none, expected one"
-    ):
+    with pytest.raises(InputError, match="found no Normal_gt, and of other H x W x 3 arrays none, expected one"):
         read_normals(path, SHAPE, MASK)
 
 
@@ -122,17 +114,13 @@ def test_text_with_commas_and_with_a_wrong_word(tmp_path: Path, normals: NDArray
 
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.tif"])
 def test_wrong_size(tmp_path: Path, normals: NDArray[np.float64], name: str) -> None:
-    with pytest.raises(
-        InputError, match="found a ground truth of 5 x 3 pixels, expected 5 x 4 as in the images"
-    ):
+    with pytest.raises(InputError, match="found a ground truth of 5 x 3 pixels, expected 5 x 4 as in the images"):
         read_normals(write(tmp_path / name, normals[1:]), SHAPE, MASK)
 
 
 def test_text_with_a_wrong_number_of_rows(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     path = write(tmp_path / "a.txt", normals[1:])
-    with pytest.raises(
-        InputError, match="found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"
-    ):
+    with pytest.raises(InputError, match="found 15 rows of 3, expected 20 rows of 3, one for each pixel of 4 x 5"):
         read_normals(path, SHAPE, MASK)
 
 
@@ -158,9 +146,7 @@ def test_rows_in_the_wrong_order_are_turned_over(tmp_path: Path, normals: NDArra
     assert not read_ground_truth(write(path, normals), SHAPE, MASK)[1]
     # A mask that is its own mirror image tells nothing.
     full = np.ones(SHAPE, bool)
-    np.testing.assert_allclose(
-        read_normals(write(path, normals[::-1]), SHAPE, full), normals[::-1], atol=2e-7
-    )
+    np.testing.assert_allclose(read_normals(write(path, normals[::-1]), SHAPE, full), normals[::-1], atol=2e-7)
 
 
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
@@ -178,15 +164,11 @@ def test_no_normal_inside_the_mask(tmp_path: Path) -> None:
 def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> None:
     picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
     path = write_image("photograph.png", picture)
-    with pytest.raises(
-        InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are no normals"
-    ):
+    with pytest.raises(InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are no normals"):
         read_normal_map(path)
 
 
-def test_a_huge_value_of_a_damaged_file_overflows_nothing(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_a_huge_value_of_a_damaged_file_overflows_nothing(tmp_path: Path, normals: NDArray[np.float64]) -> None:
     damaged = normals.astype(np.float32)
     damaged[3, 4] = 1e30
     np.save(tmp_path / "a.npy", damaged)

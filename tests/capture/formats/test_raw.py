@@ -114,16 +114,13 @@ def ramp(height: int = 30, width: int = 80) -> NDArray[Any]:
 def test_values_are_proportional_to_light(tmp_path: Path, black: Sequence[int]) -> None:
     light = ramp()
     once, twice = (
-        decode_image(write_dng(tmp_path / f"{k}.dng", mosaic(k * light, black=black), black=black))
-        for k in (1, 2)
+        decode_image(write_dng(tmp_path / f"{k}.dng", mosaic(k * light, black=black), black=black)) for k in (1, 2)
     )
     assert once.shape == (*light.shape, 3) and once.dtype == np.uint16
     # The borders of a bilinear interpolation are no ramp. Rounding on the sensor is 1/2 of 16383, and its full scale
     # is that of the highest black level: half a thousandth.
     inner = (slice(2, -2), slice(2, -2))
-    np.testing.assert_allclose(
-        once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4
-    )
+    np.testing.assert_allclose(once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4)
     bright = once[inner] > 2000
     np.testing.assert_allclose(twice[inner][bright] / once[inner][bright], 2, rtol=0.01)
 
@@ -160,9 +157,7 @@ def test_saturated_photosites_are_at_full_scale(tmp_path: Path, white: int, blac
     light[25:35, 10:20] = 3
     for number, dimmed in enumerate((light, np.where(light < 1, 0.3, light))):
         pixels = decode_image(
-            write_dng(
-                tmp_path / f"{number}.dng", mosaic(dimmed, white=white, black=black), white=white, black=black
-            )
+            write_dng(tmp_path / f"{number}.dng", mosaic(dimmed, white=white, black=black), white=white, black=black)
         )
         assert (pixels[11:19, 11:19] == 65535).all() and (pixels[26:34, 11:19] == 65535).all()
         assert (pixels[:, 30:] < 65535).all()

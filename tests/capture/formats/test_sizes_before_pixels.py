@@ -28,9 +28,7 @@ from splinecli.errors import InputError
 
 HUGE = 30_000
 SMALL = (16, 18)
-TOO_LARGE = (
-    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 megapixels"
-)
+TOO_LARGE = r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 megapixels"
 MOST_GROWTH = 300 * 2**20
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
@@ -45,9 +43,7 @@ def write_png(path: Path, size: int = HUGE) -> None:
     rows = zlib.compressobj(1)
     data = b"".join(rows.compress(bytes(size + 1)) for _ in range(size)) + rows.flush()
     header = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-    )
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
 
 
 def write_claim(path: Path, height: int, width: int) -> None:
@@ -166,9 +162,7 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> N
         open_capture(capture).read()
 
 
-def test_a_capture_larger_than_the_memory_is_not_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six images of 361 megapixels: each would fit by itself."""
     np.savetxt(tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)])
     for number in range(6):
@@ -241,9 +235,7 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / name), np.ones(SMALL, np.uint8))
         with (tmp_path / name).open("ab") as file:
             file.truncate(1 << 31)
-        refused(
-            lambda name=name: decode_image(tmp_path / name), r"found 2147\.5 MB, expected at most 67\.1 MB"
-        )
+        refused(lambda name=name: decode_image(tmp_path / name), r"found 2147\.5 MB, expected at most 67\.1 MB")
 
 
 def test_light_files_with_too_much_text(tmp_path: Path) -> None:
@@ -253,9 +245,7 @@ def test_light_files_with_too_much_text(tmp_path: Path) -> None:
         "found 1.0 MB, expected a text file of at most 1.0",
     )
     (tmp_path / "lines.txt").write_text("1\n" * 60_000)
-    refused(
-        lambda: read_light_directions(tmp_path / "lines.txt"), "found 60001 lines, expected at most 50000"
-    )
+    refused(lambda: read_light_directions(tmp_path / "lines.txt"), "found 60001 lines, expected at most 50000")
     (tmp_path / "words.txt").write_text("1 " * 400_000)
     refused(lambda: read_light_directions(tmp_path / "words.txt"), "found 400000 columns, expected 3")
 

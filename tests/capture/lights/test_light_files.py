@@ -53,9 +53,7 @@ def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> 
 
 @settings(deadline=None)
 @given(
-    vectors=st.lists(
-        st.tuples(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 10)), min_size=4, max_size=12
-    ),
+    vectors=st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 10)), min_size=4, max_size=12),
     separator=st.sampled_from([" ", "\t", ",", ";", " ,\t", " ; "]),
     counted=st.booleans(),
     transposed=st.booleans(),

@@ -81,9 +81,7 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> Non
     np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "vectors", [DIRECTIONS * 3, DIRECTIONS.T.astype(np.float32)], ids=["rows", "columns"]
-)
+@pytest.mark.parametrize("vectors", [DIRECTIONS * 3, DIRECTIONS.T.astype(np.float32)], ids=["rows", "columns"])
 def test_arrays(tmp_path: Path, vectors: np.ndarray) -> None:
     np.save(tmp_path / "lights.npy", vectors)
     np.testing.assert_allclose(read_light_directions(tmp_path / "lights.npy", 4), DIRECTIONS, atol=1e-7)

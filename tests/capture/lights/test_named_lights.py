@@ -42,11 +42,7 @@ def write_folder(tmp_path: Path, images: NDArray[np.uint16]) -> WriteFolder:
 
 def rows(names: list[str] | None = None) -> str:
     lines = [" ".join(map(repr, light)) for light in LIGHTS.tolist()]
-    return (
-        "\n".join(f"{name} {line}" for name, line in zip(names, lines, strict=True))
-        if names
-        else "\n".join(lines)
-    )
+    return "\n".join(f"{name} {line}" for name, line in zip(names, lines, strict=True)) if names else "\n".join(lines)
 
 
 def alice(names: list[Any], **more: Any) -> str:
@@ -66,9 +62,7 @@ def test_one_capture_in_every_form_gives_the_same_normals(write_folder: WriteFol
         return path
 
     psbox = write_folder("psbox/Objects", numbered).parent
-    (psbox / "light_directions.txt").write_text(
-        "\n".join(" ".join(map(repr, row)) for row in LIGHTS.T.tolist())
-    )
+    (psbox / "light_directions.txt").write_text("\n".join(" ".join(map(repr, row)) for row in LIGHTS.T.tolist()))
     forms = {
         "plain": make("plain", numbered, "light_directions.txt", rows()),
         "uw": make("uw", numbered, "lights.txt", f"5\n{rows()}"),
@@ -77,17 +71,11 @@ def test_one_capture_in_every_form_gives_the_same_normals(write_folder: WriteFol
         "foreign paths": make(
             "foreign", NAMES, "a.lp", "5\n" + rows([f"C:\\RTI jobs\\vase\\{name}" for name in NAMES])
         ),
-        "other suffix": make(
-            "suffix", NAMES, "a.LP", "5\n" + rows([f"jpg/{name[:-4].upper()}.jpg" for name in NAMES])
-        ),
-        "lp by order": make(
-            "order", numbered, "a.lp", "5\n" + rows([f"gone{number}.jpg" for number in range(5)])
-        ),
+        "other suffix": make("suffix", NAMES, "a.LP", "5\n" + rows([f"jpg/{name[:-4].upper()}.jpg" for name in NAMES])),
+        "lp by order": make("order", numbered, "a.lp", "5\n" + rows([f"gone{number}.jpg" for number in range(5)])),
         "json": make("json", numbered, "lights.json", alice([1, 2, 3, 4, 5])),
         "json by order": make("json2", numbered, "lights.json", alice([81, 13, 4711, 7, 9])),
-        "json with intensities": make(
-            "json3", numbered, "lights.json", alice(list("12345"), intensity=[1, 1.0, 1])
-        ),
+        "json with intensities": make("json3", numbered, "lights.json", alice(list("12345"), intensity=[1, 1.0, 1])),
     }
     estimator = make_estimator("ls")
     expected = estimate_normals(read_capture(forms["plain"]), estimator).normal_map
@@ -110,9 +98,7 @@ def test_images_that_no_light_names_are_left_out(write_folder: WriteFolder) -> N
     assert [path.name for path in open_capture(folder).files.images] == NAMES[:4]
 
 
-def test_intensities_of_the_json_count_unless_a_file_is_given(
-    write_folder: WriteFolder, tmp_path: Path
-) -> None:
+def test_intensities_of_the_json_count_unless_a_file_is_given(write_folder: WriteFolder, tmp_path: Path) -> None:
     folder = write_folder("alice", [f"{number}.png" for number in range(1, 6)])
     (folder / "lights.json").write_text(alice([1, 2, 3, 4, 5], intensity=[2.0, 1.0, 0.5]))
     assert open_capture(folder).light_intensities.tolist() == [[2.0, 1.0, 0.5]] * 5

@@ -51,26 +51,18 @@ def test_unequal_lights_are_estimated(n_lights, shine):
 @pytest.mark.parametrize("shine", [0.0, 0.5, 3.0])
 def test_equal_lights_are_left_alone(shine):
     directions = lights(8)
-    assert (
-        estimate_light_intensities(sphere(directions, shine=shine).astype(np.float32), None, directions)
-        is None
-    )
+    assert estimate_light_intensities(sphere(directions, shine=shine).astype(np.float32), None, directions) is None
 
 
 def test_scenes_that_do_not_determine_intensities():
     directions = lights(4)
     assert (
-        estimate_light_intensities(
-            (sphere(directions) * INTENSITIES[:4]).astype(np.float32), None, directions
-        )
-        is None
+        estimate_light_intensities((sphere(directions) * INTENSITIES[:4]).astype(np.float32), None, directions) is None
     )
     few = (sphere(lights(8)) * INTENSITIES)[:40].astype(np.float32)
     assert estimate_light_intensities(few, None, lights(8)) is None
     assert estimate_light_intensities(np.zeros((500, 8), np.float32), None, lights(8)) is None
-    never = (sphere(lights(8)) * INTENSITIES * (np.arange(8) != 3)).astype(
-        np.float32
-    )  # a lamp that did not flash
+    never = (sphere(lights(8)) * INTENSITIES * (np.arange(8) != 3)).astype(np.float32)  # a lamp that did not flash
     assert estimate_light_intensities(never, None, lights(8)) is None
 
 
@@ -123,9 +115,7 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     stated = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
     assert stated == pytest.approx([low, high], abs=0.02)
     np.testing.assert_allclose(restored.estimated_intensities, INTENSITIES / INTENSITIES.mean(), rtol=0.02)
-    np.testing.assert_allclose(
-        restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5
-    )
+    np.testing.assert_allclose(restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5)
     some = restored.choose_lights([6, 0, 2])
     np.testing.assert_array_equal(some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]])
     # Given intensities replace estimates.

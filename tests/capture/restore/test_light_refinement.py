@@ -90,9 +90,7 @@ def test_refinement_is_suggested_for_rough_lights_alone(known: bool, glossy_pixe
 def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:
     _, lights, observations = matte_pixels
     given = rough(lights, 4.0)
-    capture = Capture(
-        "one", observations.astype(np.float32), given, tuple(range(12)), np.ones((10, 20), bool)
-    )
+    capture = Capture("one", observations.astype(np.float32), given, tuple(range(12)), np.ones((10, 20), bool))
     refined = refine_capture(capture)
     assert refined.warnings[-1].code == "refined_lights"
     assert not np.array_equal(refined.light_directions, given)
@@ -103,6 +101,4 @@ def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:
         refine_capture(capture, error_deg=0.0)
     lamps = NearLamps.of(given, 1.0, (10, 20), equal=True)
     with pytest.raises(UsageError, match="near lamps"):
-        refine_capture(
-            Capture("near", capture.observations, given, capture.light_indices, capture.mask, lamps=lamps)
-        )
+        refine_capture(Capture("near", capture.observations, given, capture.light_indices, capture.mask, lamps=lamps))

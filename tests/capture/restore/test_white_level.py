@@ -35,9 +35,7 @@ def clip(images: NDArray[np.float64], level: int, exposure: float = 2.0) -> NDAr
     return np.minimum(np.rint(images * exposure * level), level).astype(np.uint16)
 
 
-def find(
-    images: Images, *, given: int | None = None, stated: int | None = None
-) -> tuple[WhiteLevel | None, int]:
+def find(images: Images, *, given: int | None = None, stated: int | None = None) -> tuple[WhiteLevel | None, int]:
     """The white level of images (F, H, W), and the number of their saturated observations."""
     finder = SaturationFinder(images[0].size, len(images), given=given)
     for position, image in enumerate(images):
@@ -189,9 +187,7 @@ def add_sbit(path: Path, *bits: int) -> None:
     path.write_bytes(data[:end] + packed + data[end:])
 
 
-@pytest.mark.parametrize(
-    ("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)]
-)
+@pytest.mark.parametrize(("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)])
 def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int | None) -> None:
     images = bright(100)
     images[0, 0, 0] = 4095  # one pixel alone would not tell

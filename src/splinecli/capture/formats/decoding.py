@@ -26,9 +26,7 @@ from splinecli.system.memory import is_out_of_memory
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 # Messages of libpng and libjpeg about pixels that they could not read.
-_DAMAGE = re.compile(
-    r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE
-)
+_DAMAGE = re.compile(r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE)
 
 _LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previews and colour profiles
 
@@ -51,9 +49,7 @@ def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[An
     return decode_with_alpha(path, expected)[0]
 
 
-def decode_with_alpha(
-    path: Path, expected: ExpectedSize | None = None
-) -> tuple[NDArray[Any], NDArray[Any] | None]:
+def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
     try:
         with open_image(path) as (file, kind):
@@ -165,9 +161,7 @@ def _check_png(data: bytes, path: Path) -> None:
         if end > len(data):
             break
         if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise InputError(
-                "the PNG is damaged (a checksum is wrong)", path=path, hint="Copy or export it again"
-            )
+            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint="Copy or export it again")
         if data[body : body + 4] == b"IEND":
             return
         position = end

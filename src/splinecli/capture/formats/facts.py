@@ -134,9 +134,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
             elif start and path.suffix.lower() == ".tga":  # its files begin with nothing that is only theirs
                 kind = "TGA"
             else:
-                raise InputError(
-                    "found neither PNG, TIFF, JPEG nor BMP" if start else "the file is empty", path=path
-                )
+                raise InputError("found neither PNG, TIFF, JPEG nor BMP" if start else "the file is empty", path=path)
             yield file, kind
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None

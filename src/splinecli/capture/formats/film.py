@@ -116,11 +116,7 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     def reduced(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
         share = side / max(image.shape[:2])
         size = max(1, round(image.shape[1] * share)), max(1, round(image.shape[0] * share))
-        return (
-            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-            if share < 1
-            else image
-        )
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) if share < 1 else image
 
     small = reduced(picture, _SMALL)
     gray = small.astype(np.float32).mean(axis=2)
@@ -134,8 +130,7 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
 def _sharp(sharpness: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which frames are about as sharp as those around them. Under another light, sharpness is another."""
     around = [
-        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1])
-        for place in range(len(sharpness))
+        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]) for place in range(len(sharpness))
     ]
     return np.asarray(sharpness >= _BLURRED * np.array(around))
 

@@ -44,9 +44,7 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     # One of these is NaN or infinite where any value is. np.isfinite of all values would need another array.
     lowest, highest = (values.min(), values.max()) if values.size else (0.0, 0.0)
     if not (np.isfinite(lowest) and np.isfinite(highest)):
-        raise InputError(
-            "found a value that is not finite (NaN or infinity), expected a photograph", path=path
-        )
+        raise InputError("found a value that is not finite (NaN or infinity), expected a photograph", path=path)
     if lowest < 0:
         raise InputError(
             f"found the negative value {lowest:g}, expected a photograph",

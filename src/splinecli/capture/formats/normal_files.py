@@ -156,7 +156,5 @@ def _unit_or_zero(stored: NDArray[Any]) -> NDArray[np.float64]:
     vectors = stored.astype(np.float64)
     usable = (np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True)
     length = np.linalg.norm(np.where(usable, vectors, 0), axis=1, keepdims=True)
-    scaled: NDArray[np.float64] = np.divide(
-        vectors, length, out=np.zeros_like(vectors), where=usable & (length > 0)
-    )
+    scaled: NDArray[np.float64] = np.divide(vectors, length, out=np.zeros_like(vectors), where=usable & (length > 0))
     return scaled

@@ -125,8 +125,7 @@ def _check_complete(page: Any, size: int, path: Path) -> None:
     ):
         raise _damaged(path)
     if any(
-        count == 0 or offset + count > size
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+        count == 0 or offset + count > size for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
     ):
         raise InputError("the TIFF is truncated", path=path, hint="Copy or export it again")
 

@@ -93,9 +93,7 @@ class Overrides:
 
     def named(self) -> tuple[Path, ...]:
         """Return the files that are given. Raises InputError for one that is no file."""
-        files = tuple(
-            f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None
-        )
+        files = tuple(f for f in (self.lights, self.intensities, self.mask, self.ground_truth) if f is not None)
         for file in files:
             check_file(file, "a file", pipe=file == self.lights)
         return files

@@ -119,9 +119,7 @@ def _is_object(folder: Path) -> bool:
 
 def _has_marks(folder: Path) -> bool:
     marks = {
-        entry.name.lower()
-        for entry in list_folder(folder)
-        if entry.name.lower() in _MARKS and not is_folder(entry)
+        entry.name.lower() for entry in list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)
     }
     return len(marks) >= _ENOUGH_MARKS
 

@@ -53,9 +53,7 @@ def list_folder(folder: Path) -> list[Path]:
     return sorted(entries, key=natural_key)
 
 
-def list_images(
-    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
-) -> tuple[Path, ...]:
+def list_images(folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
     Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and

@@ -49,9 +49,7 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     check_not_empty(images, folder)
     others: tuple[Path, ...] = ()
     if filenames is None:
-        others = tuple(
-            image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower()))
-        )
+        others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
         if len(others) > _MOST_OTHERS * len(images):
             others = ()
         images = tuple(image for image in images if image not in others)
@@ -63,8 +61,6 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
             hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
-    layout, ground_truth = (
-        ("DiLiGenT", _DILIGENT_GROUND_TRUTH) if is_diligent else ("plain folder", GROUND_TRUTH)
-    )
+    layout, ground_truth = ("DiLiGenT", _DILIGENT_GROUND_TRUTH) if is_diligent else ("plain folder", GROUND_TRUTH)
     files = gather_files(layout, folder, images, lights, overrides, ground_truth)
     return replace(files, others=others)

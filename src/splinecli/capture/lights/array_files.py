@@ -59,9 +59,7 @@ def _choose(matrices: Mapping[str, Array], path: Path, n_images: int | None) -> 
     """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
     lights = {name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape}
     if len(lights) > 1:
-        lights = {
-            name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))
-        } or lights
+        lights = {name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))} or lights
     if len(lights) == 1:
         return next(iter(lights.values()))
     sizes = ", ".join(f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items())

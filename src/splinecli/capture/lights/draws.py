@@ -91,8 +91,7 @@ class DrawsFile:
         for draw, line in zip(self.draws, self.lines, strict=True):
             if max(draw) >= available:
                 raise InputError(
-                    f"found light index {max(draw)}, expected 0 to {available - 1}:"
-                    f" the capture has {available} lights",
+                    f"found light index {max(draw)}, expected 0 to {available - 1}: the capture has {available} lights",
                     path=self.path,
                     line=line,
                 )
@@ -156,13 +155,9 @@ def _light_index(word: str, path: Path, line: int) -> int:
 def _check_draw(draw: Draw, first: Draw, path: Path, line: int) -> None:
     for position, index in enumerate(draw):
         if index in draw[:position]:
-            raise InputError(
-                f"light index {index} comes twice", path=path, line=line, hint="Name each light once"
-            )
+            raise InputError(f"light index {index} comes twice", path=path, line=line, hint="Name each light once")
     if len(draw) < MIN_LIGHTS:
-        raise InputError(
-            f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line
-        )
+        raise InputError(f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line)
     if len(draw) != len(first):
         raise InputError(
             f"found {len(draw)} light indices, expected {len(first)} as in the first draw",

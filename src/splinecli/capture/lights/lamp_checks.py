@@ -28,9 +28,7 @@ UNIT_HINT = (
 )
 
 
-def check_distances(
-    lamps: NearLamps, mask: NDArray[np.bool_], positions: Path | None
-) -> list[CaptureWarning]:
+def check_distances(lamps: NearLamps, mask: NDArray[np.bool_], positions: Path | None) -> list[CaptureWarning]:
     """Return a warning about lamps that are hardly possible over an object with this mask (H, W), or an empty list.
 
     Args:
@@ -48,15 +46,11 @@ def check_distances(
     if distances[nearest] < CLOSE * max(sizes):
         return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
     if distances[nearest] > FAR * max(sizes):
-        return [
-            CaptureWarning(LAMP_DISTANCE, f"The lamps are so far that they are distant: {text}. {UNIT_HINT}.")
-        ]
+        return [CaptureWarning(LAMP_DISTANCE, f"The lamps are so far that they are distant: {text}. {UNIT_HINT}.")]
     return []
 
 
-def distant_lights(
-    positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]
-) -> list[CaptureWarning]:
+def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: NDArray[np.bool_]) -> list[CaptureWarning]:
     """Warn that lights count as distant although a file has their positions; with a list of one warning or none.
 
     Args:

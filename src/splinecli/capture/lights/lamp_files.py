@@ -54,13 +54,9 @@ class LampOptions:
                 raise UsageError(f"the {name.replace('_', ' ')} is {value:g}, expected a number above 0")
         for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
             if getattr(self, one) is not None and getattr(self, other) is not None:
-                raise UsageError(
-                    f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other", hint="Leave one out"
-                )
+                raise UsageError(f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other", hint="Leave one out")
         if self.distance is not None and self.pixel_size is None and self.object_width is None:
-            raise UsageError(
-                "--light-distance needs the size of a pixel", hint="Add --pixel-size or --object-width"
-            )
+            raise UsageError("--light-distance needs the size of a pixel", hint="Add --pixel-size or --object-width")
 
     @property
     def given(self) -> str | None:
@@ -176,9 +172,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     if pixel_size is None and options.object_width is None:
         pixel_size = None if pixel_file is None else _read_pixel_size(pixel_file)
         if pixel_size is None and used and positions in (find_lights(folder), _path(options.positions)):
-            raise InputError(
-                "nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT
-            )
+            raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
     return LampFiles(
         positions,
         options.distance,

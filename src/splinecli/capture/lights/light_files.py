@@ -65,9 +65,7 @@ def read_light_directions(
     return directions_of(rows.numbers, n_images, frame, form)
 
 
-def directions_of(
-    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
-) -> NDArray[np.float64]:
+def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
     table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
     if form in ("azel", "slant-tilt"):
@@ -88,9 +86,7 @@ def directions_of(
     )
 
 
-def read_light_positions(
-    path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME
-) -> NDArray[np.float64]:
+def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
     """Return the positions of lamps (F, 3) float64 from a text file, which has the form of light directions.
 
     Raises:
@@ -211,9 +207,7 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
         return following
     if not count.is_integer():
         expected = columns(len(following.rows[0]))
-        raise InputError(
-            f"found 1 column, expected {expected} or a count", path=table.path, line=table.lines[0]
-        )
+        raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=table.lines[0])
     raise InputError(
         f"the count line says {count:.0f}, but {len(following.rows)} rows follow",
         path=table.path,
@@ -241,9 +235,7 @@ def _one_light_a_row(
     if not readings:
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
         text = table.texts[0]
-        decimal_commas = n_columns > 3 and (
-            has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
-        )
+        decimal_commas = n_columns > 3 and (has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3))
         raise InputError(
             f"found {columns(n_columns)}, expected {expected}",
             path=table.path,

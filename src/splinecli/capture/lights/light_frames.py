@@ -72,9 +72,7 @@ USUAL_FRAME = LightFrame()
 
 BOTH_NEGATED = LightFrame((-1, -1, 1))
 
-PLANE_FRAMES = tuple(
-    LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1))
-)
+PLANE_FRAMES = tuple(LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1)))
 """The eight frames with z to the camera; the usual one first."""
 
 

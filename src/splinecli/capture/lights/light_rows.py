@@ -84,8 +84,7 @@ def _reordered(numbers: NumberRows, order: list[int]) -> NumberRows:
     """Return rows whose last numbers are in the order given."""
     first = -len(order)
     rows = tuple(
-        (*row[:first], *(row[first:][i] for i in order)) if len(row) >= len(order) else row
-        for row in numbers.rows
+        (*row[:first], *(row[first:][i] for i in order)) if len(row) >= len(order) else row for row in numbers.rows
     )
     return replace(numbers, rows=rows)
 

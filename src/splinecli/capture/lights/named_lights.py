@@ -205,7 +205,5 @@ def _three_numbers(light: dict[str, Any], key: str, number: int, path: Path) -> 
         isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
         for value in values or ()
     ):
-        raise InputError(
-            f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path
-        )
+        raise InputError(f"light {number} has {key!r} {reprlib.repr(values)}, expected three numbers", path=path)
     return [float(value) for value in values or ()]

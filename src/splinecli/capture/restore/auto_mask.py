@@ -35,9 +35,7 @@ def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:
     _, bright = cv2.threshold(lightness, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(bright, connectivity=4)
     largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA])) if len(statistics) > 1 else 0
-    outline, _ = cv2.findContours(
-        (labels == largest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
+    outline, _ = cv2.findContours((labels == largest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     mask = cv2.drawContours(np.zeros(brightness.shape, np.uint8), outline, -1, 1, cv2.FILLED) > 0
     share = float(mask.mean())
     if not largest or not _SMALLEST <= share <= _LARGEST:

@@ -140,9 +140,7 @@ def _likeliest_tilt(intensities: Array, normals: Array, lights: Array) -> Array:
         slopes, unequal = directions[:, :2] / cosines[:, None], np.log(shown / cosines)
         slopes, unequal = slopes - slopes.mean(axis=0), unequal - unequal.mean()
         certainty = TILT**2 / max(float(unequal.var()), _LEAST_VARIANCE)
-        tilt = tilt + np.linalg.solve(
-            certainty * slopes.T @ slopes + np.eye(2), certainty * slopes.T @ unequal - tilt
-        )
+        tilt = tilt + np.linalg.solve(certainty * slopes.T @ slopes + np.eye(2), certainty * slopes.T @ unequal - tilt)
     return np.asarray(shown / np.maximum(directions @ (*tilt, 1.0), _LOWEST_COSINE))
 
 

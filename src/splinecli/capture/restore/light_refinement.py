@@ -74,9 +74,7 @@ class RefinedLights:
     fit_ratio: float
 
 
-def refine_capture(
-    capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True
-) -> Capture:
+def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
     """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
 
     Args:
@@ -97,9 +95,7 @@ def refine_capture(
         intensities_known=intensities_known,
     )
     if found is None:
-        return replace(
-            capture, warnings=(*capture.warnings, capture_warnings.kept_lights(_why_kept(capture)))
-        )
+        return replace(capture, warnings=(*capture.warnings, capture_warnings.kept_lights(_why_kept(capture))))
     intensities = capture.estimated_intensities
     if not intensities_known:
         intensities = found.intensities if intensities is None else intensities * found.intensities
@@ -142,9 +138,7 @@ def _why_kept(capture: Capture) -> str:
 def check_distant(option: str, verb: str, *, near: bool) -> None:
     """Raise UsageError for a capture with near lamps under an option that refines or finds distant lights."""
     if near:
-        raise UsageError(
-            f"{option} {verb} distant lights, and this capture has near lamps", hint=f"Leave {option} out"
-        )
+        raise UsageError(f"{option} {verb} distant lights, and this capture has near lamps", hint=f"Leave {option} out")
 
 
 def check_light_error(error_deg: float | None, *, refines: bool) -> None:

@@ -155,9 +155,7 @@ class Saturation:
             return None, saturated
         maximum = max(image.maximum for image in self.images)
         if maximum not in (0, _FULL_SCALE_16_BIT) and not any(len(pixels) for pixels in saturated):
-            at_maximum = [
-                image.at_maximum if image.maximum == maximum else _nothing() for image in self.images
-            ]
+            at_maximum = [image.at_maximum if image.maximum == maximum else _nothing() for image in self.images]
             stated = self._stated_level(maximum)
             if stated is not None:
                 return WhiteLevel(stated, "file"), at_maximum if maximum >= stated else saturated
@@ -208,9 +206,7 @@ class SaturationFinder:
         even: see Saturation.
     """
 
-    def __init__(
-        self, n_pixels: int, n_images: int, *, given: float | None = None, even: bool = False
-    ) -> None:
+    def __init__(self, n_pixels: int, n_images: int, *, given: float | None = None, even: bool = False) -> None:
         self.shape = n_pixels, n_images
         self.given, self.even = given, even
         self._images = [_NOT_ADDED] * n_images
@@ -242,9 +238,7 @@ class SaturationFinder:
         at_maximum = _indices(in_any_channel(pixels == maximum)) if maximum else _nothing()
         saturated = at_maximum if maximum == full_scale else _nothing()
         below, counts = _largest_values(pixels, maximum)
-        self._images[position] = _ImageValues(
-            full_scale, stated, saturated, maximum, at_maximum, below, counts
-        )
+        self._images[position] = _ImageValues(full_scale, stated, saturated, maximum, at_maximum, below, counts)
 
     def finish(self) -> Saturation:
         """Return the white level and the saturated observations. Images that were not added have none."""

@@ -7,9 +7,7 @@ from typer import Option
 from splinecli.cli import choices
 from splinecli.cli.options.values import Device, Precision, complete_weights
 
-METHOD = Option(
-    "spline-net", metavar="METHOD", help="Method to use: {methods}.", autocompletion=choices.methods
-)
+METHOD = Option("spline-net", metavar="METHOD", help="Method to use: {methods}.", autocompletion=choices.methods)
 METHODS = Option(
     None,
     metavar="M",
@@ -49,9 +47,5 @@ LARGEST_STEP = Option(
 )
 
 DEVICE = Option(Device.auto, help="Device to compute on. auto is a CUDA GPU if there is one, else the CPU.")
-PRECISION = Option(
-    Precision.auto, help="Number format. auto is bfloat16 if the hardware supports it, else float32."
-)
-JOBS = Option(
-    None, metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]"
-)
+PRECISION = Option(Precision.auto, help="Number format. auto is bfloat16 if the hardware supports it, else float32.")
+JOBS = Option(None, metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]")

@@ -63,9 +63,7 @@ LIGHT_POSITIONS = Option(
     help="Near lamps: a line x y z for each image, in any unit, from the middle of the image."
     " [default: light_positions.txt in CAPTURE]",
 )
-LIGHT_DISTANCE = Option(
-    None, metavar="D", help="Near lamps: the distance of all lamps from the middle of the object."
-)
+LIGHT_DISTANCE = Option(None, metavar="D", help="Near lamps: the distance of all lamps from the middle of the object.")
 _PIXEL_SIZE = "Near lamps: the width of a pixel on the object. [default: pixel_size.txt in CAPTURE]"
 PIXEL_SIZE = Option(None, metavar="S", help=_PIXEL_SIZE)
 PIXEL_SIZE_OF_SURFACE = Option(
@@ -97,13 +95,9 @@ MASK = Option(
 AUTO_MASK = Option(
     False, "--auto-mask", help="If there is no mask, find the object in the images and write found_mask.png."
 )
-CROP = Option(
-    None, metavar="X,Y,W,H", help="Read this box of the images: left upper corner and size in pixels."
-)
+CROP = Option(None, metavar="X,Y,W,H", help="Read this box of the images: left upper corner and size in pixels.")
 SCALE = Option(None, metavar="1/N", help="Read every N-th row and column, for a first look. [default: all]")
-GROUND_TRUTH = Option(
-    None, metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF)."
-)
+GROUND_TRUTH = Option(None, metavar="FILE", help="True normals to compare with (.mat, .npy, text, PNG, TIFF).")
 TRANSFER = Option(
     "auto",
     metavar="CURVE",
@@ -139,12 +133,8 @@ NUMBER_OF_LIGHTS = Option(None, metavar="K", help="Use K lights drawn at random.
 LIGHT_INDICES = Option(
     None, metavar="I,J,...", help="Use these lights, counted from 0. Plots and warnings count from 1."
 )
-DATASETS = Argument(
-    ..., metavar="DATASET", help="Folders of captures with ground truth, or the captures themselves."
-)
-NUMBERS_OF_LIGHTS = Option(
-    None, metavar="K|all", help="Number of lights in each draw. May be repeated. [default: 10]"
-)
+DATASETS = Argument(..., metavar="DATASET", help="Folders of captures with ground truth, or the captures themselves.")
+NUMBERS_OF_LIGHTS = Option(None, metavar="K|all", help="Number of lights in each draw. May be repeated. [default: 10]")
 TRIALS = Option(None, metavar="T", min=1, help="Number of random draws. [default: 100]")
 DRAWS = Option(None, metavar="FILE", help="Draws of lights: each line has light indices, counted from 0.")
 LIGHT_NOISE = Option(
@@ -193,9 +183,7 @@ GRAY_TRANSFER = Option(
 
 # Normal maps of integrate.
 
-NORMALS = Argument(
-    ..., metavar="NORMALS", help="Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote."
-)
+NORMALS = Argument(..., metavar="NORMALS", help="Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.")
 NORMALS_MASK = Option(
     None,
     metavar="FILE",

@@ -13,15 +13,9 @@ from splinecli.training.defaults import CHECKPOINT_SECONDS
 
 # The place of the results.
 
-INFER_FOLDER = Option(
-    Path("out"), "--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/."
-)
-CALIBRATION_FOLDER = Option(
-    Path("calibration"), "--output", "-o", metavar="OUT", help="Folder of the results."
-)
-SURFACE_FOLDER = Option(
-    None, "--output", "-o", metavar="OUT", help="Folder of the results. [default: that of NORMALS]"
-)
+INFER_FOLDER = Option(Path("out"), "--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/.")
+CALIBRATION_FOLDER = Option(Path("calibration"), "--output", "-o", metavar="OUT", help="Folder of the results.")
+SURFACE_FOLDER = Option(None, "--output", "-o", metavar="OUT", help="Folder of the results. [default: that of NORMALS]")
 EVALUATION_FOLDER = Option(Path("evaluation"), "--output", "-o", metavar="OUT", help="Folder of the results.")
 PIXEL_SET = Option(..., "--output", "-o", metavar="SET", help="Folder of the pixel set.")
 RUN = Option(
@@ -73,9 +67,7 @@ DECIMATE = Option(
     help="Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB (needs the extra 'mesh')."
     " [default: all]",
 )
-CONVENTION = Option(
-    NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
-)
+CONVENTION = Option(NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down.")
 LIGHT_PLOT = Option(None, metavar="FILE", help="Also plot the light directions to a PNG file.")
 COMPARE = Option(None, metavar="FILE", help="Compare the result with the light directions in a text file.")
 FIGURES = Option(False, "--figures", help="Draw every method's maps for the first draw of each capture.")
@@ -84,9 +76,7 @@ FIGURE_PIXELS = Option(
     metavar="ROW,COLUMN",
     help="With --figures: show the observation maps of this pixel. May be repeated.",
 )
-TENSORBOARD = Option(
-    False, "--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard')."
-)
+TENSORBOARD = Option(False, "--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard').")
 
 # What happens to earlier results.
 
@@ -106,7 +96,5 @@ STRICT = Option(
 
 JSON = Option(False, "--json", help="Print one JSON document on stdout, and nothing else.")
 JSON_LIST = Option(False, "--json", help="Print a JSON list of the reports on stdout, and nothing else.")
-JSON_LINES = Option(
-    False, "--jsonl", help="Print each report as one line of JSON on stdout when its capture ends."
-)
+JSON_LINES = Option(False, "--jsonl", help="Print each report as one line of JSON on stdout when its capture ends.")
 QUIET = Option(False, "--quiet", "-q", help="Print nothing but errors.")

@@ -9,16 +9,10 @@ from splinecli.training.defaults import DEFAULT_PRESET, DEFAULT_STEPS, PAPER_STE
 
 # Pixel sets of prepare.
 
-SOURCES = Argument(
-    None, metavar="SOURCE", help="Captures with ground truth, folders of them, CyclesPS trees."
-)
+SOURCES = Argument(None, metavar="SOURCE", help="Captures with ground truth, folders of them, CyclesPS trees.")
 SCENES = Option(0, metavar="N", min=0, help="Render N random scenes.")
-MESHES = Option(
-    None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated."
-)
-IMAGE_SIZE = Option(
-    None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]"
-)
+MESHES = Option(None, metavar="FILE", help="Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.")
+IMAGE_SIZE = Option(None, metavar="PIXELS", min=8, help="Width and height of the rendered images. [default: 128]")
 SCENE_LIGHTS = Option(
     None, "--n-lights", metavar="N", min=16, help="Number of lights of a rendered scene. [default: 500]"
 )
@@ -33,9 +27,7 @@ PRESET = Option(
     autocompletion=lambda: list(PRESET_NAMES),
 )
 CONFIG = Option(None, metavar="FILE", help="Settings from a TOML file or a run's config.json.")
-PARAMETERS = Option(
-    None, metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. May be repeated."
-)
+PARAMETERS = Option(None, metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. May be repeated.")
 START_FROM = Option(
     None,
     metavar="NAME|FILE",
@@ -48,15 +40,12 @@ GENERATOR_WEIGHT = Option(
     min=0,
     help="Weight of generated pixels; each SET has weight 1. [default: 0; 1 without SET]",
 )
-LIGHT_COUNTS = Option(
-    None, metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]"
-)
+LIGHT_COUNTS = Option(None, metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]")
 STEPS = Option(
     None,
     metavar="N",
     min=1,
-    help=f"Train for N steps. [default: {DEFAULT_STEPS:,}; presets paper: {PAPER_STEPS:,},"
-    f" refine: {REFINE_STEPS:,}]",
+    help=f"Train for N steps. [default: {DEFAULT_STEPS:,}; presets paper: {PAPER_STEPS:,}, refine: {REFINE_STEPS:,}]",
 )
 MINUTES = Option(
     None,
@@ -70,6 +59,4 @@ RUN_SEED = Option(None, metavar="S", min=0, max=2**32 - 1, help="Seed of the run
 # The authors' checkpoints, for import-weights.
 
 OFFICIAL_LI_NET = Argument(..., metavar="G.ckpt", help="The authors' LI-Net, which they call the generator.")
-OFFICIAL_NE_NET = Argument(
-    ..., metavar="D.ckpt", help="The authors' NE-Net, which they call the discriminator."
-)
+OFFICIAL_NE_NET = Argument(..., metavar="D.ckpt", help="The authors' NE-Net, which they call the discriminator.")

@@ -89,9 +89,7 @@ def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
     items = [item.strip() for item in text.split(",") if item.strip()]
     for item in items:
         if item not in allowed:
-            raise UsageError(
-                f"{option} has {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}"
-            )
+            raise UsageError(f"{option} has {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}")
     if not items:
         raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
     return items
@@ -141,9 +139,7 @@ def parse_skip(text: str) -> tuple[str, int]:
 
     name, equals, count = text.rpartition("=")
     if not count.isdecimal() or len(count) > _MOST_DIGITS or bool(name) != bool(equals):
-        raise UsageError(
-            f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20"
-        )
+        raise UsageError(f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20")
     return name or EVERY_CAPTURE, int(count)
 
 
