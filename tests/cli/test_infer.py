@@ -304,3 +304,17 @@ def test_closed_streams_and_ascii_terminals(capture, make_capture):
     assert call("sphere", "2>&-") == 0
     if Path("/dev/full").exists():
         assert call("sphere", "> /dev/full") == 5
+
+
+def test_gradient_and_curvature(capture, truth, run):
+    """Against the analytic sphere: its slopes are those of the true normals, and it is convex."""
+    assert run("infer", capture, "--method", "ls", "--maps", "gradient,curvature").code == 0
+    slopes, curvature = (np.load(f"out/{capture.name}/{name}.npy") for name in ("gradient", "curvature"))
+    inside = np.isfinite(curvature[..., 0])
+    assert inside.sum() == 448
+    np.testing.assert_allclose(slopes[inside], -truth[inside][:, :2] / truth[inside][:, 2:], atol=2e-3)
+    assert (curvature[inside] > 0).all()
+    picture = cv2.imread(f"out/{capture.name}/curvature.png", cv2.IMREAD_UNCHANGED)
+    expected = 127.5 + 127.5 * np.clip(curvature[inside][:, 0] / 0.05, -1, 1)
+    np.testing.assert_allclose(picture[inside], expected, atol=0.51)
+    assert (picture[~inside] == 128).all()

@@ -64,6 +64,10 @@ FILES = (
         "With --maps confidence: the probability that a normal has an error of at most 5 degrees.",
     ),
     ("OUT/NAME/preview.png", "With --maps preview: the surface in matte white under a raking light."),
+    ("OUT/NAME/gradient.npy", "With --maps gradient: the slopes dz/dx and dz/dy, H x W x 2."),
+    ("OUT/NAME/curvature.npy", "With --maps curvature: mean and Gaussian curvature in 1/pixel, H x W x 2."),
+    ("OUT/NAME/curvature.png", "With --maps curvature: the mean curvature; gray is flat, bumps are brighter."),
+    ("OUT/frames/NAME", "The frames of a film, a capture of its own."),
     (
         "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png",
         "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json. Both can write mesh.obj"

@@ -39,3 +39,13 @@ def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) ->
     """
     shading = (normal_map @ unit(np.array(PREVIEW_LIGHT, np.float32))) * mask
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
+
+
+CURVATURE_SCALE = 0.05
+"""Mean curvature, in 1/pixel, that is white in a picture; its negative is black. The same for all parts of a batch."""
+
+
+def curvature_picture(curvature: NDArray[np.float32]) -> Picture:
+    """Return the mean curvature of a map (H, W, 2) as a gray picture (H, W): flat is gray, a bump is brighter."""
+    share = np.nan_to_num(curvature[..., 0] / CURVATURE_SCALE).clip(-1, 1)
+    return np.asarray(np.rint(127.5 + 127.5 * share), np.uint8)

@@ -223,8 +223,13 @@ def _further_files(
             writers.append(partial(files.write_albedo, albedo, capture.mask, exr="exr" in options.formats))
     if "confidence" in options.maps and estimate.confidence_map is not None:
         writers.append(partial(files.write_confidence, estimate.confidence_map))
-    if "preview" in options.maps:
-        writers.append(partial(files.write_preview, estimate))
+    for name, write in (
+        ("preview", files.write_preview),
+        ("gradient", files.write_gradient),
+        ("curvature", files.write_curvature),
+    ):
+        if name in options.maps:
+            writers.append(partial(write, estimate))
     light_plot = None
     if capture.light_errors_deg is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)

@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.inference import NormalEstimate
+from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
 from splinecli.maths.normals import Convention, describe, encode_picture
-from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture
+from splinecli.pictures.maps import (
+    CURVATURE_SCALE,
+    albedo_picture,
+    confidence_picture,
+    curvature_picture,
+    preview_picture,
+)
 from splinecli.pictures.png import encode_png
 from splinecli.results.clock import Clock
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
@@ -39,10 +46,13 @@ LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
     "light_intensities.txt",
     "lights.png",
 )
+GRADIENT, CURVATURE_PICTURE, CURVATURE = "gradient.npy", "curvature.png", "curvature.npy"
 MAPS = {
     "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
     "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
     "preview": (PREVIEW,),
+    "gradient": (GRADIENT,),
+    "curvature": (CURVATURE_PICTURE, CURVATURE),
 }
 """The files of each optional map."""
 
@@ -218,3 +228,18 @@ def write_mask(mask: NDArray[np.bool_], new: NewFiles) -> None:
 def write_preview(estimate: NormalEstimate, new: NewFiles) -> None:
     """Write a shaded picture of the surface."""
     new.write(PREVIEW, encode_png(preview_picture(estimate.normal_map, estimate.capture.mask)))
+
+
+def write_gradient(estimate: NormalEstimate, new: NewFiles) -> None:
+    """Write the slopes (H, W, 2) as a float32 NPY file."""
+    with new.open(GRADIENT) as file:
+        np.save(file, gradient_of_normals(estimate.normal_map, estimate.capture.mask), allow_pickle=False)
+
+
+def write_curvature(estimate: NormalEstimate, new: NewFiles) -> None:
+    """Write the mean and Gaussian curvature (H, W, 2) as a float32 NPY file, and the mean one as a gray picture."""
+    curvature = curvature_of_normals(estimate.normal_map, estimate.capture.mask)
+    with new.open(CURVATURE) as file:
+        np.save(file, curvature, allow_pickle=False)
+    scale = f"mean curvature, black {-CURVATURE_SCALE}, gray 0, white {CURVATURE_SCALE} per pixel"
+    new.write(CURVATURE_PICTURE, encode_png(curvature_picture(curvature), {"curvature": scale}))

@@ -35,6 +35,7 @@ NOT_PHOTOGRAPHS = frozenset(
         "error_map",
         "albedo",
         "confidence",
+        "curvature",
         "preview",
         "depth",
         "mesh",

@@ -48,7 +48,7 @@ SURFACE_FORMATS = Option(
 MAPS = Option(
     None,
     metavar="LIST",
-    help="Further maps to write: any of {maps} (a shaded image).",
+    help="Further maps to write: any of {maps}. preview is a shaded image.",
     autocompletion=complete_list(choices.maps),
 )
 HTML = Option(
