@@ -167,9 +167,22 @@ def test_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run) -> None:
     times = [frame.stat().st_mtime_ns for frame in frames]
     assert "already done" in run(*command).err
     assert [frame.stat().st_mtime_ns for frame in frames] == times
+    # Of another film, nothing is replaced without --update.
     write_film(film, sphere_film(lights[::-1].copy()))
-    assert "other input files" in run(*command).err
-    assert [frame.stat().st_mtime_ns for frame in sorted(Path("out/frames/clip").glob("*.png"))] != times
+    result = run(*command)
+    assert result.code == 5 and "frames of another film" in result.err and "--update" in result.err
+    assert [frame.stat().st_mtime_ns for frame in frames] == times
+    assert run(*command, "--update").code == 0
+    assert sorted(Path("out/frames/clip").glob("*.png")) != frames
+    # Nothing else counts as a frame, and a damaged frame is taken again.
+    first = min(Path("out/frames/clip").glob("*.png"))
+    whole = first.read_bytes()
+    first.write_bytes(b"")
+    assert run(*command, "--overwrite").code == 0 and first.read_bytes() == whole
+    Path("out/frames/clip/mask.png").write_bytes(whole)
+    result = run(*command, "--overwrite")
+    assert result.code == 5 and "contains mask.png, which is no frame" in result.err
+    Path("out/frames/clip/mask.png").unlink()
     assert "from the camera axis" in run("info", film, "--lights", "estimate", "--mask", "mask.png").out
 
 
@@ -182,4 +195,23 @@ def test_films_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert result.code == 3 and "clip.avi: found 1 of 10 frames" in result.err
     assert not Path("out/frames").exists()
     result = run("infer", "none.mp4", "--lights", "estimate")
-    assert result.code == 3 and "does not exist" in result.err
+    assert result.code == 3 and "the film does not exist" in result.err
+    # A name that would lead out of OUT/frames is none of a film.
+    film.rename("...mp4")
+    assert run("infer", "...mp4", "--lights", "estimate").code == 3
+
+
+def test_a_planted_record_of_a_film_deletes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run) -> None:
+    monkeypatch.chdir(tmp_path)
+    film = write_film(Path("clip.avi"), sphere_film(path_of_lamp(60)))
+    Path("out/frames/clip").mkdir(parents=True)
+    own = Path("out/frames/clip/frame-holiday.png")
+    own.write_bytes(b"mine")
+    record = {
+        "film": "x",
+        "sha256": "y",
+        "frames": dict.fromkeys([own.name] * 1 + [f"frame-00000{i}.png" for i in range(6)], 4),
+    }
+    Path("out/frames/clip/film.json").write_text(json.dumps(record))
+    result = run("infer", film, "--lights", "estimate", "--update")
+    assert result.code == 5 and own.read_bytes() == b"mine"

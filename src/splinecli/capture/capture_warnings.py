@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.restore.white_level import WhiteLevel
-from splinecli.maths.transfer import BT709, TransferCurve
+from splinecli.maths.transfer import TransferCurve
 
 
 @dataclass(frozen=True)
@@ -175,10 +175,7 @@ def ambient_subtracted(ambient: str) -> CaptureWarning:
 
 def display_decoded(by: str, curve: TransferCurve) -> CaptureWarning:
     """Warn of images whose values are decoded with the curve that they state."""
-    if curve is None or curve == BT709:
-        how = "sRGB" if curve is None else "BT.709"
-    else:
-        how = "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}"
+    how = "sRGB" if curve is None else "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}"
     text = f"The images say that they are display-encoded ({by}) and are read as {how}."
     return CaptureWarning(DISPLAY_DECODED, f"{text} Add --transfer linear if their values are linear.")
 

@@ -20,7 +20,7 @@ from splinecli.capture.formats.images import to_linear
 from splinecli.capture.masks import take_pixels
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
-from splinecli.maths.transfer import TransferCurve, decode_transfer
+from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
 _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 
@@ -51,7 +51,7 @@ class RadiometricCalibration:
         warnings = [capture_warnings.profile_unread(unread[0].name)] if unread and self.automatic else []
         if self.automatic and len(curves) == 1:
             (curve,) = curves
-            if curve != 1:
+            if curve not in (1, BT709):  # a film has no other curve
                 warnings.append(capture_warnings.display_decoded(by, curve))
             return replace(self, curve=curve), warnings
         return self, [*warnings, capture_warnings.display_encoded(by)] if by else warnings

@@ -90,8 +90,9 @@ def infer(
     """Estimate the normal map of each CAPTURE.
 
     A CAPTURE is a folder with the images of one object. A fixed camera took them under different lights. The light file
-    is in the folder, or --lights names it. Writes OUT/<name>/normals.png, normals.npy and report.json, and
-    error_map.png if there is ground truth. With several captures, OUT/index.html links the results.
+    is in the folder, or --lights names it. With --lights estimate, a CAPTURE may be a film. Writes
+    OUT/<name>/normals.png, normals.npy and report.json, and error_map.png if there is ground truth. With several
+    captures, OUT/index.html links the results.
 
     Captures that are already done are skipped. If files or options of a capture have changed, infer reports it and
     keeps the old results. --update or --overwrite computes them again. A capture that fails does not stop the others.

@@ -91,6 +91,7 @@ def _own_path(folder: Path) -> Path:
 
 def _member(folder: Path) -> Member:
     """Return the capture in the folder. Raises UsageError for a word of another option."""
+    from splinecli.capture.formats.film import is_film
     from splinecli.capture.paths import find_mode
     from splinecli.methods import method_names
     from splinecli.results.files import MAPS, NORMALS
@@ -107,7 +108,8 @@ def _member(folder: Path) -> Member:
             path=folder,
             hint="Write lists with commas, such as --maps albedo,confidence",
         )
-    return Member(folder, folder.name or str(folder), InputError("the folder does not exist", path=folder))
+    kind = "film" if is_film(folder) else "folder"
+    return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
 
 
 def _name(folder: Path) -> str:

@@ -3,59 +3,90 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Collection
 from pathlib import Path
+from typing import Literal
 
-from splinecli.capture.formats.film import choose_frames, is_film, read_frames
+from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.capture.stamp import digest, stamp_content
 from splinecli.errors import UsageError
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.observer import Observer
 from splinecli.pipeline.reading import Reading
 from splinecli.system.files import read_json
+from splinecli.system.locks import RefusedFolderError
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
 FOLDER = "frames"
 """The folder in the output folder of `infer` with a folder of frames for each film."""
 
 _RECORD = "film.json"
+_FRAME = re.compile(r"frame-\d{6,}\.png")
 
 
-def unpacked(capture: Path, output: Path, reading: Reading, observer: Observer) -> Path:
+def unpacked(
+    capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Literal["nothing", "changed", "all"]
+) -> Path:
     """Return the capture; of a film, the folder of its frames in `output`, which are taken now or were earlier.
+
+    Args:
+        redo: whether frames of an earlier film are kept, replaced by those of another film, or taken again.
 
     Raises:
         UsageError: the lights of a film are not to be found from its images.
         InputError: the film cannot be read, or its light does not move.
+        RefusedFolderError: the folder has frames of another film, or other files.
         OutputError: the frames cannot be written.
     """
     if not is_film(capture):
         return capture
     if not reading.finds_lights:
-        raise UsageError(f"{capture} is a film, and no file has its lights", hint="Add --lights estimate")
+        raise UsageError(f"{capture} is a film, whose lights have to be found", hint="Add --lights estimate")
     folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
     refuse_link(folder.parent)
     refuse_link(folder)
     with held_folder(folder, observer.warn):
-        earlier = _earlier(folder)
-        if earlier[0] == stamp and all(is_plain(folder / name) for name in earlier[1]):
+        of_film, sizes = _earlier(folder)
+        _refuse_others(folder, sizes)
+        whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
+        if of_film == stamp and whole and redo != "all":
             return folder
+        if of_film not in (stamp, "") and redo == "nothing":
+            raise RefusedFolderError(
+                "contains the frames of another film, or of an earlier version of this one",
+                path=folder,
+                hint="Add --update to take those of this film, or choose another place with -o",
+            )
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
             advance(1)
         names = [f"frame-{number:06}.png" for number in numbers]
-        with new_files(folder, report=_RECORD, stale=earlier[1]) as new:
+        with new_files(folder, report=_RECORD, stale=sizes) as new:
             for name, frame in zip(names, read_frames(capture, numbers), strict=True):
                 new.write(name, encode_png(frame, film=True))
-            new.write(_RECORD, json.dumps({"film": str(capture), "sha256": stamp, "frames": names}, indent=2))
+            record = {"film": str(capture), "sha256": stamp, "frames": new.sizes}
+            new.write(_RECORD, json.dumps(record, indent=2) + "\n")
     return folder
 
 
-def _earlier(folder: Path) -> tuple[str, Sequence[str]]:
-    """Return the stamp of the film and the names of the frames that are in the folder; nothing for none."""
+def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
+    """Return the stamp of the film whose frames are in the folder, and their sizes; nothing for none."""
     try:
         record = read_json(folder / _RECORD)
-        names = [name for name in record["frames"] if name.startswith("frame-") and Path(name).name == name]
-        return str(record["sha256"]), names
+        frames = {str(name): int(size) for name, size in record["frames"].items()}
+        if len(frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, frames)):
+            return str(record["sha256"]), frames
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return "", ()
+        pass
+    return "", {}
+
+
+def _refuse_others(folder: Path, frames: Collection[str]) -> None:
+    """Raise RefusedFolderError for files that are no frames: they would count as photographs, or as a mask."""
+    known = {*frames, _RECORD}
+    others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
+    if others and not (not frames and all(map(_FRAME.fullmatch, others))):
+        raise RefusedFolderError(
+            f"contains {others[0]}, which is no frame of this film", path=folder, hint="Move it, or choose another -o"
+        )

@@ -79,7 +79,7 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
         UsageError: the plot would be in the folder of the images, or an option is out of range.
     """
     with TemporaryDirectory() as frames:  # of a film
-        folder = unpacked(options.capture, Path(frames), options.reading, observer)
+        folder = unpacked(options.capture, Path(frames), options.reading, observer, redo="all")
         return _describe(replace(options, capture=folder), observer)
 
 

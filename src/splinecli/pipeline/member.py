@@ -67,7 +67,7 @@ def run_member(
     if member.missing is not None:
         return replace(failed(member.name, member.missing), status="missing")
     try:
-        folder = unpacked(member.folder, Path(options.output), options, observer)
+        folder = unpacked(member.folder, Path(options.output), options, observer, redo=redo)
         member = replace(member, folder=folder)
         outcome = _earlier_outcome(member, options, observer, redo)
     except Exception as error:

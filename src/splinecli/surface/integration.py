@@ -18,7 +18,7 @@ from splinecli.maths.normals import unit
 from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length
-from splinecli.surface.laplacian import MULTIGRID_PIXELS, LaplacianSolver
+from splinecli.surface.laplacian import LaplacianSolver
 
 Floats = NDArray[np.float64]
 
@@ -88,10 +88,11 @@ def _integrate(
     # At heights of zero all weights are equal, so the first solve is least squares and needs full precision.
     # Each later solve moves the surface a little further, for which few digits suffice.
     precision, most, own_share = _FIRST_PRECISION, _SOLVES_OF_COARSEST if stiffness > 0 else 1, 1.0
-    if n_pixels > (_COARSEST if stiffness > 0 else MULTIGRID_PIXELS):
+    is_huge = n_pixels > _FINEST
+    if is_huge or (n_pixels > _COARSEST and stiffness > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = np.zeros((*blocks.mask.shape, 3))
-        coarse[blocks.mask] = _normals_of(blocks, normal_map[mask].astype(np.float64), mask)
+        coarse[blocks.mask] = _normals_of(blocks, normal_map[mask].astype(np.float64), mask, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
         of_blocks[blocks.mask] = _integrate(
             coarse,
@@ -101,11 +102,9 @@ def _integrate(
             lambda share: progress((1 - own_share) * share),
         )
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
-        if n_pixels > _FINEST:
+        if is_huge:
             return heights
-        precision, most = _LATER_PRECISION, 1
-        if stiffness > 0:
-            most = min(_MOST_SOLVES, max(_FEWEST_SOLVES, _SOLVED_PIXELS // n_pixels))
+        precision, most = _LATER_PRECISION, min(_MOST_SOLVES, max(_FEWEST_SOLVES, _SOLVED_PIXELS // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
     for _ in range(most):
         weights, flows = equations.weigh(heights, stiffness)
@@ -118,12 +117,16 @@ def _integrate(
     return heights
 
 
-def _normals_of(blocks: Blocks, normals: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """Return the normals (p, 3) of blocks from those of their pixels (P, 3): the mean, or at an edge the steepest one.
+def _normals_of(blocks: Blocks, normals: Floats, mask: NDArray[np.bool_], *, keep_edges: bool) -> Floats:
+    """Return the normals (p, 3) of blocks from those of their pixels (P, 3): of the mean slope, or of the steepest one.
 
-    The mean over an edge would be a slope that joins what it separates. The steepest one belongs to the rim.
+    With keep_edges, a block that contains an edge has the steepest normal, which belongs to the rim. The mean over an
+    edge would be a slope that joins what it separates.
     """
-    mean = unit(blocks.average(normals, mask))
+    slopes = normals / np.maximum(normals[:, 2:], SMALLEST_COSINE)
+    mean = unit(blocks.average(slopes, mask))
+    if not keep_edges:
+        return mean
     block = blocks.numbers_at(*np.nonzero(mask))
     closest = np.ones(len(mean))
     np.minimum.at(closest, block, np.einsum("pi,pi->p", normals, mean[block]))

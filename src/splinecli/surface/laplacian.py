@@ -1,7 +1,6 @@
 """The linear solver of integration: a weighted Laplacian of the graph of pixels.
 
-Conjugate gradients with an algebraic multigrid preconditioner. On large maps that start from a coarser scale, only fine
-detail is missing, which the diagonal as a preconditioner finds in a few steps and in far less memory.
+Conjugate gradients with an algebraic multigrid preconditioner.
 """
 
 from __future__ import annotations
@@ -14,14 +13,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int32]
 
-MULTIGRID_PIXELS = 1_500_000
-"""Larger maps have to start from a coarser scale."""
-
 # Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that no
 # equation ties to others keep their heights, and the system is never singular.
 _DAMPING_OF_GAPS = 1e-7
 _DAMPING_OF_HEIGHTS = 1e-12
-_MAX_STEPS, _STEPS_OF_DETAIL = 200, 15
+_MAX_STEPS = 200
 _STEPS_BEFORE_RENEWAL = 15  # above this number of steps, a new preconditioner saves more time than it costs
 
 
@@ -54,14 +50,9 @@ class LaplacianSolver:
             precision: the relative residual at which the solver stops.
         """
         from pyamg import ruge_stuben_solver
-        from scipy.sparse import diags
         from scipy.sparse.linalg import cg
 
         matrix = self._laplacian(weights + _DAMPING_OF_GAPS)
-        if self._n_pixels > MULTIGRID_PIXELS:
-            inverse = diags(1 / matrix.diagonal())
-            detail, _ = cg(matrix, self._divergence(flows), rtol=precision, maxiter=_STEPS_OF_DETAIL, M=inverse)
-            return np.asarray(detail, np.float64)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()

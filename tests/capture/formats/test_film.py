@@ -129,3 +129,7 @@ def test_a_truncated_film_is_refused(tmp_path: Path) -> None:
     film.write_bytes(film.read_bytes()[:20_000])  # the index at the end is missing
     with pytest.raises(InputError, match="damaged"):
         choose_frames(film)
+    film = write_film(tmp_path / "clip.avi", sphere_film(path_of_lamp(40)))
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"breaks off: \d+ of 40 frames|damaged"):
+        choose_frames(film)

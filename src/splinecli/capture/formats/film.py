@@ -32,6 +32,7 @@ LEAST_DIFFERENCE = 0.05
 _CANDIDATES = 1000  # frames that are compared; of a longer film, one of two, of four and so on
 _THUMBNAIL, _SMALL = 64, 512  # longest sides in pixels: of shading, of sharpness and exposure
 _NEIGHBOURS = 7  # frames before and after, whose light is similar
+_LEAST_READ = 0.8  # share of the frames that the film states
 _BLURRED = 0.6  # share of the neighbours' sharpness
 _DARK = 0.2  # share of the usual brightness
 _CLIPPED = 250  # stored value from which a pixel counts as overexposed
@@ -51,7 +52,7 @@ class _Candidate(NamedTuple):
 
 def is_film(path: Path) -> bool:
     """Return whether the path has the name of a film, and is no folder."""
-    return path.suffix.lower() in FILM_SUFFIXES and not is_folder(path)
+    return path.suffix.lower() in FILM_SUFFIXES and path.stem.strip(".") != "" and not is_folder(path)
 
 
 def choose_frames(film: Path) -> tuple[int, ...]:
@@ -86,27 +87,35 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
     with _opened(film) as video:
         place = 0
         for number in numbers:
-            while place <= number:
-                if not video.grab():
-                    raise _damaged(film)
-                place += 1
+            with native_stderr():  # not longer, because it stops progress bars, too
+                while place <= number and video.grab():
+                    place += 1
+            if place <= number:
+                raise _damaged(film)
             yield np.ascontiguousarray(_picture(video, film)[..., ::-1])
 
 
 def _candidates(film: Path) -> list[_Candidate]:
     """Return frames at even distances, with what their choice depends on. Raises InputError."""
+    import cv2
+
     found: list[_Candidate] = []
     step = 1
     with _opened(film) as video:
-        number = 0
-        while video.grab():
-            if number % step == 0:
-                found.append(_candidate(number, _picture(video, film)))
-            if len(found) >= _CANDIDATES:
-                found, step = found[::2], 2 * step
-            number += 1
+        number, stated = 0, video.get(cv2.CAP_PROP_FRAME_COUNT)
+        with native_stderr():
+            while video.grab():
+                if number % step == 0:
+                    found.append(_candidate(number, _picture(video, film)))
+                if len(found) >= _CANDIDATES:
+                    found, step = found[::2], 2 * step
+                number += 1
     if not found:
         raise _damaged(film)
+    if number < _LEAST_READ * stated:
+        raise InputError(
+            f"the film breaks off: {number} of {stated:.0f} frames can be read", path=film, hint="Copy it again"
+        )
     return found
 
 
