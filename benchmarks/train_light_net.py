@@ -3,9 +3,9 @@
     python benchmarks/train_light_net.py render FOLDER --scenes 960
     python benchmarks/train_light_net.py train FOLDER --minutes 85 -o light-net.safetensors
 
-Both go on after an interruption. The shipped weights saw 1,880 scenes in three classes of materials each, in two legs of
-22,000 and 11,000 steps: about 300,000 captures. The second leg began from the first with a rate of 0.0012, and had twice
-the scenes.
+Both go on after an interruption. The shipped weights saw 1,880 scenes in three classes of materials each, in two legs
+of 22,000 and 11,000 steps: about 300,000 captures. The second leg began from the first with a rate of 0.0012, and had
+twice the scenes.
 """
 
 from __future__ import annotations
