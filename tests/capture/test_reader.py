@@ -10,6 +10,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from scenes import ring_lights, write_capture
 from splinecli.capture import CaptureWarning, open_capture, read_capture
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
@@ -155,3 +156,14 @@ def test_least_squares_on_diligent(shared_data: Path, name: str, n_pixels: int, 
     truth = capture.ground_truth[capture.mask]
     scored = truth.any(axis=1)
     assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(mae_deg, abs=0.02)
+
+
+@pytest.mark.parametrize(("scale", "spread", "warned"), [(1, 0.3, False), (600, 0, False), (200, 0.3, True)])
+def test_positions_given_as_directions_are_named(tmp_path: Path, scale: float, spread: float, warned: bool) -> None:
+    """Vectors of one length, or of about 1, are directions."""
+    lights = ring_lights(8) * scale * (1 + spread * np.linspace(0, 1, 8)[:, None])
+    folder = write_capture(tmp_path / "a", np.full((8, 4, 5), 100, np.uint8), lights)
+    found = [str(w) for w in read_capture(folder).warnings if w.code == "near_lamps"]
+    assert len(found) == warned
+    if warned:
+        assert "lengths from 200 to 260" in found[0] and "--light-positions" in found[0]

@@ -16,6 +16,7 @@ from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
+from splinecli.capture.lights.lamp_checks import positions_as_directions
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
 from splinecli.capture.lights.light_angles import LightForm, RowForm
 from splinecli.capture.lights.light_files import read_light_intensities
@@ -177,6 +178,8 @@ def _read_lights(
         intensities = None
     elif files.light_intensities is not None:
         intensities = _read_intensities(files.light_intensities, files.images, in_folder)
+    if path is not None and form == "xyz" and lamps is None:
+        warnings += positions_as_directions(path)
     facts = tuple(map(read_facts, files.images))
     known = equal or intensities is not None
     measured = intensities is not None

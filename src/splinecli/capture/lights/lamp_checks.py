@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
+from splinecli.capture.lights.array_files import SUFFIXES as ARRAY_SUFFIXES
+from splinecli.capture.lights.light_rows import read_light_rows
+from splinecli.capture.lights.named_lights import SUFFIXES as NAMED_SUFFIXES
 from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.paths import is_substitution
 from splinecli.errors import InputError
 
 NEAR_DEG = 2.0
@@ -21,6 +25,9 @@ width and height: it would be inside the object, or hide it from the camera."""
 CLOSE, FAR = 1.0, 300.0
 """Distances, in the larger of the object's width and height, that carry a warning: below the first, and above the
 second. A position in metres instead of millimetres changes the distance a thousandfold."""
+
+_SHORTEST_POSITION, _UNEQUAL_LENGTHS = 3.0, 1.02
+"""Vectors of a file of directions are probably positions above this length, if the longest is so much longer."""
 
 UNIT_HINT = (
     "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the pixel size or object"
@@ -68,5 +75,24 @@ def distant_lights(positions: Path | None, lamps: NearLamps | None, mask: NDArra
     text = (
         f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees between the middle"
         " and the edge of the object, but the lights count as distant. Use --light-positions instead of --lights."
+    )
+    return [CaptureWarning(NEAR_LAMPS, text)]
+
+
+def positions_as_directions(path: Path) -> list[CaptureWarning]:
+    """Warn of a text file of light directions whose vectors have lengths as positions of lamps have."""
+    if path.suffix.lower() in (*NAMED_SUFFIXES, *ARRAY_SUFFIXES) or is_substitution(path):
+        return []
+    try:
+        vectors = read_light_rows(path, expected="x y z", n_numbers=3).numbers.as_array()
+    except InputError:
+        return []  # a file of angles
+    vectors = vectors.T if vectors.shape[1] != 3 and vectors.shape[0] == 3 else vectors[:, -3:]
+    lengths = np.linalg.norm(vectors, axis=1)
+    if len(lengths) < 3 or lengths.min() < _SHORTEST_POSITION or lengths.max() < _UNEQUAL_LENGTHS * lengths.min():
+        return []
+    text = (
+        f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g}, as positions of"
+        " lamps have, but count as directions. If they are positions, use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
