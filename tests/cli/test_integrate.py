@@ -101,6 +101,53 @@ def test_a_background_that_is_not_black(run, where):
     assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
 
 
+def write_depth(form: str, depth: np.ndarray) -> str:
+    if form == "npy":
+        np.save("prior.npy", depth)
+    elif form == "tif":
+        tifffile.imwrite("prior.tif", depth)
+    else:
+        header = {"compression": (exr := pytest.importorskip("OpenEXR")).ZIP_COMPRESSION, "type": exr.scanlineimage}
+        exr.File(header, {"Z": depth}).write("prior.exr")
+    return f"prior.{form}"
+
+
+@pytest.mark.parametrize("form", ["npy", "tif", "exr"])
+def test_a_prior(run, form):
+    """Its heights in millimetres decide where the surface is."""
+    _, heights, inside = sphere()
+    prior = write_depth(form, np.where(inside, 0.5 * (heights + 100), np.nan).astype(np.float32))
+    arguments = ["normals.png", "--prior", prior, "--pixel-size", "0.5", "-o", "out", "--format", "npy", "--json"]
+    report = json.loads(run("integrate", *arguments).out)
+    assert (report["prior"], report["unit"]) == (prior, "millimetre")
+    np.testing.assert_allclose(np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2)
+
+
+BAD_PRIORS = {
+    "size": (np.ones((3, 4), np.float32), "found a depth map of 4 x 3 pixels"),
+    "integers": (np.ones(SHAPE, np.uint16), "expected floating-point numbers"),
+    "vectors": (np.ones((*SHAPE, 2), np.float32), "expected floating-point numbers"),
+    "nothing": (np.full(SHAPE, np.nan, np.float32), "the prior has no value in the mask"),
+    "negated": (-sphere()[1].astype(np.float32), "the slopes of the prior are -0."),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PRIORS)
+def test_a_bad_prior(run, case):
+    prior, message = BAD_PRIORS[case]
+    np.save("prior.npy", prior)
+    result = run("integrate", "normals.png", "--prior", "prior.npy", "-o", "out")
+    assert (result.code, message in result.err, Path("out/surface.json").exists()) == (3, True, False), result.err
+
+
+def test_a_damaged_prior(run):
+    for name in ("prior.npy", "prior.tif", "prior.exr"):
+        Path(name).write_bytes(b"\x93NUMPY\x01\x00garbage")
+        result = run("integrate", "normals.png", "--prior", name, "-o", "out")
+        assert (result.code, name in result.err) == (3, True), result.err
+    assert run("integrate", "normals.png", "--prior-detail", "9", "-o", "out").code == 2
+
+
 VIEWS = {
     "millimetres": "--pixel-size 0.5",
     "scale": "--scale 1/2 --pixel-size 0.5",

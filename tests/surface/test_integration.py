@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, label
 
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.maths.normals import unit
@@ -233,6 +233,71 @@ def test_least_squares_is_the_dense_solution() -> None:
     normals[normals[..., 2] < 0.1] = (0, 0, 1)
     found = integrate_normals(normals, mask, stiffness=0)[mask]
     np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
+
+
+def test_a_prior_is_the_dense_solution() -> None:
+    normals, mask = bumps(14, 19), holes(14, 19)
+    normals[normals[..., 2] < 0.1] = (0, 0, 1)
+    prior = np.random.default_rng(2).normal(size=mask.shape)
+    prior[:, 12:] = np.nan  # parts there have mean height 0, in relation to the mean of the prior
+    found = integrate_normals(normals, mask, stiffness=0, prior=prior, prior_detail=8)[mask]
+    matrices, constants = equations(normals, mask)
+    known = np.isfinite(prior[mask])
+    pulls = 2 * np.pi / 8 * np.eye(len(known))[known]
+    rows = np.concatenate((*(np.sqrt(0.5) * matrix for matrix in matrices), pulls))
+    values = np.concatenate((-np.sqrt(0.5) * np.concatenate(constants), 2 * np.pi / 8 * prior[mask][known]))
+    expected = np.linalg.lstsq(rows, values)[0]
+    parts = label(mask)[0][mask]
+    reached = np.isin(parts, parts[known])
+    np.testing.assert_allclose(found[reached], expected[reached], atol=1e-4)
+    means = [found[parts == part].mean() for part in np.unique(parts[~reached])]
+    np.testing.assert_allclose(means, prior[mask][known].mean(), atol=1e-9)
+
+
+def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
+    """Return normals with smooth errors of 4 degrees and noise of 2, heights, and a coarse, noisy scan of these."""
+    rng = np.random.default_rng(seed)
+    x, y = grid(200, 200)
+    heights = 40 * np.exp(-(x**2 + y**2) / 60**2) + 2 * np.sin(x / 5) * np.cos(y / 4)
+    down, right = np.gradient(heights)
+    normals = normals_of_slopes(right, -down)
+    errors = np.stack([gaussian_filter(rng.normal(size=x.shape), 40) for _ in range(2)], axis=-1)
+    normals[..., :2] += errors * np.tan(np.radians(4)) / errors.std() + rng.normal(scale=0.035, size=errors.shape)
+    scan = gaussian_filter(heights, 6) + rng.normal(scale=0.7, size=x.shape)
+    return unit(normals), heights, scan
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 2.0])
+@pytest.mark.usefixtures("any_scale")
+def test_a_prior_is_better_than_normals_and_scan_alone(stiffness: float) -> None:
+    normals, heights, scan = drifting()
+    scan[80:95, 60:120] = np.nan
+
+    def error(found: Floats) -> float:
+        return float(np.nanstd(found - heights))
+
+    both = integrate_normals(normals, stiffness=stiffness, prior=scan)
+    assert 1.5 * error(both) < error(scan) < error(integrate_normals(normals, stiffness=stiffness))
+    assert abs(np.mean(both - heights)) < 0.1
+
+
+def test_a_prior_gives_depths_their_scale() -> None:
+    mask = np.ones((84, 126), bool)
+    rays = seen(CAMERA, *mask.shape)
+    normal = unit(np.array([0.2, -0.3, 1.0]))
+    truth = 1 / np.abs(rays @ normal)
+    prior = 500 * truth / truth.mean()
+    found = integrate_normals(np.broadcast_to(normal, (*mask.shape, 3)), mask, CAMERA, prior=prior)
+    np.testing.assert_allclose(found, prior, rtol=1e-3)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 20.0, 0.05])
+def test_a_prior_in_another_direction_or_unit(factor: float) -> None:
+    normals, heights, _ = drifting()
+    with pytest.raises(InputError, match="the slopes of the prior are") as raised:
+        integrate_normals(normals, prior=factor * heights)
+    stated = re.search(r"are (\S+) times", str(raised.value))
+    assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)
 
 
 @pytest.mark.usefixtures("until_nothing_moves")

@@ -19,6 +19,8 @@ def integrate(
     convention: NormalConvention | None = inputs.NORMALS_CONVENTION,
     colours: Path | None = inputs.COLOURS,
     stiffness: float = computing.STIFFNESS,
+    prior: Path | None = inputs.PRIOR,
+    prior_detail: float | None = computing.PRIOR_DETAIL,
     largest_step: float | None = computing.LARGEST_STEP,
     pixel_size: float | None = inputs.PIXEL_SIZE_MM,
     output: Path | None = outputs.SURFACE_FOLDER,

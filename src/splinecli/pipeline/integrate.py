@@ -50,6 +50,8 @@ class IntegrateOptions:
         camera_matrix: a text file of 3 x 3 numbers, for a perspective camera. None for that of the report of `infer`
             beside the normal map, or else for an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 never tears it.
+        prior: a depth map of the same view from elsewhere, for the shape in the large. None for the normals alone.
+        prior_detail: the width in pixels below which the shape is that of the normals. None chooses it.
         largest_step: leaves out triangles that are higher, in pixels. None keeps all.
         pixel_size: the width of a pixel on the object in millimetres. None for that of the report, or else for a
             surface without this unit.
@@ -69,6 +71,8 @@ class IntegrateOptions:
     mask: Path | None = None
     camera_matrix: Path | None = None
     stiffness: float = STIFFNESS
+    prior: Path | None = None
+    prior_detail: float | None = None
     largest_step: float | None = None
     pixel_size: float | None = None
     decimate: int | None = None
@@ -81,6 +85,8 @@ class IntegrateOptions:
         check_pixel_size(self.pixel_size)
         if self.decimate is not None and self.decimate < 1:
             raise UsageError(f"--decimate is {self.decimate}, expected a number of triangles of at least 1")
+        if self.prior_detail is not None and self.prior is None:
+            raise UsageError("--prior-detail needs --prior")
         for name in self.formats:
             if name not in SURFACE_FILES:
                 raise UsageError(f"no format named {name!r}; expected one of {', '.join(SURFACE_FILES)}")
@@ -122,8 +128,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 
     from splinecli.capture import read_normal_map
     from splinecli.capture.capture_size import BYTES_OF_SURFACE
-    from splinecli.capture.formats.image_size import check_memory
+    from splinecli.capture.formats.image_size import ExpectedSize, check_memory
     from splinecli.capture.lights.lamp_files import read_camera_matrix
+    from splinecli.surface.depth_files import read_depth
     from splinecli.system.publishing import new_files
 
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
@@ -142,6 +149,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     pixel_size = options.pixel_size
     if made_by is not None:
         camera_matrix, pixel_size = view_of_report(made_by, camera_matrix, pixel_size)
+    prior = None
+    if options.prior is not None:
+        prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
     picture = options.colours or _find_albedo(options.normals)
     colours = None if picture is None else _read_colours(picture, mask.shape)
     with observer.progress("integrating", 1.0) as advance:
@@ -154,12 +164,15 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             largest_step=options.largest_step,
             n_triangles=options.decimate,
             pixel_size_mm=pixel_size,
+            prior=prior,
+            prior_detail=options.prior_detail,
             progress=advance,
         )
     report = {
         "schema": SCHEMA,
         "normals": str(options.normals),
         "colours": None if picture is None else str(picture),
+        "prior": None if options.prior is None else str(options.prior),
         "n_pixels": n_pixels,
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,

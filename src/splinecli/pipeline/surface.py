@@ -28,16 +28,20 @@ def make_surface(
     largest_step: float | None = None,
     n_triangles: int | None = None,
     pixel_size_mm: float | None = None,
+    prior: NDArray[np.floating] | None = None,
+    prior_detail: float | None = None,
     progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and what the reports say of it.
 
     Args:
-        normal_map, mask, camera_matrix, stiffness, progress: see integrate_normals.
+        normal_map, mask, camera_matrix, stiffness, prior_detail, progress: see integrate_normals.
         colours, largest_step: see surface_mesh.
         n_triangles: see decimate. None keeps all triangles.
         pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a surface in pixels,
             or, with a camera matrix, in mean depths.
+        prior: see integrate_normals; in the unit of the surface. With a camera matrix this is the millimetre, so that
+            pixel_size_mm is not needed.
 
     Raises:
         InputError, UsageError: see integrate_normals, surface_mesh and decimate.
@@ -49,7 +53,17 @@ def make_surface(
     from splinecli.surface.integration import integrate_normals
     from splinecli.surface.mesh import surface_mesh
 
-    depth = integrate_normals(normal_map, mask, camera_matrix, stiffness=stiffness, progress=progress)
+    if prior is not None and camera_matrix is None and pixel_size_mm is not None:
+        prior = prior / pixel_size_mm
+    depth = integrate_normals(
+        normal_map,
+        mask,
+        camera_matrix,
+        stiffness=stiffness,
+        prior=prior,
+        prior_detail=prior_detail,
+        progress=progress,
+    )
     if n_triangles is None:
         mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
     else:
@@ -65,7 +79,9 @@ def make_surface(
         mesh = decimate(fine, n_triangles, normal_map, camera_matrix)
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit, millimetres = "pixel" if camera_matrix is None else "mean depth", 1 / pixel
-    if pixel_size_mm is not None:
+    if prior is not None and camera_matrix is not None:
+        unit, millimetres = "millimetre", 1.0
+    elif pixel_size_mm is not None:
         unit, millimetres, scale = "millimetre", 1.0, pixel_size_mm / pixel
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
     surface = Surface(depth, mesh, unit, millimetres)

@@ -1,14 +1,17 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes: the surface tears only
-where it contradicts the normals, and large maps are integrated from coarse to fine. `bilateral_equations` has the
-equations, `laplacian` the linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
+where it contradicts the normals, and large maps are integrated from coarse to fine. A coarse surface from elsewhere may
+give what is wider than some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and
+normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations, `laplacian` the linear solver.
+Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +33,8 @@ _FINEST = 8_000_000  # pixels; larger maps have the heights of their blocks, int
 _SOLVES_OF_COARSEST = 150
 _MOST_SOLVES, _FEWEST_SOLVES = 20, 4  # the most at finer scales, of small maps and of large ones
 _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
+_PRIOR_DETAIL = 0.15  # of the root of the mask's area
+_CLEARLY_CORRELATED, _MOST_TIMES_STEEPER = 0.5, 2.0  # slopes of prior and normals
 _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
 
 Progress = Callable[[float], object]
@@ -42,6 +47,8 @@ def integrate_normals(
     camera_matrix: NDArray[np.floating] | None = None,
     *,
     stiffness: float = STIFFNESS,
+    prior: NDArray[np.floating] | None = None,
+    prior_detail: float | None = None,
     progress: Progress = lambda share: None,
 ) -> Floats:
     """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the mask.
@@ -56,32 +63,64 @@ def integrate_normals(
         camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV: columns count to the
             right, rows count down, and (0, 0) is the centre of the first pixel. None is an orthographic camera.
         stiffness: how easily the surface tears at edges. 0 is least squares, which never tears.
+        prior: (H, W), a coarse surface from elsewhere, as a scanner gives it: heights or depths like the result, NaN
+            where it is not known. The result has its shape in the large, its offset and, in depths, its scale.
+        prior_detail: the width in pixels of the waves that come from prior and normals in equal parts. Wider ones
+            follow the prior. None for 15 % of the root of the mask's area.
         progress: see Progress. The shares may add up to less than 1.
 
     Raises:
         UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
-        InputError: the mask is empty, a normal in the mask is not a unit vector, or the camera matrix is not valid.
+        InputError: the mask is empty, a normal in the mask is not a unit vector, the camera matrix is not valid, or the
+            prior has no value in the mask, or clearly another direction or unit.
     """
     if not (isfinite(stiffness) and stiffness >= 0):
         raise UsageError(f"the stiffness is {stiffness:g}, expected a number of at least 0")
     if mask is None:
         mask = _mask_of_normals(normal_map)
     _check_maps(normal_map, mask)
-    return _depth_map(_integrate(normal_map, mask, camera_matrix, stiffness, progress), mask, camera_matrix)
+    known = None
+    if prior is not None:
+        known = _heights_of_prior(prior, mask, camera_matrix)
+        prior_detail = _PRIOR_DETAIL * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
+        if not (isfinite(prior_detail) and prior_detail > 0):
+            raise UsageError(f"the detail of the prior is {prior_detail:g} pixels, expected a positive number")
+    surface = _Surface(normal_map, mask, camera_matrix, known, prior_detail or 0.0)
+    if known is not None:
+        _check_prior(surface)
+    return _depth_map(_integrate(surface, stiffness, progress), mask, camera_matrix, known)
 
 
-def _integrate(
-    normal_map: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    camera_matrix: NDArray[np.floating] | None,
-    stiffness: float,
-    progress: Progress,
-) -> Floats:
+class _Surface(NamedTuple):
+    """What is known of a surface: see integrate_normals. The prior is one of heights (P,)."""
+
+    normal_map: NDArray[np.floating]
+    mask: NDArray[np.bool_]
+    camera_matrix: NDArray[np.floating] | None
+    prior: Floats | None
+    prior_detail: float
+
+    def of_blocks(self, blocks: Blocks, *, keep_edges: bool) -> _Surface:
+        """Return the surface at the scale of blocks; see _normals_of."""
+        normals = np.zeros((*blocks.mask.shape, 3))
+        of_pixels = self.normal_map[self.mask].astype(np.float64)
+        normals[blocks.mask] = _normals_of(blocks, of_pixels, self.mask, keep_edges=keep_edges)
+        prior = None
+        if self.prior is not None:
+            values = np.stack((np.nan_to_num(self.prior), np.isfinite(self.prior)), axis=1)
+            sums, known = blocks.average(values, self.mask).T
+            prior = np.divide(sums, known * blocks.step, out=np.full(len(sums), np.nan), where=known > 0)
+        camera = blocks.shrink_camera(self.camera_matrix)
+        return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
+
+
+def _integrate(known: _Surface, stiffness: float, progress: Progress) -> Floats:
     """Return the heights (P,) of the mask's pixels; see integrate_normals.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
     at the coarsest scale, where many solves take little time. Finer scales follow the edges.
     """
+    normal_map, mask, camera_matrix, prior, prior_detail = known
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
     heights: Floats = np.zeros(n_pixels)
@@ -91,13 +130,10 @@ def _integrate(
     is_huge = n_pixels > _FINEST
     if is_huge or (n_pixels > _COARSEST and stiffness > 0):
         blocks = Blocks.of_step(mask, 2)
-        coarse = np.zeros((*blocks.mask.shape, 3))
-        coarse[blocks.mask] = _normals_of(blocks, normal_map[mask].astype(np.float64), mask, keep_edges=not is_huge)
+        coarse = known.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
         of_blocks[blocks.mask] = _integrate(
             coarse,
-            blocks.mask,
-            blocks.shrink_camera(camera_matrix),
             stiffness,
             lambda share: progress((1 - own_share) * share),
         )
@@ -106,9 +142,12 @@ def _integrate(
             return heights
         precision, most = _LATER_PRECISION, min(_MOST_SOLVES, max(_FEWEST_SOLVES, _SOLVED_PIXELS // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
+    # Normals fix gaps, which are the smaller the wider a wave is. At this width, both weigh the same.
+    pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
+    known_heights = 0.0 if prior is None else np.nan_to_num(prior)
     for _ in range(most):
         weights, flows = equations.weigh(heights, stiffness)
-        change = solver.solve(weights, flows, precision=precision)
+        change = solver.solve(weights, flows, precision=precision, pull=pull, distance=heights - known_heights)
         heights += change
         progress(own_share / most)
         if precision == _LATER_PRECISION and np.std(change) < _STILL:
@@ -137,6 +176,44 @@ def _normals_of(blocks: Blocks, normals: Floats, mask: NDArray[np.bool_], *, kee
     return np.asarray(np.where(mixed[:, None], steepest, mean))
 
 
+def _heights_of_prior(
+    prior: NDArray[np.floating], mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None
+) -> Floats:
+    """Return the heights (P,) of a prior in the unit of the equations, NaN where it is not known."""
+    if prior.shape != mask.shape:
+        raise UsageError(f"the prior has shape {prior.shape}, expected {mask.shape}, that of the normal map")
+    heights = prior[mask].astype(np.float64)
+    if camera_matrix is not None:
+        heights = -focal_length(camera_matrix) * np.log(np.where(heights > 0, heights, np.nan))
+    heights[~np.isfinite(heights)] = np.nan
+    if np.isnan(heights).all():
+        raise InputError("the prior has no value in the mask")
+    return heights
+
+
+def _check_prior(surface: _Surface) -> None:
+    """Raise InputError for a prior that is negated, or in another unit than the normals."""
+    step = max(1, min(round(surface.prior_detail), min(surface.mask.shape) // 4))
+    coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
+    equations = BilateralEquations.from_normals(coarse.normal_map, coarse.mask, coarse.camera_matrix)
+    assert coarse.prior is not None
+    slopes, expected = [], []
+    for slant, (near, far) in zip(equations.slants, equations.pairs, strict=True):
+        facing = equations.facing[near] + equations.facing[far]
+        usable = np.isfinite(coarse.prior[near] + coarse.prior[far]) & (facing > SMALLEST_COSINE)
+        slopes.append((coarse.prior[far] - coarse.prior[near])[usable])
+        expected.append(-((slant[near] + slant[far]) / np.maximum(facing, SMALLEST_COSINE))[usable])
+    found, wanted = np.concatenate(slopes), np.concatenate(expected)
+    both = float(found @ wanted)
+    correlation = both / max(float(np.linalg.norm(found) * np.linalg.norm(wanted)), 1e-12)
+    steeper = both / max(float(wanted @ wanted), 1e-12)
+    if abs(correlation) > _CLEARLY_CORRELATED and not 1 / _MOST_TIMES_STEEPER <= steeper <= _MOST_TIMES_STEEPER:
+        raise InputError(
+            f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1",
+            hint="Give heights towards the camera, or depths with a camera matrix, in the unit of the result",
+        )
+
+
 def _mask_of_normals(normal_map: NDArray[np.floating]) -> NDArray[np.bool_]:
     if normal_map.ndim != 3 or normal_map.shape[2] != 3:
         raise UsageError(f"the normal map has shape {normal_map.shape}, expected (H, W, 3)")
@@ -146,11 +223,17 @@ def _mask_of_normals(normal_map: NDArray[np.floating]) -> NDArray[np.bool_]:
     return mask
 
 
-def _depth_map(heights: Floats, mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None) -> Floats:
+def _depth_map(
+    heights: Floats, mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None, prior: Floats | None
+) -> Floats:
     from scipy.ndimage import label
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
-    heights = heights - (np.bincount(parts, heights) / np.bincount(parts))[parts]
+    offsets = np.bincount(parts, heights) / np.bincount(parts)
+    if prior is not None:  # a part that the prior does not reach has the mean height of what is known
+        is_known = np.bincount(parts, np.isfinite(prior)) > 0
+        offsets = np.where(is_known, 0, offsets - np.nanmean(prior))
+    heights = heights - offsets[parts]
     depth = np.full(mask.shape, np.nan)
     depth[mask] = heights if camera_matrix is None else np.exp(-heights / focal_length(camera_matrix))
     return depth

@@ -41,18 +41,28 @@ class LaplacianSolver:
         positions = np.arange(len(rows), dtype=np.int32)
         self._pattern = csr_matrix((positions, (rows, columns)), shape=(n_pixels, n_pixels))
 
-    def solve(self, weights: Floats, flows: Floats, *, precision: float) -> Floats:
+    def solve(
+        self,
+        weights: Floats,
+        flows: Floats,
+        *,
+        precision: float,
+        pull: Floats | float = 0.0,
+        distance: Floats | float = 0.0,
+    ) -> Floats:
         """Return the change of heights (P,) that minimises the sum of squares.
 
         Args:
             weights: (E,) half the second derivative by the gap of each pair.
             flows: (E,) half the first derivative by the gap of each pair.
             precision: the relative residual at which the solver stops.
+            pull: (P,) half the second derivative by the height of each pixel, of what pulls it to a known height.
+            distance: (P,) of the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
         from scipy.sparse.linalg import cg
 
-        matrix = self._laplacian(weights + _DAMPING_OF_GAPS)
+        matrix = self._laplacian(weights + _DAMPING_OF_GAPS, pull)
         if self._preconditioner is None:
             # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
             self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
@@ -65,7 +75,7 @@ class LaplacianSolver:
         change: Floats
         change, _ = cg(
             matrix,
-            self._divergence(flows),
+            self._divergence(flows) - pull * distance,
             rtol=precision,
             maxiter=_MAX_STEPS,
             M=self._preconditioner,
@@ -75,10 +85,10 @@ class LaplacianSolver:
             self._preconditioner = None
         return change
 
-    def _laplacian(self, weights: Floats) -> Any:
+    def _laplacian(self, weights: Floats, pull: Floats | float) -> Any:
         from scipy.sparse import csr_matrix
 
-        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS
+        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
         return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
 

@@ -39,6 +39,12 @@ STIFFNESS = Option(
     min=0,
     help="How easily the surface of integrate or --surface tears at edges. 0 never tears it.",
 )
+PRIOR_DETAIL = Option(
+    None,
+    metavar="PIXELS",
+    min=1,
+    help="With --prior: shapes narrower than this come from the normals. [default: 15 % of the object's size]",
+)
 LARGEST_STEP = Option(
     None,
     metavar="PIXELS",

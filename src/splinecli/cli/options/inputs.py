@@ -200,6 +200,13 @@ NORMALS_CONVENTION = Option(
     help="Green channel of a normal map of colours: opengl is y up, directx is y down. [default: as in report.json"
     " beside it, or opengl]",
 )
+PRIOR = Option(
+    None,
+    metavar="FILE",
+    help="Depth map of the same view from elsewhere, such as a scan: the surface has its shape in the large, and the"
+    " detail of the normals. .npy, .tif or .exr, with heights towards the camera in the unit of the result, or with"
+    " depths in millimetres for a perspective camera. NaN is unknown.",
+)
 COLOURS = Option(
     None,
     metavar="FILE",

@@ -1,0 +1,63 @@
+"""Depth maps from elsewhere, such as those of scanners: floating-point .npy, TIFF and OpenEXR files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
+from splinecli.capture.paths import check_file
+from splinecli.errors import InputError
+from splinecli.system.extras import import_extra
+
+_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")
+
+
+def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
+    """Return a depth map (H, W) float64, NaN where it is not finite: there, nothing is known.
+
+    Raises:
+        InputError: the file cannot be read, is no map of floating-point numbers, or has another size.
+        UsageError: the file is an EXR file, and OpenEXR is not installed.
+    """
+    check_file(path, "a depth map")
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".npy":
+            stored: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+            check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
+        elif suffix == ".exr":
+            stored = _read_exr(path, expected)
+        else:
+            stored = decode_image(path, expected)
+    except (OSError, ValueError, RuntimeError, EOFError) as error:
+        raise InputError(f"the depth map cannot be read ({error})", path=path) from error
+    if stored.ndim == 3 and stored.shape[2] in (1, 3, 4):
+        stored = stored[..., 0]
+    if stored.ndim != 2 or stored.dtype.kind != "f":
+        found = f"{stored.dtype} {' x '.join(map(str, stored.shape))}"
+        raise InputError(
+            f"found an array of {found}, expected floating-point numbers H x W",
+            path=path,
+            hint="Save the depth as .npy, floating-point TIFF or EXR",
+        )
+    depth = np.array(stored, np.float64)
+    depth[~np.isfinite(depth)] = np.nan
+    return depth
+
+
+def _read_exr(path: Path, expected: ExpectedSize) -> NDArray[Any]:
+    """Return the first channel of an EXR file that may hold a depth."""
+    library = import_extra("OpenEXR", "exr")
+    low, high = library.File(str(path), header_only=True).header()["dataWindow"]
+    shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
+    check_stored_size(shape, 4, path, expected)
+    channels = library.File(str(path)).channels()
+    for name in (*_EXR_CHANNELS, *channels):
+        if name in channels:
+            return np.asarray(channels[name].pixels)
+    raise InputError("the EXR file has no channel", path=path)
