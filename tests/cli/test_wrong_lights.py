@@ -94,6 +94,21 @@ def test_info_lists_the_readings(run, medallion):
     )
 
 
+def test_mended_lights(run, medallion):
+    """What is written needs no frame and no other order."""
+    right = np.loadtxt(medallion / "light_directions.txt")
+    good = run("info", medallion, "--mended-lights", "mended.txt")
+    assert (good.code, Path("mended.txt").exists()) == (0, False)
+    assert "not written: no other reading of the lights fits better" in good.out
+    write_lights(medallion, lambda lights: np.roll(lights, 2, axis=0)[:, [1, 0, 2]])
+    report = json.loads(run("info", medallion, "--mended-lights", "mended.txt", "--json").out)
+    assert report["mended_lights"] == "mended.txt"
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.loadtxt("mended.txt"), right, atol=1e-6)
+    assert run("info", medallion, "--mended-lights", "mended.txt").code == 5
+    assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
+
+
 def test_lights_as_angles(run, medallion):
     def angles(lights):
         return np.degrees(np.stack((np.arctan2(lights[:, 1], lights[:, 0]), np.arcsin(lights[:, 2])), axis=1))

@@ -212,3 +212,50 @@ def test_a_line_of_pixels_tells_no_frame(shape: tuple[int, int]) -> None:
     normals = unit(generator.normal((0, 0, 1), 0.2, (shape[0] * shape[1], 3)))
     check = check_lights((normals @ lights.T).clip(0), np.ones(shape, bool), lights)
     assert check.best is None
+
+
+def dome(*counts: int) -> Array:
+    """Lights in rings of so many lamps, from low to high, each turned by ten degrees against the one below."""
+    lights = []
+    for place, count in enumerate(counts):
+        azimuth = np.radians(360 * np.arange(count) / count + 10 * place)
+        height = np.radians(20 + 50 * place / max(len(counts) - 1, 1))
+        directions = (
+            np.cos(azimuth) * np.cos(height),
+            np.sin(azimuth) * np.cos(height),
+            np.full(count, np.sin(height)),
+        )
+        lights.append(np.stack(directions, axis=1))
+    return np.concatenate(lights)
+
+
+@pytest.mark.parametrize("frame", [(1, 1, 1), (-1, 1, 1)], ids=["in its frame", "x negated"])
+@pytest.mark.parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
+def test_rings_that_begin_at_another_lamp(counts: tuple[int, ...], frame: tuple[int, int, int]) -> None:
+    lights = dome(*counts)
+    read_as, ends = lights.copy(), np.cumsum(counts)
+    for start, stop in list(zip(ends - counts, ends, strict=True))[1::2]:
+        read_as[start:stop] = np.roll(lights[start:stop], 1, axis=0)
+    check = check_vase(lights, read_as * frame)
+    assert check.order is not None and f"lights {counts[0] + 1} to {counts[0] + counts[1]}" in check.order
+    assert check.mended is not None
+    np.testing.assert_allclose(check.mended, lights, atol=1e-6)
+
+
+def test_a_ring_that_runs_the_other_way_round() -> None:
+    lights = dome(12, 12, 12)
+    read_as = lights.copy()
+    read_as[12:24] = lights[12:24][::-1]
+    check = check_vase(lights, read_as)
+    assert check.order == "with lights 13 to 24 reversed"
+    assert check.mended is not None
+    np.testing.assert_allclose(check.mended, lights, atol=1e-6)
+
+
+@pytest.mark.parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
+@pytest.mark.parametrize("gloss", [0.0, 0.3, 0.8])
+def test_right_rings_are_not_doubted(counts: tuple[int, ...], gloss: float) -> None:
+    lights = dome(*counts)
+    normals, mask = vase()
+    check = check_lights(scenes.shade(normals, lights, gloss=gloss, noise=0.01), mask, lights)
+    assert (check.order, check.best, check.mended) == (None, None, None)

@@ -34,6 +34,7 @@ def info(
     light_frame: str | None = inputs.LIGHT_FRAME,
     lights_format: LightForm = inputs.LIGHTS_FORMAT,
     check_lights: bool = inputs.CHECK_LIGHTS,
+    mended_lights: Path | None = outputs.MENDED_LIGHTS,
     plot: Path | None = outputs.LIGHT_PLOT,
     overwrite: bool = outputs.OVERWRITE_PLOT,
     strict: bool = outputs.STRICT,
@@ -43,7 +44,8 @@ def info(
     """Show what `infer` would read from CAPTURE, without running it.
 
     Prints the layout and files of the capture, the size and bit depth of the images, their white level and exposure,
-    the angles of the lights from the camera axis, and the memory and time that infer needs. Writes only the plot.
+    the angles of the lights from the camera axis, and the memory and time that infer needs. Writes nothing
+    but the plot and the mended lights.
     """
     given = locals()
 

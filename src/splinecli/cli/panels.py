@@ -53,6 +53,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--intensities",
             *LAMPS,
             "--check-lights",
+            "--mended-lights",
         ),
         "Output": ("--plot", "--strict", *REPEAT),
     },

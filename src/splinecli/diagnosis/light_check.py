@@ -78,6 +78,8 @@ class LightCheck:
         tried: readings of the order in words, each with its misfit.
         outline_counts: how much the normals at the mask's edge count, from 0 to 1.
         odd_image: an image that contradicts the others, without which all this was found; None if there is none.
+        mended: (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no
+            order fits.
     """
 
     candidates: tuple[Candidate, ...]
@@ -88,6 +90,7 @@ class LightCheck:
     tried: tuple[tuple[str, float], ...] = ()
     outline_counts: float = 0.0
     odd_image: OddImage | None = None
+    mended: Array | None = None
 
     @property
     def given(self) -> Candidate:
@@ -174,10 +177,16 @@ def _check_frame_and_order(
     ranked = sorted((_judge(other, first, weight) for other in others), key=lambda other: -other.advantage)
     # Where no order fits, the normals are no evidence.
     best = None if found.order == UNKNOWN_ORDER else _best(ranked, in_order=found.order is not None)
-    order = found.order
+    order, mended = found.order, None
+    if order != UNKNOWN_ORDER and (order is not None or best is not None):
+        matrices = {shift_words(row, len(light_directions)): matrix for row, matrix in found.turns}
+        matrix = np.eye(3) if best is None else matrices[best.name] if best.frame is None else best.frame.matrix
+        mended = found.lights @ matrix.T
     if order is not None and best is not None and best.frame is None:
         order, best = best.name, None  # one of several orders that fit, told by the normals
-    return LightCheck((first, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight)
+    return LightCheck(
+        (first, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, mended=mended
+    )
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:

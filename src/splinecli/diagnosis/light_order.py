@@ -25,6 +25,7 @@ from splinecli.capture.lights.light_fit import (
     shifted_orders,
     swapped_orders,
 )
+from splinecli.diagnosis.light_rings import mend_rings
 
 Array = NDArray[np.float64]
 
@@ -39,6 +40,9 @@ MAX_MENDED = 0.35
 
 MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
 """Smallest misfit of a wrong order, as a share of the median of random orders: of all lights, of two exchanged ones."""
+
+MIN_RING_MISFIT, BETTER_RINGS = 0.1, 0.75
+"""The same for single rings of a dome, and the largest share of the misfit that is left when they are mended."""
 
 CHANCE = 0.02
 """An order is wrong if more than this share of random orders fits as well."""
@@ -127,6 +131,11 @@ def check_order(
     shift_misfits = compared.misfits(shifted)
     shifts, others = _best_shifts(shifted, shift_misfits), _other_readings(compared, lights, names)
     found = _better_reading(given, (*shifts, *others), usual)
+    if found.misfit > MIN_RING_MISFIT * usual and np.array_equal(chosen, np.arange(len(light_directions))):
+        words, mended, misfit = mend_rings(compared, lights)
+        others += [_Reading(words, mended, misfit)] if words else []
+        if words and misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
+            found = others[-1]
     if found is given and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
     turns: tuple[tuple[int, Array], ...] = ()

@@ -50,8 +50,9 @@ class InfoOptions:
         capture: the folder of the capture.
         reading: how `infer` would read it. With its `strict`, what could not be checked is a warning, too.
         plot: a PNG file that a plot of the lights is written to.
-        overwrite: replace an earlier plot.
+        overwrite: replace an earlier plot, and earlier mended lights.
         check_lights: also list the readings of the light file that were compared.
+        mended_lights: a text file for the light directions in the reading that fits best, if the given one does not.
     """
 
     capture: Path
@@ -59,13 +60,13 @@ class InfoOptions:
     plot: Path | None = None
     overwrite: bool = False
     check_lights: bool = False
+    mended_lights: Path | None = None
 
     def __post_init__(self) -> None:
         """Raise UsageError for options that contradict each other."""
-        if self.check_lights and self.reading.finds_lights:
-            raise UsageError(
-                "--check-lights checks a light file, and --lights estimate reads none", hint="Leave one out"
-            )
+        for name, given in (("--check-lights", self.check_lights), ("--mended-lights", self.mended_lights)):
+            if given and self.reading.finds_lights:
+                raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
 
 
 def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[str, Any]:
@@ -85,15 +86,20 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
 
 def _describe(options: InfoOptions, observer: Observer) -> dict[str, Any]:
     from splinecli.capture.capture_warnings import estimated_lights
+    from splinecli.capture.lights.light_files import rows_text
     from splinecli.capture.summary import summarise_capture
     from splinecli.diagnosis.checks import check_sample
     from splinecli.diagnosis.evidence import StatedLights
     from splinecli.diagnosis.light_advice import candidate_rows
-    from splinecli.system.files import write_bytes
+    from splinecli.system.files import check_free, write_bytes
 
     source = options.reading.open(options.capture)
     if options.plot is not None:
         _check_plot(options.plot, source, overwrite=options.overwrite)
+    if options.mended_lights is not None:
+        if source.lamps is not None and source.lamps.used:
+            raise UsageError("--mended-lights writes directions, but the lights are near lamps")
+        check_free(options.mended_lights.parent, [options.mended_lights.name], overwrite=options.overwrite)
     with observer.progress("reading", len(source.files.images)) as advance:
         summary = summarise_capture(source, progress=lambda: advance(1))
     summary, found_lights = _with_found_lights(summary)
@@ -114,6 +120,11 @@ def _describe(options: InfoOptions, observer: Observer) -> dict[str, Any]:
         "warnings": [str(warning) for warning in warnings],
         "warning_codes": [warning.code for warning in warnings],
     }
+    if options.mended_lights is not None:
+        mended = None if check is None or check.odd_image is not None else check.mended
+        if mended is not None:
+            write_bytes(options.mended_lights, rows_text(mended).encode())
+        report["mended_lights"] = None if mended is None else str(options.mended_lights)
     if options.check_lights:
         report["light_candidates"] = [] if check is None else candidate_rows(check)
     return report
@@ -152,6 +163,8 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("expect", f"{report['expect']['memory_mib']} MiB of memory and about {report['expect']['seconds']} s"
                    f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface"),
     ]  # fmt: skip
+    if "mended_lights" in report:
+        rows.append(("mended", report["mended_lights"] or "not written: no other reading of the lights fits better"))
     return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(report.get("light_candidates"))
 
 

@@ -69,6 +69,11 @@ DECIMATE = Option(
 )
 CONVENTION = Option(NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down.")
 LIGHT_PLOT = Option(None, metavar="FILE", help="Also plot the light directions to a PNG file.")
+MENDED_LIGHTS = Option(
+    None,
+    metavar="FILE",
+    help="Write the light directions in the order and frame that fit the images best, if the light file does not.",
+)
 COMPARE = Option(None, metavar="FILE", help="Compare the result with the light directions in a text file.")
 FIGURES = Option(False, "--figures", help="Draw every method's maps for the first draw of each capture.")
 FIGURE_PIXELS = Option(
@@ -82,7 +87,7 @@ TENSORBOARD = Option(False, "--tensorboard", help="Also write RUN/tensorboard (n
 
 OVERWRITE = Option(False, "--overwrite", help="Replace earlier results.")
 OVERWRITE_FILE = Option(False, "--overwrite", help="Replace an existing file.")
-OVERWRITE_PLOT = Option(False, "--overwrite", help="Replace an earlier plot.")
+OVERWRITE_PLOT = Option(False, "--overwrite", help="Replace an earlier plot or file of lights.")
 OVERWRITE_TRIALS = Option(False, "--overwrite", help="Compute all trials again, also those stored in OUT.")
 UPDATE = Option(False, "--update", help="Compute changed captures again, and skip those that are done.")
 

@@ -1,0 +1,102 @@
+"""Rings of a dome that are shifted or mirrored against the others in the light file.
+
+A wrong order or frame of all lights is found by light_order.py and light_check.py. In a dome, single rings may also
+begin at another lamp, or run the other way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.lights.light_fit import Factors
+
+Array = NDArray[np.float64]
+
+FEWEST_IN_RING = 4
+_GAP_DEG = 3.0
+"""Lights belong to one ring if their elevations follow each other at smaller steps."""
+
+_MOST_LEFT = 0.95
+"""One more ring is mended if at most this share of the misfit is left."""
+
+_EQUAL = 1e-3
+"""Share of the misfit by which equal readings may differ."""
+
+_WAYS = {
+    "": (1, 1, 1),
+    "x negated": (1, -1, 1),
+    "y negated": (1, 1, -1),
+    "x and y negated": (1, -1, -1),
+    "reversed": (-1, 1, 1),
+}
+"""The step through the lamps of a ring, and the signs of x and y."""
+
+
+@dataclass(frozen=True)
+class _RingReading:
+    """One ring read in another way: its lights (indices in rising order), in words, and its directions (n, 3)."""
+
+    lights: NDArray[np.integer]
+    words: str
+    directions: Array
+
+
+def mend_rings(factors: Factors, lights: Array) -> tuple[str, Array, float]:
+    """Return what mends the rings of lights (F, 3), in words (none if they fit), the mended lights and their misfit.
+
+    Rings are mended one after the other, the best first, as long as the images fit clearly better. The images show how
+    the rings stand to each other; most of them count as right.
+    """
+    rings = find_rings(lights)
+    trials = [(ring, reading) for ring, lamps in enumerate(rings) for reading in _readings(lamps, lights)]
+    mended, found = lights, dict[int, _RingReading]()
+    misfit = float(factors.misfits(lights[None])[0])
+    for _ in range(2 * len(rings)):
+        stack = np.repeat(mended[None], len(trials), axis=0)
+        for row, (ring, reading) in enumerate(trials):
+            stack[row, rings[ring]] = reading.directions
+        misfits = factors.misfits(stack)
+        if misfits.min() > _MOST_LEFT * misfit:
+            break
+        # On a regular ring, several readings are the same. The first ones are the simplest.
+        best = int(np.flatnonzero(misfits <= misfits.min() + _EQUAL * misfit)[0])
+        ring, reading = trials[best]
+        mended, misfit, found[ring] = stack[best], float(misfits[best]), reading
+    return _in_words([found[ring] for ring in sorted(found) if found[ring].words]), mended, misfit
+
+
+def find_rings(lights: Array) -> list[NDArray[np.integer]]:
+    """Return the indices of the lights (F, 3) of each ring that has enough of them."""
+    elevation = np.degrees(np.arcsin(lights[:, 2].clip(-1, 1)))
+    order = elevation.argsort(kind="stable")
+    starts = np.flatnonzero(np.diff(elevation[order]) > _GAP_DEG) + 1
+    rings = [np.sort(ring) for ring in np.split(order, starts)]
+    return [ring for ring in rings if len(ring) >= FEWEST_IN_RING] if len(rings) > 1 else []
+
+
+def _readings(ring: NDArray[np.integer], lights: Array) -> Iterator[_RingReading]:
+    """Yield the readings of a ring, the simplest first."""
+    given = lights[ring]
+    for steps in sorted(range(len(ring)), key=lambda steps: min(steps, len(ring) - steps)):
+        shift = "" if steps == 0 else f"shifted by {min(steps, steps - len(ring), key=abs):+d}"
+        for way, (step, *signs) in _WAYS.items():
+            directions = np.roll(given[::step], -steps, axis=0) * (*signs, 1)
+            yield _RingReading(ring, " and ".join(filter(None, (way, shift))), directions)
+
+
+def _in_words(readings: Sequence[_RingReading]) -> str:
+    """Return words for mended rings, such as "with lights 9 to 16 shifted by +1"."""
+    parts: dict[str, list[str]] = {}
+    for reading in readings:
+        parts.setdefault(reading.words, []).append(_numbers(reading.lights + 1))
+    named = "; ".join(f"lights {', '.join(lights)} {words}" for words, lights in parts.items())
+    return f"with {named}" if named else ""
+
+
+def _numbers(numbers: NDArray[np.integer]) -> str:
+    whole = len(numbers) == numbers[-1] - numbers[0] + 1
+    return f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
