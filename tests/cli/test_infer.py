@@ -318,3 +318,13 @@ def test_gradient_and_curvature(capture, truth, run):
     expected = 127.5 + 127.5 * np.clip(curvature[inside][:, 0] / 0.05, -1, 1)
     np.testing.assert_allclose(picture[inside], expected, atol=0.51)
     assert (picture[~inside] == 128).all()
+
+
+def test_relief(capture, run):
+    assert run("infer", capture, "--method", "ls", "--maps", "relief").code == 0
+    relief = np.load(f"out/{capture.name}/relief.npy")
+    inside = np.isfinite(relief)
+    assert (relief.dtype, inside.sum()) == (np.float32, 448)
+    picture = cv2.imread(f"out/{capture.name}/relief.png", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(picture[inside], 127.5 + 127.5 * np.clip(relief[inside], -1, 1), atol=0.51)
+    assert (picture[~inside] == 128).all()

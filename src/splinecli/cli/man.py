@@ -67,6 +67,8 @@ FILES = (
     ("OUT/NAME/gradient.npy", "With --maps gradient: the slopes dz/dx and dz/dy, H x W x 2."),
     ("OUT/NAME/curvature.npy", "With --maps curvature: mean and Gaussian curvature in 1/pixel, H x W x 2."),
     ("OUT/NAME/curvature.png", "With --maps curvature: the mean curvature; gray is flat, bumps are brighter."),
+    ("OUT/NAME/relief.npy", "With --maps relief: heights in pixels without the shape in the large, H x W."),
+    ("OUT/NAME/relief.png", "With --maps relief: gray is 0, white is 1 pixel towards the camera."),
     ("OUT/frames/NAME", "The frames of a film, a capture of its own."),
     (
         "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png",

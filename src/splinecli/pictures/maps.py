@@ -41,11 +41,11 @@ def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) ->
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-CURVATURE_SCALE = 0.05
-"""Mean curvature, in 1/pixel, that is white in a picture; its negative is black. The same for all parts of a batch."""
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0
+"""Mean curvature in 1/pixel, and relief in pixels, that is white in a picture. The same for all parts of a batch."""
 
 
-def curvature_picture(curvature: NDArray[np.float32]) -> Picture:
-    """Return the mean curvature of a map (H, W, 2) as a gray picture (H, W): flat is gray, a bump is brighter."""
-    share = np.nan_to_num(curvature[..., 0] / CURVATURE_SCALE).clip(-1, 1)
+def signed_picture(values: NDArray[np.float32], scale: float) -> Picture:
+    """Return values (H, W) as a gray picture (H, W): 0 and NaN are gray, -scale is black, scale is white."""
+    share = np.nan_to_num(values / scale).clip(-1, 1)
     return np.asarray(np.rint(127.5 + 127.5 * share), np.uint8)

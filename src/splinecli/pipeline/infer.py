@@ -160,7 +160,9 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 
     albedo = "albedo" in options.maps or options.html
     check_memory(
-        results_bytes(capture.n_pixels, capture.n_lights, albedo=albedo, surface=options.surface),
+        results_bytes(
+            capture.n_pixels, capture.n_lights, albedo=albedo, surface=options.surface or "relief" in options.maps
+        ),
         f"the results of {capture.n_pixels} pixels take",
         folder,
         hint="Mask the object, or use --scale or --crop"
@@ -227,6 +229,7 @@ def _further_files(
         ("preview", files.write_preview),
         ("gradient", files.write_gradient),
         ("curvature", files.write_curvature),
+        ("relief", files.write_relief),
     ):
         if name in options.maps:
             writers.append(partial(write, estimate))

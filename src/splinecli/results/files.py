@@ -17,13 +17,15 @@ from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normal
 from splinecli.maths.normals import Convention, describe, encode_picture
 from splinecli.pictures.maps import (
     CURVATURE_SCALE,
+    RELIEF_SCALE,
     albedo_picture,
     confidence_picture,
-    curvature_picture,
     preview_picture,
+    signed_picture,
 )
 from splinecli.pictures.png import encode_png
 from splinecli.results.clock import Clock
+from splinecli.surface.relief import relief_of_normals
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import NewFiles, is_plain, new_files
@@ -47,12 +49,14 @@ LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
     "lights.png",
 )
 GRADIENT, CURVATURE_PICTURE, CURVATURE = "gradient.npy", "curvature.png", "curvature.npy"
+RELIEF_PICTURE, RELIEF = "relief.png", "relief.npy"
 MAPS = {
     "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
     "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
     "preview": (PREVIEW,),
     "gradient": (GRADIENT,),
     "curvature": (CURVATURE_PICTURE, CURVATURE),
+    "relief": (RELIEF_PICTURE, RELIEF),
 }
 """The files of each optional map."""
 
@@ -242,4 +246,13 @@ def write_curvature(estimate: NormalEstimate, new: NewFiles) -> None:
     with new.open(CURVATURE) as file:
         np.save(file, curvature, allow_pickle=False)
     scale = f"mean curvature, black {-CURVATURE_SCALE}, gray 0, white {CURVATURE_SCALE} per pixel"
-    new.write(CURVATURE_PICTURE, encode_png(curvature_picture(curvature), {"curvature": scale}))
+    new.write(CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], CURVATURE_SCALE), {"curvature": scale}))
+
+
+def write_relief(estimate: NormalEstimate, new: NewFiles) -> None:
+    """Write the relief (H, W) as a float32 NPY file and as a gray picture."""
+    relief = relief_of_normals(estimate.normal_map, estimate.capture.mask)
+    with new.open(RELIEF) as file:
+        np.save(file, relief, allow_pickle=False)
+    scale = f"height, black {-RELIEF_SCALE}, gray 0, white {RELIEF_SCALE} pixels"
+    new.write(RELIEF_PICTURE, encode_png(signed_picture(relief, RELIEF_SCALE), {"relief": scale}))

@@ -36,6 +36,7 @@ NOT_PHOTOGRAPHS = frozenset(
         "albedo",
         "confidence",
         "curvature",
+        "relief",
         "preview",
         "depth",
         "mesh",
