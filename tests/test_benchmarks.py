@@ -97,6 +97,11 @@ def test_near_lamps(run: Run) -> None:
     assert distant < 1 > distant_range
 
 
+def test_inspection(run: Run) -> None:
+    printed = run("inspection", "--size", "96", "--plates", "1", "--depths", "0.5", "--method", "ls").splitlines()
+    assert printed[2:] == ["| dent | 0.5 | 4 of 4 | 4 of 4 |", "| scratch | 0.5 | 4 of 4 | 4 of 4 |"]
+
+
 def test_large_captures(run: Run, tmp_path: Path) -> None:
     plot = tmp_path / "plot.png"
     arguments = ("--megapixels", "0.001", "--method", "ls", "--plot", str(plot))
