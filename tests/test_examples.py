@@ -147,13 +147,7 @@ def test_least_squares_is_off_by_highlights_and_shadows_alone(ls_mae_deg):
 
 def run(command: list[str], folder: Path, **environment: str) -> str:
     done = subprocess.run(
-        command,
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
+        command, cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -177,10 +171,7 @@ def test_infer_medallion_runs_from_any_folder(tmp_path):
     if command is None or shell is None:
         pytest.skip("no splinecli console script, or no sh, on the PATH")
     said = run(
-        [shell, str(EXAMPLES / "infer_medallion.sh"), "here"],
-        tmp_path,
-        SPLINECLI=command,
-        PYTHON=sys.executable,
+        [shell, str(EXAMPLES / "infer_medallion.sh"), "here"], tmp_path, SPLINECLI=command, PYTHON=sys.executable
     )
     assert said.startswith("spline-net, 10 lights: MAE ")
     made = {path.name for path in (tmp_path / "here" / "medallion").iterdir()}

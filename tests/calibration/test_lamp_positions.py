@@ -10,13 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import spiral_lights
-from splinecli.calibration.balls import (
-    BallCalibration,
-    BallFiles,
-    calibrate_ball,
-    combine_balls,
-    find_ball_files,
-)
+from splinecli.calibration.balls import BallCalibration, BallFiles, calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.lamp_positions import intersect_rays, triangulate_lamps
 from splinecli.calibration.mirror_ball import Highlight
@@ -104,9 +98,7 @@ def photographed(
     places = towards * rng.uniform(300, 700, (6, 1)) * min(1, eye[2] / 900)
     assumed = {"EXIF": focal * np.exp(0.05 * rng.normal()), "assumed distant": DISTANT}.get(source, focal)
     view = View(
-        np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1))),
-        source,
-        SHORTEST_LENS * PIXELS[1],
+        np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1))), source, SHORTEST_LENS * PIXELS[1]
     )
     balls = []
     for side in (-1, 1):

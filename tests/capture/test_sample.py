@@ -30,10 +30,7 @@ def test_a_dark_background_is_left_out():
     assert np.count_nonzero(sample.mask != mask) < 0.05 * mask.sum()
     assert share == pytest.approx(1 - sample.mask.mean())
     np.testing.assert_array_equal(sample.observations, observations[sample.mask.ravel()])
-    for kept in (
-        Sample(observations[mask.ravel()], mask, 1),
-        Sample(observations[:5], everything[:1, :5], 1),
-    ):
+    for kept in (Sample(observations[mask.ravel()], mask, 1), Sample(observations[:5], everything[:1, :5], 1)):
         assert leave_out_background(kept) == (kept, 0.0)
     bright = Sample(ball_before(0.3)[0].reshape(12, -1).T, everything, 1)
     assert leave_out_background(bright) == (bright, 0.0)

@@ -52,18 +52,7 @@ def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_cap
     Path("third/image3.png").write_bytes(b"no picture")
     read, write = os.pipe()
     os.close(read)
-    arguments = [
-        sys.executable,
-        "-u",
-        "-m",
-        "splinecli",
-        "infer",
-        str(capture),
-        "third",
-        "second",
-        "--method",
-        "ls",
-    ]
+    arguments = [sys.executable, "-u", "-m", "splinecli", "infer", str(capture), "third", "second", "--method", "ls"]
     done = subprocess.run(arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True)
     os.close(write)
     assert done.returncode == 3
@@ -90,10 +79,7 @@ def test_a_failure_is_a_json_document(name, run, tmp_path, monkeypatch):
     if name == "infer":
         (document,) = document
         assert document.pop("capture") == "nowhere"
-    assert document == {
-        "error": result.err.removeprefix("splinecli: ").rstrip("\n"),
-        "exit_code": result.code,
-    }
+    assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": result.code}
     assert (result.code, "nowhere" in document["error"]) == (3, True)
 
 

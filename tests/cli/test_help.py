@@ -71,11 +71,7 @@ def test_help_and_ls_do_not_import_torch(capture):
 
     def loaded(*args: str) -> str:
         done = subprocess.run(
-            [sys.executable, "-c", script, *args],
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=capture.parent,
+            [sys.executable, "-c", script, *args], capture_output=True, text=True, check=True, cwd=capture.parent
         )
         return done.stderr.strip()
 

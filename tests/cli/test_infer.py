@@ -275,10 +275,7 @@ def test_ctrl_c_ends_a_real_process(capture):
     command = [sys.executable, "-m", "splinecli", "train", "-o", "run", "--minutes", "10"]
     # A shell starts background jobs with SIGINT ignored, and these tests may run in one.
     process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     )
     while not Path("run/config.json").exists():
         assert process.poll() is None

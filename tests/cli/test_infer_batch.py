@@ -138,11 +138,7 @@ def test_the_worst_exit_code():
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (
-            ("--maps", "albedo", "confidence"),
-            2,
-            "confidence: the folder does not exist. Write lists with commas",
-        ),
+        (("--maps", "albedo", "confidence"), 2, "confidence: the folder does not exist. Write lists with commas"),
         (("--lights", "none.txt"), 3, "none.txt: the file does not exist."),
         (("--mask", "none.png"), 3, "none.png: the file does not exist."),
         (("--intensities", "none.txt"), 3, "none.txt: the file does not exist."),
@@ -178,13 +174,7 @@ def test_arguments_are_checked_before_the_first_capture(
 def test_options_are_written_and_read_back(capture, run):
     """They are the report's `options`, go through JSON and pickle, and tell what changes the results."""
     options = InferOptions(
-        method="ls",
-        n_lights=5,
-        seed=3,
-        formats=("npy",),
-        maps=("albedo",),
-        white_level=60_000.5,
-        output="elsewhere",
+        method="ls", n_lights=5, seed=3, formats=("npy",), maps=("albedo",), white_level=60_000.5, output="elsewhere"
     )
     assert InferOptions.from_dict(json.loads(json.dumps(options.as_dict()))) == options
     assert pickle.loads(pickle.dumps(options)) == options

@@ -86,10 +86,7 @@ def test_the_same_command_continues(run, make_capture):
     shutil.move("hidden.png", two / "image3.png")
     assert run("prepare", one, two, "-o", "set").code == 0
     assert Path("set/one/observations.npy").stat().st_mtime_ns == before.st_mtime_ns
-    assert {entry["name"] for entry in json.loads(Path("set/manifest.json").read_text())["entries"]} == {
-        "one",
-        "two",
-    }
+    assert {entry["name"] for entry in json.loads(Path("set/manifest.json").read_text())["entries"]} == {"one", "two"}
 
 
 def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
@@ -124,10 +121,7 @@ def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture
     hint = "Add --update to read it again, or choose another -o."
     message = f"one: its files changed since the entry one was made. {hint}"
     assert (result.code, result.err) == (5, f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n")
-    assert (summary["entries"], summary["skipped"]) == (
-        2,
-        [{"source": "one", "reason": message, "exit_code": 5}],
-    )
+    assert (summary["entries"], summary["skipped"]) == (2, [{"source": "one", "reason": message, "exit_code": 5}])
     np.testing.assert_array_equal(arrays("one")["observations"], before["observations"])
     assert run("prepare", one, two, "-o", "set", "--update", "--quiet").code == 0
     after = arrays("one")

@@ -68,11 +68,7 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> Non
     ("command", "arguments", "message"),
     [
         ("evaluate", ["--light-error-deg", "4"], "--light-error-deg needs --refine-lights"),
-        (
-            "evaluate",
-            ["--refine-lights", "--light-error-deg", "40"],
-            "the light error is 40 degrees, expected",
-        ),
+        ("evaluate", ["--refine-lights", "--light-error-deg", "40"], "the light error is 40 degrees, expected"),
         (
             "infer",
             ["--refine-lights", "--light-distance", "200", "--pixel-size", "2"],

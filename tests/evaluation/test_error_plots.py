@@ -41,13 +41,7 @@ def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize(
     ("captures", "across", "down"),
-    [
-        (["ball"], 1, 1),
-        (["ball", "cat"], 3, 1),
-        (list("abc"), 2, 2),
-        (list("abcd"), 3, 2),
-        (list("abcde"), 1, 1),
-    ],
+    [(["ball"], 1, 1), (["ball", "cat"], 3, 1), (list("abc"), 2, 2), (list("abcd"), 3, 2), (list("abcde"), 1, 1)],
 )
 def test_a_panel_for_each_capture_and_the_average(captures: list[str], across: int, down: int) -> None:
     picture = decode(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))

@@ -68,10 +68,7 @@ def test_four_rotations_of_the_paper_network_make_it_fourfold_symmetric() -> Non
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     for rotations, symmetric in ((4, True), (1, False)):
         network = NetworkEstimator("spline-net", random_network(PAPER), precision="float32", rotations=rotations)
-        here, there = (
-            network.estimate(observations, lights),
-            network.estimate(observations, lights @ quarter.T),
-        )
+        here, there = (network.estimate(observations, lights), network.estimate(observations, lights @ quarter.T))
         assert np.allclose(there, here @ quarter.T, atol=1e-4) == symmetric
 
 
@@ -79,10 +76,7 @@ def test_two_rotations_of_a_canonical_network_make_it_mirror_symmetric() -> None
     observations, lights = pixels(10)
     for rotations, symmetric in ((2, True), (1, False)):
         network = NetworkEstimator("spline-net", random_network(COMPACT), precision="float32", rotations=rotations)
-        here, there = (
-            network.estimate(observations, lights),
-            network.estimate(observations, lights * (1, -1, 1)),
-        )
+        here, there = (network.estimate(observations, lights), network.estimate(observations, lights * (1, -1, 1)))
         assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
 
 

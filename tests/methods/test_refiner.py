@@ -54,12 +54,7 @@ def refine(
     refined = normals.copy()
     done: list[int] = []
     NetworkRefiner(net, "float32", tile=tile, margin=REACH).refine(
-        mask,
-        observations,
-        lambda rows: LampLight(observations[rows], LIGHTS),
-        refined,
-        errors,
-        progress=done.append,
+        mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), refined, errors, progress=done.append
     )
     assert sum(done) == count
     return normals, refined, errors

@@ -43,12 +43,7 @@ def scene(
     observations += noise * observations.max() * rng.normal(size=observations.shape)
     mask = np.ones(normals.shape[:2], np.bool_)
     return Capture(
-        "scene",
-        observations.clip(0).astype(np.float32),
-        LIGHTS,
-        tuple(range(10)),
-        mask,
-        normals.astype(np.float32),
+        "scene", observations.clip(0).astype(np.float32), LIGHTS, tuple(range(10)), mask, normals.astype(np.float32)
     )
 
 

@@ -300,10 +300,7 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="not a PyTorch checkpoint"):
         import_official(path, files[1])
     assert not (tmp_path / "exploded").exists()
-    for missing, reason in (
-        (tmp_path / "none.ckpt", "the file does not exist"),
-        (tmp_path, "found a folder"),
-    ):
+    for missing, reason in ((tmp_path / "none.ckpt", "the file does not exist"), (tmp_path, "found a folder")):
         with pytest.raises(ModelError, match=reason):
             import_official(missing, files[1])
 

@@ -52,10 +52,7 @@ def test_each_curve_leaves_out_what_was_not_computed() -> None:
     steps = [50, 100, 125]
     assert lines(loss) == {"weighted sum": [steps, [2.0, 1.0, 0.5]], "Ls, unweighted": [[100], [0.5]]}
     assert lines(angle) == {"training": [steps, [20, 10, 8]], "validation": [[100, 125], [12.5, 9]]}
-    assert lines(maps) == {
-        "all cells": [steps, [0.2, 0.1, 0.08]],
-        "cells with a light": [steps, [0.1, 0.05, 0.04]],
-    }
+    assert lines(maps) == {"all cells": [steps, [0.2, 0.1, 0.08]], "cells with a light": [steps, [0.1, 0.05, 0.04]]}
     assert {axes.get_xlabel() for axes in (loss, angle, maps)} == {"step"}
     assert loss.get_title() == "loss"
     assert loss.get_yscale() == "linear"

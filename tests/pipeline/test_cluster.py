@@ -279,11 +279,7 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
 
 
 def test_errors_travel(client):
-    for error in (
-        InputError("wrong", path="a", line=3, hint="Do it"),
-        OutputError("full"),
-        SplinecliError("x"),
-    ):
+    for error in (InputError("wrong", path="a", line=3, hint="Do it"), OutputError("full"), SplinecliError("x")):
         found = client.submit(lambda error: error, error, pure=False).result()
         assert (type(found), str(found), vars(found)) == (type(error), str(error), vars(error))
 

@@ -46,9 +46,7 @@ def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtyp
         valid = batch.valid[pixel].numpy()
         used = set()
         for direction, observed in zip(
-            batch.light_directions[pixel].numpy()[valid],
-            batch.observations[pixel].numpy()[valid],
-            strict=True,
+            batch.light_directions[pixel].numpy()[valid], batch.observations[pixel].numpy()[valid], strict=True
         ):
             distance = np.abs(stored[name].light_directions - direction).max(axis=1)
             light = int(distance.argmin())

@@ -109,12 +109,7 @@ def test_normals_and_frame_agree(scene: Scene, rendered: dict[int, RenderedScene
 @pytest.mark.parametrize("bounces", [0, 4])
 @pytest.mark.parametrize(("name", "most_off"), [("diffuse", 0.04), ("specular", 0.04), ("metallic", 0.06)])
 def test_images_agree(
-    scene: Scene,
-    rendered: dict[int, RenderedScene],
-    benchmark: ModuleType,
-    name: str,
-    bounces: int,
-    most_off: float,
+    scene: Scene, rendered: dict[int, RenderedScene], benchmark: ModuleType, name: str, bounces: int, most_off: float
 ) -> None:
     ours = rendered[bounces]
     shapes = benchmark.mitsuba_shapes(scene, name)

@@ -56,11 +56,7 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
     def facets(nh: float, nl: float, nv: float, roughness: float, gamma: float) -> float:
         alpha = max(roughness, 0.1) ** 2
         area, _ = integrate.quad(
-            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
-            0,
-            1,
-            points=[1 - alpha**2],
-            epsrel=1e-9,
+            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma, 0, 1, points=[1 - alpha**2], epsrel=1e-9
         )
         ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
         return float(ndf * g1(nl, alpha) * g1(nv, alpha))

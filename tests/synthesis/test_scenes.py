@@ -13,14 +13,7 @@ pytest.importorskip("embreex", reason="needs the extra 'render'")
 from splinecli.errors import UsageError
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import CLASSES, draw_class
-from splinecli.synthesis.scenes import (
-    MIN_LIGHT_Z,
-    SceneConfig,
-    draw_lights,
-    draw_patches,
-    draw_scene,
-    render_scene,
-)
+from splinecli.synthesis.scenes import MIN_LIGHT_Z, SceneConfig, draw_lights, draw_patches, draw_scene, render_scene
 
 SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
 

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from scenes import shade, sphere
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.film import (
-    FEWEST_FRAMES,
-    MOST_FRAMES,
-    choose_frames,
-    is_film,
-    read_frames,
-)
+from splinecli.capture.formats.film import FEWEST_FRAMES, MOST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, decode_transfer
 from splinecli.pictures.png import encode_png

@@ -45,12 +45,7 @@ def test_floating_point_tiff_is_kept(tmp_path: Path, dtype: type, channels: int)
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"compression": "zlib"},
-        {"compression": "zlib", "predictor": True},
-        {"tile": (16, 16)},
-        {"bigtiff": True},
-    ],
+    [{"compression": "zlib"}, {"compression": "zlib", "predictor": True}, {"tile": (16, 16)}, {"bigtiff": True}],
     ids=["deflate", "predictor", "tiles", "bigtiff"],
 )
 def test_kinds_of_tiff(tmp_path: Path, options: dict[str, object]) -> None:

@@ -240,10 +240,7 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
 
 def test_light_files_with_too_much_text(tmp_path: Path) -> None:
     (tmp_path / "long.txt").write_text("0 0 1" + " " * 1_000_000)
-    refused(
-        lambda: read_light_directions(tmp_path / "long.txt"),
-        "found 1.0 MB, expected a text file of at most 1.0",
-    )
+    refused(lambda: read_light_directions(tmp_path / "long.txt"), "found 1.0 MB, expected a text file of at most 1.0")
     (tmp_path / "lines.txt").write_text("1\n" * 60_000)
     refused(lambda: read_light_directions(tmp_path / "lines.txt"), "found 60001 lines, expected at most 50000")
     (tmp_path / "words.txt").write_text("1 " * 400_000)

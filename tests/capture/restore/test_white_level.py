@@ -203,8 +203,7 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
 
 
 @pytest.mark.parametrize(
-    ("tag", "value", "level"),
-    [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)],
+    ("tag", "value", "level"), [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)]
 )
 def test_tiff_states_its_level(tmp_path: Path, tag: int, value: int, level: int | None) -> None:
     folder = tmp_path / "vase"
