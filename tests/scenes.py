@@ -1,7 +1,5 @@
 """Lights, shapes and captures of known normals, which the tests of many rooms share."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

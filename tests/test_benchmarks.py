@@ -1,7 +1,5 @@
 """Each benchmark runs to its end on small inputs and prints every row."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

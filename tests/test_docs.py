@@ -1,7 +1,5 @@
 """The documentation agrees with the code: links, commands, constants and tables of figures."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

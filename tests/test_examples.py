@@ -1,7 +1,5 @@
 """The example capture is what its script renders, and the example scripts run."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """The functions for notebooks: the same normals as `splinecli infer`, from arrays."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

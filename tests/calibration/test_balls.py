@@ -1,7 +1,5 @@
 """From folders of photographs to the lights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

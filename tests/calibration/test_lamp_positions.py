@@ -1,7 +1,5 @@
 """Positions of lamps from mirror balls: the oracle is the law of reflection under a lamp of known position."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Highlights and directions, against a ball whose reflections are followed to the lamp."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

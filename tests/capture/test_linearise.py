@@ -1,7 +1,5 @@
 """Photographs stored in other ways than linear: all come back to the light that was there."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The pixels of a mask, by NumPy's own indexing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

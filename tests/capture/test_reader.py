@@ -1,7 +1,5 @@
 """Whole captures: observations against the photographs written, and real ones against known errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The record: what it refuses, and choosing lights."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

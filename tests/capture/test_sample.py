@@ -1,7 +1,5 @@
 """The sample of pixels that checks see."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A small analytic capture, and ways to run the command line."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

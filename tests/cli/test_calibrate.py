@@ -1,7 +1,5 @@
 """`splinecli calibrate`: its files, messages and errors, on synthetic mirror balls."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

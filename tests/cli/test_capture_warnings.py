@@ -1,7 +1,5 @@
 """Warnings about a capture, from the files to the messages and exit codes of `infer` and `info`."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

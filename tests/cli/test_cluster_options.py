@@ -1,7 +1,5 @@
 """Options of workers and clusters that are refused before anything is computed."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What all commands share: panels in the help, `~` in paths, closed pipes, and threads that sleep while they wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What a shell asks for at the Tab key is answered at once, and by nothing but the answer."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Progress and messages of the commands: a bar on a terminal, a line every half minute elsewhere."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

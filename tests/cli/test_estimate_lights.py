@@ -1,7 +1,5 @@
 """`--lights estimate` of infer, info and evaluate."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Help and man pages come from one source, and starting up stays cheap."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 import subprocess

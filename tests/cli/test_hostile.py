@@ -1,7 +1,5 @@
 """What is wrong with files, names and limits gets one line and a documented exit code, and nothing hangs."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

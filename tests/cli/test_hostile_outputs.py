@@ -1,7 +1,5 @@
 """An output folder that somebody else prepared: nothing outside of it changes, nothing hangs, no traceback."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

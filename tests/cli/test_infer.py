@@ -1,7 +1,5 @@
 """`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

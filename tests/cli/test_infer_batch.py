@@ -1,7 +1,5 @@
 """One capture and many: failures, the exit code, the JSON and the index."""
 
-from __future__ import annotations
-
 import base64
 import errno
 import json

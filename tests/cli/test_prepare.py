@@ -1,7 +1,5 @@
 """`splinecli prepare`: captures, CyclesPS trees and rendered scenes, continuation, and refusals."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

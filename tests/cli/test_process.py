@@ -1,7 +1,5 @@
 """The process: Ctrl-C and SIGTERM at awkward moments, and nothing on stderr but messages."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

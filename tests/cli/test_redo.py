@@ -1,7 +1,5 @@
 """What an earlier run has left: what is skipped, kept, redone or refused."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

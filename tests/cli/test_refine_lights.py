@@ -1,7 +1,5 @@
 """`--refine-lights` on a matte capture whose light file is rough."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The documents of infer, integrate and evaluate are those that docs/reports.schema.json describes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

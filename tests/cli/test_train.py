@@ -1,7 +1,5 @@
 """`splinecli train`: a short run, its files, continuation, and refusals."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """Images against each other: the same one twice; lights that crowd."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

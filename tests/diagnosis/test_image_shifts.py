@@ -1,7 +1,5 @@
 """Images that were moved by known amounts: each is found, and no other."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Unequal light intensities that the images do not determine."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from splinecli.capture import Capture

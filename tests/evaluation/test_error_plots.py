@@ -1,7 +1,5 @@
 """Plots decode, have the size their panels need, and carry each method's colour."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The report is valid HTML, loads nothing, shows what it was given, and escapes names."""
 
-from __future__ import annotations
-
 import base64
 import re
 from dataclasses import replace

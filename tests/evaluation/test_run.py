@@ -1,7 +1,5 @@
 """Whole evaluations: against analytic captures, hand-computed errors, and the published errors of DiLiGenT."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path

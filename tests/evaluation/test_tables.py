@@ -1,7 +1,5 @@
 """The whole text of every document of an evaluation stands in tests/golden/."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

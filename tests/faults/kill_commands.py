@@ -10,8 +10,6 @@ Then the same command runs again, and must end with the same files as an undistu
 sync every file before it renames it.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

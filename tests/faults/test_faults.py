@@ -1,7 +1,5 @@
 """Commands under kills, on a tiny disk, under limits, and two at once."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The methods that fit a Lambertian pixel and leave out what does not fit: IW12, L1, trimmed LS."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Small whole inputs of every kind that splinecli reads, and the commands that read them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Seeded mutations of files: of bytes, of texts and their numbers, of JSON values, of headers, of what a path is."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -12,8 +12,6 @@ The cases run one after another in a process that has imported everything, so ea
 process or hangs, it fails, and another process takes the next.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

@@ -1,7 +1,5 @@
 """SPLINE-Net as an estimator: batches, rotations, progress."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Refinement of a whole capture: tiles, masks, dark pixels, and the scores of single pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The shipped refinement net invents nothing: analytic scenes whose normals are known everywhere."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The weights that come in the package: their size, their checksum, and a small stored prediction."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

@@ -4,8 +4,6 @@ The authors' architecture, built here from its description, is the oracle of the
 weights, are saved as the authors save theirs, imported, and asked the same questions.
 """
 
-from __future__ import annotations
-
 import pickle
 import zipfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The refinement net and its features: symmetries, the mask, and how far it sees."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The whole network between observations and normals: shapes, limits, symmetries, and the error that it tells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Weight files are read as they were written, and other files are refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Plots: every method is drawn, curves leave out what was not computed, and anything may be a title."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

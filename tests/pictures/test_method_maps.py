@@ -1,7 +1,5 @@
 """Known normals and errors have known colours at known places, in every size of picture."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

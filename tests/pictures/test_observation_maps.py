@@ -1,7 +1,5 @@
 """A cell has its colour at its place in the figure; empty cells are gray."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

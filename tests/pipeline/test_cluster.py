@@ -1,7 +1,5 @@
 """Items on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many captures."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket

@@ -1,7 +1,5 @@
 """Batches from a pixel set contain the stored pixels, under drawn lights, and dense maps fill only gaps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Pixel sets are read as they were written, and damaged ones are refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import warnings

@@ -1,7 +1,5 @@
 """The page loads nothing, escapes names, stores the normals exactly, and lights them by Lambert's law."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The pages share one head, one set of colours and one list of terms, and open without errors in a browser."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 from unittest import mock

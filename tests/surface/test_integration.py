@@ -1,7 +1,5 @@
 """Integration of normals, against analytic surfaces and a dense solver."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

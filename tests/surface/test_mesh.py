@@ -1,7 +1,5 @@
 """Meshes of height maps."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Each effect against the distribution that its docstring states. Seeds are fixed: nothing here is left to chance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 

@@ -4,8 +4,6 @@ The full comparison is benchmarks/render_accuracy.py; here a small image under t
 wrong lobe, factor, frame or bounce.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 from pathlib import Path

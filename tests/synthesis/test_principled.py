@@ -1,7 +1,5 @@
 """The principled BRDF against its equations, written out a second time in numpy with explicit vectors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

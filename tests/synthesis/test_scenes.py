@@ -1,7 +1,5 @@
 """Scenes: reproducible one by one, and drawn from the stated ranges."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Procedural shapes: sound surfaces, true normals, hollows, and fields against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Training configurations and presets, and the names of them that load without PyTorch."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Training configurations from presets, files and options."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Several processes have the losses of one process, and a run survives the failure of a process."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

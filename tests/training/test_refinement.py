@@ -1,7 +1,5 @@
 """Whole scenes as captures, and the training of the refinement net on them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The log files of a run: metrics.csv, the figures and TensorBoard's events."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sources of training and validation pixels: weights of a mixture, and scenes kept for validation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

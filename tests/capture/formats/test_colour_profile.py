@@ -1,7 +1,5 @@
 """Curves of colour profiles: profiles written here after ISO 15076-1, and one of LittleCMS."""
 
-from __future__ import annotations
-
 import io
 import struct
 import tracemalloc

@@ -1,7 +1,5 @@
 """Films of an analytic sphere, written by OpenCV: which frames are taken, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Photographs and masks: values exactly as written, and damaged files refused without a word on stderr."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Ground truth in every format against the normals that were written."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """RAW files: DNGs written here, of known radiance, so that what LibRaw makes of them is known too."""
 
-from __future__ import annotations
-
 import struct
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Files that claim or hide far more than they show are refused from their headers, without taking memory."""
 
-from __future__ import annotations
-
 import io
 import os
 import resource

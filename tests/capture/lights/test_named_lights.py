@@ -1,7 +1,5 @@
 """Light files that name their images: RTI's .lp and AliceVision's JSON."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The object is found by its brightness, against drawn scenes whose masks are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

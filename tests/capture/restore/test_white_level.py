@@ -1,7 +1,5 @@
 """White levels: found where cameras clip below the full scale of 16 bits, and not where something else looks flat."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path
