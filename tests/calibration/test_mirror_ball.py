@@ -31,12 +31,6 @@ def test_directions_come_back(render_ball: Render, lights: NDArray[np.float64], 
         assert (highlight.saturated > 0.1) == (full_scale is not None)
 
 
-def test_the_normal_is_not_the_light(render_ball: Render, lights: NDArray[np.float64]) -> None:
-    highlight = find_highlight(render_ball(lights[4]), BALL)
-    normal = BALL.normals(np.array([highlight.x]), np.array([highlight.y]))[0]
-    assert angle_between_deg(normal, lights[4]) == pytest.approx(20, abs=0.5)  # half of 40 degrees
-
-
 def test_a_sparkle_is_no_lamp(render_ball: Render, lights: NDArray[np.float64]) -> None:
     picture = render_ball(lights[3]).clip(0, 1)
     expected = find_highlight(picture, BALL)

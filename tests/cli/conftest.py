@@ -1,5 +1,6 @@
 """A small analytic capture, and ways to run the command line."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -66,6 +67,10 @@ def medallion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the example, in an empty working folder."""
     monkeypatch.chdir(tmp_path)
     return Path(shutil.copytree(EXAMPLE, tmp_path / "medallion"))
+
+
+def read_report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text("utf-8"))
 
 
 @dataclass(frozen=True)

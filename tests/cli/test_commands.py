@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from cli.test_schema import check
 from splinecli.cli.app import app
 from splinecli.cli.panels import OTHERS, sort_into_panels
 
@@ -76,6 +77,9 @@ def test_a_failure_is_a_json_document(name, run, tmp_path, monkeypatch):
     document = json.loads(result.out)
     if name == "infer":
         (document,) = document
+    if name in ("infer", "integrate"):
+        check(document, "failure")
+    if name == "infer":
         assert document.pop("capture") == "nowhere"
     assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": result.code}
     assert (result.code, "nowhere" in document["error"]) == (3, True)
@@ -89,6 +93,7 @@ def test_an_error_of_the_parser_is_a_json_document(name, wrong, run, tmp_path, m
     document = json.loads(result.out)
     if name == "infer":
         (document,) = document
+        check(document, "failure")
         assert document.pop("capture") is None
     assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": 2}
     assert (result.code, result.err.count("\n")) == (2, 1)

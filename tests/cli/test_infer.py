@@ -13,12 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from cli.conftest import read_report
 from splinecli.maths.normals import angle_between_deg, decode_picture
 from splinecli.methods.least_squares import LeastSquares
-
-
-def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
 
 
 def test_writes_the_contract(capture, truth, run, golden):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from cli.conftest import read_report
 from splinecli import inference
 from splinecli.capture import source
 from splinecli.diagnosis import checks
@@ -26,10 +27,6 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
 from splinecli.results import albedo, clock, files
-
-
-def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
 
 
 def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from cli.conftest import read_report
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
-
-
-def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
 
 
 def test_refuses_to_overwrite(capture, run, golden):

@@ -78,11 +78,6 @@ def test_two_rotations_of_a_canonical_network_make_it_mirror_symmetric() -> None
         assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
 
 
-def test_several_rotations_give_unit_vectors() -> None:
-    network = estimator(random_network(COMPACT), precision="float32", rotations=5)
-    np.testing.assert_allclose(np.linalg.norm(network.estimate(*pixels(30)), axis=1), 1, rtol=1e-5)
-
-
 def test_progress_changes_no_bit() -> None:
     observations, lights = pixels(150)
     network = estimator(random_network(COMPACT), precision="float32", batch_size=100)

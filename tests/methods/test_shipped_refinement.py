@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import directions_at
+from scenes import directions_at, halfway
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.light.lamp_light import LampLight
@@ -35,9 +35,8 @@ def scene(
     """
     rng = np.random.default_rng(0)
     flat = normals.reshape(-1, 3)
-    half = unit(LIGHTS + np.array((0, 0, 1)))
     observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
-    observations = unmeasured * (observations + gloss * (flat @ half.T).clip(0) ** 60)
+    observations = unmeasured * (observations + gloss * (flat @ halfway(LIGHTS).T).clip(0) ** 60)
     observations += noise * observations.max() * rng.normal(size=observations.shape)
     mask = np.ones(normals.shape[:2], np.bool_)
     return Capture(

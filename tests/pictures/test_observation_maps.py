@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import decode_rgb
 from splinecli.pictures.observation_maps import observation_map_figure
 
 SIZE = 8
@@ -26,7 +27,7 @@ def draw(
         title="$cat$, 10 lights" if named else "",
         grid=grid,  # type: ignore[arg-type]
     )
-    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
+    return decode_rgb(png)
 
 
 def boxes(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> list[NDArray[np.int32]]:
