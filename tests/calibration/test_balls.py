@@ -76,19 +76,6 @@ def test_several_balls_are_averaged(
         combine_balls([one, short])
 
 
-def test_a_ball_cut_off_by_the_frame(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> None:
-    for number, light in enumerate(lights[:3], start=1):
-        write(tmp_path / "ball", f"{number}.png", render_ball(light, x=45.0, lamp=0.9))
-    with pytest.raises(InputError, match=r"not entirely inside the image\. Take images of the whole"):
-        calibrate_ball(find_ball_files(tmp_path / "ball"))
-
-
-def test_a_photograph_without_highlight_is_named(ball: Path, render_ball: Render) -> None:
-    write(ball, "4.png", render_ball(np.array([0.0, 0.6, -0.8]), lamp=0.02))
-    with pytest.raises(InputError, match=r"ball/4\.png: found no highlight"):
-        calibrate_ball(find_ball_files(ball), circle=BALL)
-
-
 def test_pictures_of_another_size(ball: Path) -> None:
     write(ball, "3.png", np.zeros((50, 60)))
     with pytest.raises(InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"):

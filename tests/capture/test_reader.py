@@ -86,18 +86,6 @@ def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDAr
         source.read()
 
 
-def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> None:
-    mask = write_image("vase/mask.png", np.full((6, 5), 255, np.uint8))
-    with pytest.raises(InputError) as caught:
-        read_capture(capture_folder)
-    assert str(caught.value) == f"{mask}: found a mask of 5 x 6 pixels, expected 6 x 5 as in img8.png."
-    mask.unlink()
-    image = write_image("vase/img10.png", np.zeros((5, 7), np.uint16))
-    with pytest.raises(InputError) as caught:
-        read_capture(capture_folder)
-    assert str(caught.value) == f"{image}: found an image of 7 x 5 pixels, expected 6 x 5 as in img8.png."
-
-
 def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(
     capture_folder: Path, write_image: WriteImage
 ) -> None:

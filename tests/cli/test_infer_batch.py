@@ -336,7 +336,7 @@ def test_files_without_permission(make_capture, run_without_privileges):
     assert third == read_report(Path("out/good"))
     lights = Path("lights.txt")
     lights.touch(mode=0)
-    result = run_without_privileges("infer", good, "--lights", lights, "-o", "new", "--json")
+    result = run_without_privileges("infer", good, "--method", "ls", "--lights", lights, "-o", "new", "--json")
     (document,) = json.loads(result.out)
     assert (result.code, document["exit_code"], "lights.txt" in document["error"]) == (3, 3, True)
 

@@ -163,7 +163,10 @@ def cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path("cube.obj")
 
 
-def test_scenes_and_a_mesh_are_rendered(run, cube):
+def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
+    # Coarser shapes, for speed.
+    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
     arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
     result = run(*arguments, "--scenes", 1)
     assert result.code == 0
@@ -193,11 +196,13 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
 
 def test_workers_render_the_same_set(run, cube):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    arguments = ("prepare", "--mesh", cube, "--scenes", 2, "--size", 16, "--n-lights", 20)
-    alone = run(*arguments, "-o", "alone")
-    # The set has one of the scenes already.
-    assert run(*arguments[:3], "--scenes", 1, *arguments[5:], "-o", "set", "-q").code == 0
-    together = run(*arguments, "-o", "set", "--workers", 2)
+    Path("block.obj").write_text(cube.read_text())
+    more = ("--mesh", "block.obj", "--scenes", 1)
+    arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20)
+    alone = run(*arguments, *more, "-o", "alone")
+    # The set has the cube already.
+    assert run(*arguments, "-o", "set", "-q").code == 0
+    together = run(*arguments, *more, "-o", "set", "--workers", 2)
     assert (together.code, together.err) == (0, alone.err)
     files = [
         {path.relative_to(folder): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
