@@ -72,8 +72,9 @@ def test_photographs(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("coarse_shapes")
-def test_faulty_captures(run: Run, tmp_path: Path) -> None:
+def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
+    monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
     printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "16")
     assert int(printed.split()[0]) > 5
     rows = run("fit_capture_confidence", str(tmp_path)).splitlines()

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from splinecli.capture import read_capture
+from splinecli.cli.main import main
 from splinecli.inference import estimate_normals
 from splinecli.maths.normals import angle_between_deg, encode_picture, unit
 from splinecli.methods import make_estimator
@@ -152,8 +154,11 @@ def run(command: list[str], folder: Path, **environment: str) -> str:
 
 
 @needs_weights
-def test_python_api_runs_from_any_folder(tmp_path, ls_mae_deg):
-    said = run([sys.executable, str(EXAMPLES / "python_api.py")], tmp_path)
+def test_python_api_runs_from_any_folder(tmp_path, ls_mae_deg, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["python_api.py"])
+    runpy.run_path(str(EXAMPLES / "python_api.py"), run_name="__main__")
+    said = capsys.readouterr().out
     assert f"ls: MAE {ls_mae_deg:.2f} deg" in said
     assert "spline-net: MAE " in said
     for method in ("ls", "spline-net"):
@@ -177,9 +182,13 @@ def test_infer_medallion_runs_from_any_folder(tmp_path):
 
 
 @needs_weights
-def test_the_overview_is_what_the_script_draws(tmp_path):
+def test_the_overview_is_what_the_script_draws(tmp_path, monkeypatch):
     """The README's picture matches the results of today; fonts and rounding differ a little between machines."""
-    run([sys.executable, str(EXAMPLES / "make_overview.py"), "overview.png"], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["make_overview.py", "overview.png"])
+    # The command of the script, in this process.
+    monkeypatch.setattr(subprocess, "run", lambda command, check: main(command[command.index("infer") :]))
+    runpy.run_path(str(EXAMPLES / "make_overview.py"), run_name="__main__")
     drawn, stored = read_png(tmp_path / "overview.png"), read_png(TUTORIAL.parent / "pictures/overview.png")
     assert drawn.shape == stored.shape == (400, 1200, 3)
     assert (TUTORIAL.parent / "pictures/overview.png").stat().st_size < 400_000

@@ -77,7 +77,10 @@ def alarm():
 
 
 @pytest.fixture
-def inputs(capture):
+def inputs(capture, monkeypatch):
+    """What the commands read. Figures are not drawn: these tests are about their files."""
+    drawn = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()
+    monkeypatch.setattr("splinecli.evaluation.capture_figures.method_maps", lambda *_, **__: drawn)
     np.save("n.npy", np.tile(np.float32([0, 0, 1]), (8, 9, 1)))
     Path("ball").mkdir()
     y, x = np.indices((100, 120))

@@ -13,7 +13,7 @@ from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.refinement.tiles import MARGIN, NetworkRefiner
 
-SIZE = 64
+SIZE = 48
 AZIMUTH = np.arange(10) * np.radians(36)
 ZENITH = np.radians(np.where(np.arange(10) % 2, 25, 50))
 LIGHTS = directions_at(AZIMUTH, ZENITH)
@@ -118,7 +118,7 @@ def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -
 @pytest.mark.parametrize("behind", [0.002, 0.3])
 def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
     """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the sphere."""
-    x, y = (COLUMNS - SIZE / 2 + 0.5) / 24, (SIZE / 2 - 0.5 - ROWS) / 24
+    x, y = (COLUMNS - SIZE / 2 + 0.5) / 18, (SIZE / 2 - 0.5 - ROWS) / 18
     height = np.sqrt((1 - x**2 - y**2).clip(0))
     sphere = height > 0.2
     normals = np.where(sphere[..., None], np.stack((x, y, height), axis=-1), PLATE)

@@ -233,7 +233,7 @@ def test_exchanged_files(files: Files) -> None:
 
 
 def deflated(path: Path) -> None:
-    torch.save({"a": torch.zeros(50_000_000)}, path)
+    torch.save({"a": torch.zeros(5_000_000)}, path)
     with zipfile.ZipFile(path) as archive:
         records = {record.filename: archive.read(record) for record in archive.infolist()}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -250,12 +250,12 @@ def countless_records(path: Path) -> None:
 
 def countless_tensors(path: Path) -> None:
     empty = torch.zeros(0)
-    torch.save({str(number): empty[:0] for number in range(60_000)}, path)
+    torch.save({str(number): empty[:0] for number in range(25_000)}, path)
 
 
 def countless_old_tensors(path: Path) -> None:
     empty = torch.zeros(0)
-    state = {str(number): empty[:0] for number in range(60_000)}
+    state = {str(number): empty[:0] for number in range(25_000)}
     torch.save(state, path, _use_new_zipfile_serialization=False)
 
 

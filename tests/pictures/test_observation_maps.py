@@ -1,5 +1,7 @@
 """A cell has its colour at its place in the figure; empty cells are gray."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ SIZE = 8
 YELLOW, VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' ends; 0.85 of 255
 
 
+@cache
 def draw(
     n_pixels: int, *, with_truth: bool = True, with_dense: bool = True, named: bool = True, grid: str = "even"
 ) -> NDArray[np.uint8]:
