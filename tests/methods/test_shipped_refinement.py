@@ -1,5 +1,7 @@
 """The shipped refinement net invents nothing: analytic scenes whose normals are known everywhere."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -44,16 +46,9 @@ def scene(
     )
 
 
-def refined_and_not(
-    normals: NDArray[np.floating],
-    albedo: NDArray[np.floating] | float,
-    *,
-    noise: float,
-    gloss: float = 0.0,
-    unmeasured: NDArray[np.floating] | float = 1.0,
-) -> tuple[NormalEstimate, NormalEstimate]:
+def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, NormalEstimate]:
     """Estimate a scene with and without refinement; see `scene`."""
-    capture = scene(normals, albedo, noise=noise, gloss=gloss, unmeasured=unmeasured)
+    capture = scene(*surface, **faults)
     refined, pixelwise = (
         estimate_normals(capture, make_estimator(name)) for name in ("spline-net", "spline-net-pixelwise")
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from distributions import generator as seeded
 from splinecli.maths.observation_map import cell_directions
 from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
 from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
@@ -18,10 +19,6 @@ FAULTLESS = CaptureConfig(
     light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
 )  # fmt: skip
 MakeSet = Callable[..., PixelSet]
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def source_of(pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0) -> PixelSetSource:

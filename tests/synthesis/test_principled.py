@@ -1,5 +1,7 @@
 """The principled BRDF against its equations, written out a second time in numpy with explicit vectors."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -9,21 +11,7 @@ from scipy import integrate
 from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 
 Vectors = NDArray[np.float64]
-NAMES = (
-    "base",
-    "metallic",
-    "specular",
-    "roughness",
-    "sheen",
-    "clearcoat",
-    "clearcoat_gloss",
-    "interface_loss",
-    "minnaert",
-    "tail_exponent",
-    "second_share",
-    "second_roughness",
-    "retro",
-)
+NAMES = tuple(field.name for field in fields(PrincipledMaterial))
 
 
 def material(**values: float) -> PrincipledMaterial:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from distributions import generator as seeded
 from splinecli.errors import InputError
 from splinecli.pixel_sets.source import SampledPixels
 from splinecli.pixel_sets.store import Entry, PixelSet
@@ -16,10 +17,6 @@ from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.sources import open_sources, split_scenes
 
 MakeSet = Callable[..., PixelSet]
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def assert_same(one: PixelBatch, other: PixelBatch) -> None:
