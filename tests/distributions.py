@@ -1,7 +1,5 @@
 """Draws of many values, compared with the distribution that they come from."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reads GLB files as the specification of glTF 2.0 has them, and checks what it requires."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

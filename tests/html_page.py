@@ -1,7 +1,5 @@
 """A parser for the tests of the HTML pages, and the report and normals of a ball to show."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 from typing import Any
 

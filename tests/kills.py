@@ -1,7 +1,5 @@
 """Kill a process at a chosen step of its changes to files, as a power cut or `kill -9` would."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,7 @@
 """Lights, shapes and captures of known normals, which the tests of many rooms share."""
 
-from __future__ import annotations
-
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -96,6 +96,20 @@ def write_capture(
     if intensities is not None:
         np.savetxt(folder / "light_intensities.txt", intensities)
     return folder
+
+
+def decode_rgb(png: bytes) -> NDArray[np.uint8]:
+    """RGB (H, W, 3) of an encoded picture."""
+    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def png_chunk(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def with_chunk(png: bytes, name: bytes, content: bytes) -> bytes:
+    """A PNG with one more chunk after its header."""
+    return png[:33] + png_chunk(name, content) + png[33:]
 
 
 BUMP_MM = 64.0

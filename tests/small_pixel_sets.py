@@ -1,7 +1,5 @@
 """Small pixel sets for tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Each benchmark runs to its end on small inputs and prints every row."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import math
@@ -38,6 +36,13 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return run_benchmark
 
 
+@pytest.fixture
+def coarse_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawn shapes of few triangles, which small pictures show as well."""
+    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
+
+
 def numbers(line: str) -> list[float]:
     return [float(number) for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))]
 
@@ -45,7 +50,7 @@ def numbers(line: str) -> list[float]:
 def test_training_speed(run: Run) -> None:
     """It crashed: CNN-PS has no LI-Net, so its updates cannot alternate."""
     printed = run(
-        "training_speed", "--batch-size", "8", "--steps", "1", "--warm-up", "1", "--device", "cpu"
+        "training_speed", "--batch-size", "4", "--steps", "1", "--warm-up", "1", "--device", "cpu"
     ).splitlines()
     rows = [line.split("  ")[0] for line in printed[1:]]
     assert rows == ["compact", "compact, Ls and La", "compact, alternating", "paper", "cnn-ps"]
@@ -66,9 +71,11 @@ def test_photographs(run: Run) -> None:
     assert len(numbers(intensities.splitlines()[1])) == 7
 
 
-def test_faulty_captures(run: Run, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("coarse_shapes")
+def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "24")
+    monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
+    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "16")
     assert int(printed.split()[0]) > 5
     rows = run("fit_capture_confidence", str(tmp_path)).splitlines()
     assert rows[0].startswith("| capture | number | claimed before")
@@ -76,6 +83,7 @@ def test_faulty_captures(run: Run, tmp_path: Path) -> None:
     assert all(len(numbers(row)) == 8 for row in rows[2:])
 
 
+@pytest.mark.usefixtures("coarse_shapes")
 def test_render_accuracy(run: Run) -> None:
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
     pytest.importorskip("embreex", reason="needs the extra 'render'")
@@ -86,6 +94,7 @@ def test_render_accuracy(run: Run) -> None:
     assert printed[-1].count("%") == 3
 
 
+@pytest.mark.usefixtures("coarse_shapes")
 def test_near_lamps(run: Run) -> None:
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     printed = run("near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8").splitlines()

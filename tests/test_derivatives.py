@@ -1,7 +1,5 @@
 """Slopes and curvatures of analytic surfaces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Devices, precision and threads."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The documentation agrees with the code: links, commands, constants and tables of figures."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -91,12 +89,7 @@ def test_commands_have_options_that_exist(page, command):
 def test_exit_codes():
     codes = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text_of("docs/files-and-frames.md"), re.MULTILINE))
     assert codes.keys() == {"0", "1", "2", "3", "4", "5", "130"}
-    for error, word in (
-        (UsageError, "usage"),
-        (InputError, "input"),
-        (ModelError, "weights"),
-        (OutputError, "output"),
-    ):
+    for error, word in ((UsageError, "usage"), (InputError, "input"), (ModelError, "weights"), (OutputError, "output")):
         assert word in codes[str(error.exit_code)]
 
 

@@ -1,7 +1,5 @@
 """Optional packages: what the message says when one is not installed."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Output files appear complete or not at all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Imports only point downwards through the rooms of the house (CONTRIBUTING.md)."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """From a capture to a normal map, mostly with least squares, whose result is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

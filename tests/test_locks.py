@@ -1,7 +1,5 @@
 """One process at a time holds a folder, on systems with either kind of lock."""
 
-from __future__ import annotations
-
 import errno
 import os
 import sys

@@ -1,7 +1,5 @@
 """Angular errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The functions for notebooks: the same normals as `splinecli infer`, from arrays."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -138,11 +136,7 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
         ({"images": [np.ones((5, 6)), np.ones((5, 7))]}, UsageError, "images[1]"),
         ({"images": -np.ones((4, 5, 6))}, InputError, "images[0]: found the negative value -1"),
         ({"light_directions": LIGHTS[:3]}, UsageError, "expected (F, 3) = (4, 3), one for each image"),
-        (
-            {"light_directions": -LIGHTS},
-            InputError,
-            "light_directions: found a light below the horizon in row 0",
-        ),
+        ({"light_directions": -LIGHTS}, InputError, "light_directions: found a light below the horizon in row 0"),
         ({"mask": np.ones((5, 5))}, UsageError, "found a mask of shape (5, 5), expected (H, W) = (5, 6)"),
         ({"mask": np.zeros((5, 6))}, InputError, "the mask is empty"),
         ({"light_intensities": np.ones(3)}, UsageError, "found light intensities of shape (3,)"),

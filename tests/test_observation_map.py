@@ -1,7 +1,5 @@
 """Observation maps: which cell a direction falls on, and the symmetries of what is laid out there."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

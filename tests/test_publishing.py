@@ -1,7 +1,5 @@
 """Sets of files replace earlier ones, whenever the process is killed and whatever somebody put into the folder."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The closed-form 3 x 3 solutions, compared with LAPACK's."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

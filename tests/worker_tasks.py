@@ -1,7 +1,5 @@
 """Items for workers in other processes, which import this file. They note in a folder what happens."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

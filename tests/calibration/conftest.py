@@ -1,7 +1,5 @@
 """Photographs of made-up mirror balls: the oracle is the law of reflection, followed from the camera to the lamp."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

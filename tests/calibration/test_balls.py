@@ -1,7 +1,5 @@
 """From folders of photographs to the lights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -76,19 +74,6 @@ def test_several_balls_are_averaged(
     short = calibrate_ball(find_ball_files(write(tmp_path / "short", "1.png", render_ball(lights[1]))), circle=BALL)
     with pytest.raises(InputError, match=r"7 images .*1 images"):
         combine_balls([one, short])
-
-
-def test_a_ball_cut_off_by_the_frame(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> None:
-    for number, light in enumerate(lights[:3], start=1):
-        write(tmp_path / "ball", f"{number}.png", render_ball(light, x=45.0, lamp=0.9))
-    with pytest.raises(InputError, match=r"not entirely inside the image\. Take images of the whole"):
-        calibrate_ball(find_ball_files(tmp_path / "ball"))
-
-
-def test_a_photograph_without_highlight_is_named(ball: Path, render_ball: Render) -> None:
-    write(ball, "4.png", render_ball(np.array([0.0, 0.6, -0.8]), lamp=0.02))
-    with pytest.raises(InputError, match=r"ball/4\.png: found no highlight"):
-        calibrate_ball(find_ball_files(ball), circle=BALL)
 
 
 def test_pictures_of_another_size(ball: Path) -> None:

@@ -1,7 +1,5 @@
 """Circles from masks and in pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

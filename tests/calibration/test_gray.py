@@ -1,7 +1,5 @@
 """Strengths of lights from a matte ball or card, by Lambert's law."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Positions of lamps from mirror balls: the oracle is the law of reflection under a lamp of known position."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -9,14 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import spiral_lights
-from splinecli.calibration.balls import (
-    BallCalibration,
-    BallFiles,
-    calibrate_ball,
-    combine_balls,
-    find_ball_files,
-)
+from scenes import directions_at, spiral_lights
+from splinecli.calibration.balls import BallCalibration, BallFiles, calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.lamp_positions import intersect_rays, triangulate_lamps
 from splinecli.calibration.mirror_ball import Highlight
@@ -100,13 +92,11 @@ def photographed(
         return middle + focal * seen[:, :2] / -seen[:, 2:] * (1, -1)
 
     zenith, azimuth = np.radians(rng.uniform(15, 50, 6)), rng.uniform(0, 2 * np.pi, 6)
-    towards = np.stack((np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1)
+    towards = directions_at(azimuth, zenith)
     places = towards * rng.uniform(300, 700, (6, 1)) * min(1, eye[2] / 900)
     assumed = {"EXIF": focal * np.exp(0.05 * rng.normal()), "assumed distant": DISTANT}.get(source, focal)
     view = View(
-        np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1))),
-        source,
-        SHORTEST_LENS * PIXELS[1],
+        np.array(((assumed, 0, middle[0]), (0, assumed, middle[1]), (0, 0, 1))), source, SHORTEST_LENS * PIXELS[1]
     )
     balls = []
     for side in (-1, 1):

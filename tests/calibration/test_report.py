@@ -1,7 +1,5 @@
 """The report of a calibration, of lights whose errors are known."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The camera of a calibration, from EXIF tags: focal lengths computed by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images written by the tests: the oracle of the readers is what was written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

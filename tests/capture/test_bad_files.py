@@ -1,7 +1,5 @@
 """Bad files cause one message that names the file, and nothing else on stderr."""
 
-from __future__ import annotations
-
 import builtins
 import os
 import warnings

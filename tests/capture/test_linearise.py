@@ -1,8 +1,5 @@
 """Photographs stored in other ways than linear: all come back to the light that was there."""
 
-from __future__ import annotations
-
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import with_chunk
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
 from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
@@ -103,12 +101,6 @@ def test_files_that_do_not_fit(tmp_path: Path, light: NDArray[np.float64]) -> No
         observed(folder, flat_field=(small, small))
     with pytest.raises(InputError, match=r"black\.png: the flat-field image is black"):
         observed(folder, flat_field=(black,))
-
-
-def with_chunk(png: bytes, name: bytes, body: bytes) -> bytes:
-    """A PNG with one more chunk after its header."""
-    chunk = len(body).to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
-    return png[:33] + chunk + png[33:]
 
 
 def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np.float64]) -> None:

@@ -1,7 +1,5 @@
 """Whole captures: observations against the photographs written, and real ones against known errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -86,18 +84,6 @@ def test_only_the_chosen_images_are_read(capture_folder: Path, photographs: NDAr
     np.testing.assert_allclose(capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6)
     with pytest.raises(InputError, match=r"img9\.png: found neither PNG, TIFF, JPEG nor BMP"):
         source.read()
-
-
-def test_sizes_that_differ(capture_folder: Path, write_image: WriteImage) -> None:
-    mask = write_image("vase/mask.png", np.full((6, 5), 255, np.uint8))
-    with pytest.raises(InputError) as caught:
-        read_capture(capture_folder)
-    assert str(caught.value) == f"{mask}: found a mask of 5 x 6 pixels, expected 6 x 5 as in img8.png."
-    mask.unlink()
-    image = write_image("vase/img10.png", np.zeros((5, 7), np.uint16))
-    with pytest.raises(InputError) as caught:
-        read_capture(capture_folder)
-    assert str(caught.value) == f"{image}: found an image of 7 x 5 pixels, expected 6 x 5 as in img8.png."
 
 
 def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(

@@ -1,7 +1,5 @@
 """The record: what it refuses, and choosing lights."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -28,10 +26,7 @@ def make(**changes: Any) -> Capture:
 @pytest.mark.parametrize(
     ("positions", "message"),
     [
-        (
-            [0, 1, 4],
-            "light index 4 is out of range: the capture has 4 lights. Light indices count from 0 to 3",
-        ),
+        ([0, 1, 4], "light index 4 is out of range: the capture has 4 lights. Light indices count from 0 to 3"),
         ([0, 1, -1], "light index -1 is out of range"),
         ([0, 1, 2, 1], "light index 1 comes twice. Name each light once."),
         ([0, 1], "2 lights chosen, expected at least 3."),
@@ -61,10 +56,7 @@ SHORT = {"light_directions": LIGHTS[:2], "light_indices": (0, 1), "observations"
         ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 lies below the horizon \(z <= 0\)"),
         ({"mask": np.zeros((2, 3), bool)}, "the mask is empty"),
         ({"mask": np.ones(4, bool)}, r"a mask of shape \(4,\), expected \(H, W\)"),
-        (
-            {"ground_truth": np.zeros((3, 2, 3))},
-            r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)",
-        ),
+        ({"ground_truth": np.zeros((3, 2, 3))}, r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)"),
         ({"ground_truth": np.full((2, 3, 3), 0.1)}, NO_NORMAL),
         ({"ground_truth": np.full((2, 3, 3), np.nan)}, NO_NORMAL),
     ],

@@ -1,10 +1,9 @@
 """The sample of pixels that checks see."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from scenes import directions_at
 from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.sample import Sample, leave_out_background
 from splinecli.diagnosis.checks import check_arrays
@@ -12,8 +11,7 @@ from splinecli.diagnosis.checks import check_arrays
 
 def ball_before(background: float, size: int = 80) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return images (F, H, W) of a matte ball before a noisy plane of some brightness, lights and its mask."""
-    azimuth = np.arange(12) * 2.4
-    lights = np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(12, 0.8)), axis=1)
+    lights = directions_at(np.arange(12) * 2.4, np.arccos(0.8))
     y, x = np.mgrid[2.2 : -2.2 : size * 1j, -2.2 : 2.2 : size * 1j]
     mask = np.hypot(x, y) < 0.97
     normals = np.stack((x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=2)
@@ -30,10 +28,7 @@ def test_a_dark_background_is_left_out():
     assert np.count_nonzero(sample.mask != mask) < 0.05 * mask.sum()
     assert share == pytest.approx(1 - sample.mask.mean())
     np.testing.assert_array_equal(sample.observations, observations[sample.mask.ravel()])
-    for kept in (
-        Sample(observations[mask.ravel()], mask, 1),
-        Sample(observations[:5], everything[:1, :5], 1),
-    ):
+    for kept in (Sample(observations[mask.ravel()], mask, 1), Sample(observations[:5], everything[:1, :5], 1)):
         assert leave_out_background(kept) == (kept, 0.0)
     bright = Sample(ball_before(0.3)[0].reshape(12, -1).T, everything, 1)
     assert leave_out_background(bright) == (bright, 0.0)

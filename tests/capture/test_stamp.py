@@ -1,7 +1,5 @@
 """Stamps change with every file of a capture, and only then."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

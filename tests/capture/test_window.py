@@ -1,7 +1,5 @@
 """--crop and --scale: what is read is a part of the whole capture, and so are the results."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,17 +1,18 @@
 """A small analytic capture, and ways to run the command line."""
 
-from __future__ import annotations
-
+import json
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 import scenes
 from splinecli.cli.main import main
@@ -70,6 +71,10 @@ def medallion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path(shutil.copytree(EXAMPLE, tmp_path / "medallion"))
 
 
+def read_report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text("utf-8"))
+
+
 @dataclass(frozen=True)
 class Run:
     code: int
@@ -77,11 +82,16 @@ class Run:
     err: str
 
 
+COMMAND = cache(typer.main.get_command)
+"""The commands are the same in all tests. Making them takes longer than many a command."""
+
+
 @pytest.fixture
 def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
     """Run the command line: run("infer", folder, "--json") -> Run(code, out, err)."""
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("TERMINAL_WIDTH", "100")
+    monkeypatch.setattr(typer.main, "get_command", COMMAND)
 
     def call(*args: object) -> Run:
         code = main([str(arg) for arg in args])

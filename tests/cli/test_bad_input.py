@@ -3,8 +3,6 @@
 The texts stand in tests/golden/bad_input/, a file a case.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

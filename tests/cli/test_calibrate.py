@@ -1,7 +1,5 @@
 """`splinecli calibrate`: its files, messages and errors, on synthetic mirror balls."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -104,16 +102,7 @@ def test_positions_need_the_camera(run):
     assert not Path("calibration/light_positions.txt").exists()
     matrix = np.array(((1000, 0, 149.5), (0, 1000, 49.5), (0, 0, 1)))
     np.savetxt("matrix.txt", matrix)
-    arguments = [
-        "calibrate",
-        "one",
-        "two",
-        *circles,
-        "--overwrite",
-        "--json",
-        "--camera-matrix",
-        "matrix.txt",
-    ]
+    arguments = ["calibrate", "one", "two", *circles, "--overwrite", "--json", "--camera-matrix", "matrix.txt"]
     report = json.loads(run(*arguments).out)
     assert report["camera"] == {"from": "--camera-matrix", "matrix": matrix.tolist()}
     known = report["lamp_positions"]["known"]

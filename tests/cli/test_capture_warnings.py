@@ -1,7 +1,5 @@
 """Warnings about a capture, from the files to the messages and exit codes of `infer` and `info`."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path
@@ -70,10 +68,7 @@ def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [
-        ((0.1, 0.1, 1), "The lights lie in a narrow cone"),
-        ((1, 0.05, 1), "The lights lie nearly in one plane"),
-    ],
+    [((0.1, 0.1, 1), "The lights lie in a narrow cone"), ((1, 0.05, 1), "The lights lie nearly in one plane")],
 )
 def test_lights_that_crowd(run, medallion, change, words):
     lights = np.loadtxt(medallion / "light_directions.txt") * change

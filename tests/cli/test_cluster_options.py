@@ -1,7 +1,5 @@
 """Options of workers and clusters that are refused before anything is computed."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -16,10 +14,7 @@ import pytest
         (("--workers", "2", "--cluster", "tcp://a:1"), "--workers and --cluster contradict each other"),
         (("--shard", "3/2"), "--shard is 3/2; expected I/N with I from 1 to N"),
         (("--shard", "half"), "--shard is 'half'; expected I/N"),
-        (
-            ("--cluster", "none.json"),
-            "--cluster is none.json; expected an address such as tcp://scheduler:8786",
-        ),
+        (("--cluster", "none.json"), "--cluster is none.json; expected an address such as tcp://scheduler:8786"),
     ],
 )
 def test_refusals(arguments, message, capture, make_capture, run):

@@ -1,7 +1,5 @@
 """What all commands share: panels in the help, `~` in paths, closed pipes, and threads that sleep while they wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -11,6 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from cli.test_schema import check
 from splinecli.cli.app import app
 from splinecli.cli.panels import OTHERS, sort_into_panels
 
@@ -52,18 +51,7 @@ def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_cap
     Path("third/image3.png").write_bytes(b"no picture")
     read, write = os.pipe()
     os.close(read)
-    arguments = [
-        sys.executable,
-        "-u",
-        "-m",
-        "splinecli",
-        "infer",
-        str(capture),
-        "third",
-        "second",
-        "--method",
-        "ls",
-    ]
+    arguments = [sys.executable, "-u", "-m", "splinecli", "infer", str(capture), "third", "second", "--method", "ls"]
     done = subprocess.run(arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True)
     os.close(write)
     assert done.returncode == 3
@@ -89,11 +77,11 @@ def test_a_failure_is_a_json_document(name, run, tmp_path, monkeypatch):
     document = json.loads(result.out)
     if name == "infer":
         (document,) = document
+    if name in ("infer", "integrate"):
+        check(document, "failure")
+    if name == "infer":
         assert document.pop("capture") == "nowhere"
-    assert document == {
-        "error": result.err.removeprefix("splinecli: ").rstrip("\n"),
-        "exit_code": result.code,
-    }
+    assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": result.code}
     assert (result.code, "nowhere" in document["error"]) == (3, True)
 
 
@@ -105,6 +93,7 @@ def test_an_error_of_the_parser_is_a_json_document(name, wrong, run, tmp_path, m
     document = json.loads(result.out)
     if name == "infer":
         (document,) = document
+        check(document, "failure")
         assert document.pop("capture") is None
     assert document == {"error": result.err.removeprefix("splinecli: ").rstrip("\n"), "exit_code": 2}
     assert (result.code, result.err.count("\n")) == (2, 1)

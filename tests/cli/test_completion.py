@@ -1,13 +1,9 @@
 """What a shell asks for at the Tab key is answered at once, and by nothing but the answer."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-
-import pytest
 
 from splinecli.methods import method_names
 from splinecli.networks.weights import shipped_names
@@ -79,9 +75,12 @@ COMPLETED = {
 }
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_words_are_completed(shell):
-    script, *answers = ask([{"_SPLINECLI_COMPLETE": f"source_{shell}"}, *(question(line, shell) for line in COMPLETED)])
-    assert f"_SPLINECLI_COMPLETE=complete_{shell}" in script
-    found = {line: sorted(words(out, shell)) for line, out in zip(COMPLETED, answers, strict=True)}
-    assert found == {line: sorted(expected) for line, expected in COMPLETED.items()}
+def test_words_are_completed():
+    shells = ("bash", "zsh", "fish")
+    scripts = [{"_SPLINECLI_COMPLETE": f"source_{shell}"} for shell in shells]
+    answers = iter(ask(scripts + [question(line, shell) for shell in shells for line in COMPLETED]))
+    for shell in shells:
+        assert f"_SPLINECLI_COMPLETE=complete_{shell}" in next(answers)
+    for shell in shells:
+        found = {line: sorted(words(next(answers), shell)) for line in COMPLETED}
+        assert found == {line: sorted(expected) for line, expected in COMPLETED.items()}, shell

@@ -1,7 +1,5 @@
 """`--lights estimate` of infer, info and evaluate."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path
@@ -85,19 +83,7 @@ def test_info(unlit, run):
 def test_evaluate(unlit, run):
     np.savetxt(unlit / "light_directions.txt", LIGHTS)
     (unlit / "light_intensities.txt").write_text("1\n" * len(LIGHTS))
-    arguments = (
-        "evaluate",
-        unlit,
-        "--method",
-        "ls",
-        "--n-lights",
-        "8",
-        "--trials",
-        "2",
-        "--json",
-        "-o",
-        "scores",
-    )
+    arguments = ("evaluate", unlit, "--method", "ls", "--n-lights", "8", "--trials", "2", "--json", "-o", "scores")
     given = json.loads(run(*arguments).out)
     result = run(*arguments, "--lights", "estimate")
     estimated = json.loads(result.out)

@@ -1,7 +1,5 @@
 """`splinecli evaluate` on analytic captures: files, tables, and what goes wrong."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """EXR files hold the values and the channels that renderers read, and texts about them."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What is wrong with files, names and limits gets one line and a documented exit code, and nothing hangs."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -29,10 +27,7 @@ def test_devices_and_pipes_are_refused_at_once(capture, run):
     for option, expected in (("--lights", "a file"), ("--mask", "a file"), ("--ground-truth", "a file")):
         for path, kind in (("/dev/zero", "a device"), ("pipe", "a pipe")):
             result = run("infer", capture, "--method", "ls", option, path)
-            assert (result.code, result.err) == (
-                3,
-                f"splinecli: {path}: found {kind}, expected {expected}.\n",
-            )
+            assert (result.code, result.err) == (3, f"splinecli: {path}: found {kind}, expected {expected}.\n")
     run("infer", capture, "--method", "ls")
     result = run("integrate", "out/sphere", "--camera-matrix", "/dev/zero")
     assert (result.code, result.err) == (3, "splinecli: /dev/zero: found a device, expected a text file.\n")

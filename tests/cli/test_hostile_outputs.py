@@ -1,7 +1,5 @@
 """An output folder that somebody else prepared: nothing outside of it changes, nothing hangs, no traceback."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -35,19 +33,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
         ("surface.json", "depth.npy", "mesh.ply", "mesh.glb"),
     ),
     "evaluate": (
-        (
-            "evaluate",
-            "sphere",
-            "--method",
-            "ls",
-            "--n-lights",
-            "4",
-            "--trials",
-            "1",
-            "--figures",
-            "-o",
-            "out",
-        ),
+        ("evaluate", "sphere", "--method", "ls", "--n-lights", "4", "--trials", "1", "--figures", "-o", "out"),
         "out",
         ("results.json", "results.csv", "trials.jsonl", "lights.png", "figures/sphere.png", "figures"),
     ),
@@ -91,7 +77,10 @@ def alarm():
 
 
 @pytest.fixture
-def inputs(capture):
+def inputs(capture, monkeypatch):
+    """What the commands read. Figures are not drawn: these tests are about their files."""
+    drawn = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()
+    monkeypatch.setattr("splinecli.evaluation.capture_figures.method_maps", lambda *_, **__: drawn)
     np.save("n.npy", np.tile(np.float32([0, 0, 1]), (8, 9, 1)))
     Path("ball").mkdir()
     y, x = np.indices((100, 120))

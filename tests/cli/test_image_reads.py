@@ -1,7 +1,5 @@
 """How often a command opens each photograph."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """`splinecli import-weights`: the written file works, and refusals."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`splinecli infer` on an analytic capture: files, report, choice of lights, batches, and what goes wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -15,12 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from cli.conftest import read_report
 from splinecli.maths.normals import angle_between_deg, decode_picture
 from splinecli.methods.least_squares import LeastSquares
-
-
-def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
 
 
 def test_writes_the_contract(capture, truth, run, golden):
@@ -275,10 +270,7 @@ def test_ctrl_c_ends_a_real_process(capture):
     command = [sys.executable, "-m", "splinecli", "train", "-o", "run", "--minutes", "10"]
     # A shell starts background jobs with SIGINT ignored, and these tests may run in one.
     process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     )
     while not Path("run/config.json").exists():
         assert process.poll() is None

@@ -1,7 +1,5 @@
 """`splinecli info`: its report of a capture whose content is known, and that it writes nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

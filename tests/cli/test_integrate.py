@@ -1,7 +1,5 @@
 """`splinecli integrate`: normal maps in all formats, the files, and the errors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Near lamps on the command line: the same capture, told in each way in which a user may tell where the lamps are."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

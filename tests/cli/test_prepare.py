@@ -1,7 +1,5 @@
 """`splinecli prepare`: captures, CyclesPS trees and rendered scenes, continuation, and refusals."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -86,10 +84,7 @@ def test_the_same_command_continues(run, make_capture):
     shutil.move("hidden.png", two / "image3.png")
     assert run("prepare", one, two, "-o", "set").code == 0
     assert Path("set/one/observations.npy").stat().st_mtime_ns == before.st_mtime_ns
-    assert {entry["name"] for entry in json.loads(Path("set/manifest.json").read_text())["entries"]} == {
-        "one",
-        "two",
-    }
+    assert {entry["name"] for entry in json.loads(Path("set/manifest.json").read_text())["entries"]} == {"one", "two"}
 
 
 def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
@@ -124,10 +119,7 @@ def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture
     hint = "Add --update to read it again, or choose another -o."
     message = f"one: its files changed since the entry one was made. {hint}"
     assert (result.code, result.err) == (5, f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n")
-    assert (summary["entries"], summary["skipped"]) == (
-        2,
-        [{"source": "one", "reason": message, "exit_code": 5}],
-    )
+    assert (summary["entries"], summary["skipped"]) == (2, [{"source": "one", "reason": message, "exit_code": 5}])
     np.testing.assert_array_equal(arrays("one")["observations"], before["observations"])
     assert run("prepare", one, two, "-o", "set", "--update", "--quiet").code == 0
     after = arrays("one")
@@ -171,7 +163,10 @@ def cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path("cube.obj")
 
 
-def test_scenes_and_a_mesh_are_rendered(run, cube):
+def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
+    # Coarser shapes, for speed.
+    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
     arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
     result = run(*arguments, "--scenes", 1)
     assert result.code == 0
@@ -201,11 +196,13 @@ def test_scenes_and_a_mesh_are_rendered(run, cube):
 
 def test_workers_render_the_same_set(run, cube):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    arguments = ("prepare", "--mesh", cube, "--scenes", 2, "--size", 16, "--n-lights", 20)
-    alone = run(*arguments, "-o", "alone")
-    # The set has one of the scenes already.
-    assert run(*arguments[:3], "--scenes", 1, *arguments[5:], "-o", "set", "-q").code == 0
-    together = run(*arguments, "-o", "set", "--workers", 2)
+    Path("block.obj").write_text(cube.read_text())
+    more = ("--mesh", "block.obj", "--scenes", 1)
+    arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20)
+    alone = run(*arguments, *more, "-o", "alone")
+    # The set has the cube already.
+    assert run(*arguments, "-o", "set", "-q").code == 0
+    together = run(*arguments, *more, "-o", "set", "--workers", 2)
     assert (together.code, together.err) == (0, alone.err)
     files = [
         {path.relative_to(folder): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}

@@ -1,7 +1,5 @@
 """The process: Ctrl-C and SIGTERM at awkward moments, and nothing on stderr but messages."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +23,8 @@ from splinecli.cli import main
 def work():
     import library
     print("imported", flush=True)
-    time.sleep(20)
+    for _ in range(200):
+        time.sleep(0.1)
 main.main = work
 __main__.run()
 """

@@ -1,7 +1,5 @@
 """What an earlier run has left: what is skipped, kept, redone or refused."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable
@@ -9,12 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from cli.conftest import read_report
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
-
-
-def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
 
 
 def test_refuses_to_overwrite(capture, run, golden):

@@ -1,7 +1,5 @@
 """`--refine-lights` on a matte capture whose light file is rough."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -68,11 +66,7 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> Non
     ("command", "arguments", "message"),
     [
         ("evaluate", ["--light-error-deg", "4"], "--light-error-deg needs --refine-lights"),
-        (
-            "evaluate",
-            ["--refine-lights", "--light-error-deg", "40"],
-            "the light error is 40 degrees, expected",
-        ),
+        ("evaluate", ["--refine-lights", "--light-error-deg", "40"], "the light error is 40 degrees, expected"),
         (
             "infer",
             ["--refine-lights", "--light-distance", "200", "--pixel-size", "2"],

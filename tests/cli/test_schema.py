@@ -1,7 +1,5 @@
 """The documents of infer, integrate and evaluate are those that docs/reports.schema.json describes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -60,9 +58,3 @@ def test_the_codes_of_warnings_are_those_of_the_source():
     codes = {value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)}
     described = SCHEMA["$defs"]["report"]["properties"]["warnings"]["items"]["properties"]["code"]["enum"]
     assert described == sorted(codes)
-
-
-@pytest.mark.parametrize("arguments", [["infer", "missing"], ["infer", "--strange"], ["integrate", "missing"]])
-def test_failures(run, arguments):
-    printed = json.loads(run(*arguments, "--json").out)
-    check(printed[0] if arguments[0] == "infer" else printed, "failure")

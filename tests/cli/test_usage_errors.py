@@ -1,7 +1,5 @@
 """Errors of the parser: each message names what was found, what was expected, and the help of the command."""
 
-from __future__ import annotations
-
 import pytest
 
 CASES = {

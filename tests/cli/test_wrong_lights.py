@@ -1,7 +1,5 @@
 """Wrong light files are told on the command line, with the option that mends them; --strict makes them errors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

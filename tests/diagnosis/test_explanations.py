@@ -1,7 +1,5 @@
 """Encoded values and near lamps, found in scenes of known curve and lamps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,13 +1,11 @@
 """Images against each other: the same one twice; lights that crowd."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from scenes import spiral_lights
+from scenes import halfway, spiral_lights
 from splinecli.diagnosis.checks import light_spread, repeated_images
 
 Array = NDArray[np.float64]
@@ -23,10 +21,8 @@ def images(shine: float = 0.2) -> Array:
     normals = np.stack((-z_x, -z_y, np.ones_like(x)), axis=2)
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     albedo = 0.6 + 1.7 * gaussian_filter(rng.normal(size=x.shape), 2)
-    half = LIGHTS + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
     cosine = np.clip(normals @ LIGHTS.T, 0, None)
-    shaded = albedo[..., None] * cosine + shine * np.clip(normals @ half.T, 0, None) ** 40
+    shaded = albedo[..., None] * cosine + shine * np.clip(normals @ halfway(LIGHTS).T, 0, None) ** 40
     return np.clip(shaded + rng.normal(0, 0.004, shaded.shape), 0.001, None)
 
 

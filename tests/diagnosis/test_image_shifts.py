@@ -1,11 +1,10 @@
 """Images that were moved by known amounts: each is found, and no other."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
 
+from scenes import ring_lights
 from splinecli.capture.sample import Sample
 from splinecli.diagnosis.image_shifts import ImageShift, find_shifts
 
@@ -19,9 +18,7 @@ def images(*, texture: float, seed: int = 0) -> np.ndarray:
     normals = np.stack((0.6 * x + 0.2 * np.sin(17 * y), 0.6 * y + 0.2 * np.cos(13 * x), np.ones_like(x)), axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     albedo = 0.6 + texture * rng.uniform(-1, 1, (SIDE, SIDE))
-    azimuth = 2 * np.pi * np.arange(N_LIGHTS) / N_LIGHTS
-    lights = np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(N_LIGHTS, 0.8)), axis=1)
-    shaded = albedo[..., None] * (normals @ lights.T).clip(0)
+    shaded = albedo[..., None] * (normals @ ring_lights(N_LIGHTS, np.degrees(np.arccos(0.8))).T).clip(0)
     return shaded * (1 + 0.01 * rng.normal(size=shaded.shape)) * rng.uniform(0.5, 2, N_LIGHTS)
 
 

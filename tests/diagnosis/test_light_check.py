@@ -1,7 +1,5 @@
 """Wrong light files are told from right ones, on surfaces whose normals are known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

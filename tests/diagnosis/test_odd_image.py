@@ -1,7 +1,5 @@
 """An image that contradicts the others is found, on rendered shapes of which one image was spoilt."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,9 +1,8 @@
 """Unequal light intensities that the images do not determine."""
 
-from __future__ import annotations
-
 import numpy as np
 
+from scenes import halfway, spiral_lights
 from splinecli.capture import Capture
 from splinecli.diagnosis.checks import check_arrays
 
@@ -11,14 +10,10 @@ from splinecli.diagnosis.checks import check_arrays
 def codes(intensities: np.ndarray) -> list[str]:
     """Return the warnings about a plane with faint bumps and broad gloss under 12 lights of these intensities."""
     rng = np.random.default_rng(0)
-    azimuth, zenith = np.arange(12) * 2.4, np.radians(np.linspace(15, 55, 12))
-    level = np.sin(zenith)
-    lights = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)), axis=1)
+    lights = spiral_lights(12, 55, 15)
     normals = np.concatenate((rng.normal(0, 0.3, (900, 2)), np.ones((900, 1))), axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    half = lights + np.array((0.0, 0.0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    shaded = (0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ half.T).clip(0) ** 12) * intensities
+    shaded = (0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ halfway(lights).T).clip(0) ** 12) * intensities
     values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)
     capture = Capture("glossy", values, lights, tuple(range(12)), np.ones((30, 30), np.bool_))
     return [warning.code for warning in check_arrays(capture, intensities_measured=False)]

@@ -1,7 +1,5 @@
 """An analytic capture: a convex Lambertian dome, every light seen from everywhere, so that least squares is exact."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,12 +1,10 @@
 """Plots decode, have the size their panels need, and carry each method's colour."""
 
-from __future__ import annotations
-
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import decode_rgb
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
 from splinecli.evaluation.outcome import Evaluation, Result
 from splinecli.evaluation.protocol import Protocol
@@ -29,11 +27,6 @@ def evaluation_of(
     )
 
 
-def decode(png: bytes) -> NDArray[np.uint8]:
-    """RGB (H, W, 3)."""
-    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
-
-
 def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
     rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return float((np.abs(picture.astype(int) - rgb).max(axis=2) <= 2).mean())
@@ -41,16 +34,10 @@ def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize(
     ("captures", "across", "down"),
-    [
-        (["ball"], 1, 1),
-        (["ball", "cat"], 3, 1),
-        (list("abc"), 2, 2),
-        (list("abcd"), 3, 2),
-        (list("abcde"), 1, 1),
-    ],
+    [(["ball"], 1, 1), (["ball", "cat"], 3, 1), (list("abc"), 2, 2), (list("abcd"), 3, 2), (list("abcde"), 1, 1)],
 )
 def test_a_panel_for_each_capture_and_the_average(captures: list[str], across: int, down: int) -> None:
-    picture = decode(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
+    picture = decode_rgb(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
     assert picture.shape == (540 * down + 80, 640 * across, 3)
     assert (picture[0] == 255).all()
 
@@ -62,7 +49,7 @@ def test_each_method_has_its_colour_in_both_plots() -> None:
         light_noise_curves([evaluation_of(["ball"], 10, noise) for noise in (0, 2, 4)]),
     ):
         for method in METHODS:
-            assert share_of(styles[method].colour, decode(png)) > 0.002  # a line 3 pixels thick
+            assert share_of(styles[method].colour, decode_rgb(png)) > 0.002  # a line 3 pixels thick
 
 
 def test_captures_that_not_all_have_are_left_out() -> None:
@@ -75,4 +62,4 @@ def test_odd_names_one_point_and_one_trial_are_drawn() -> None:
     odd = Evaluation(Protocol(10), (Result("_m$x$", "a$b_{c$ 猫", 10, (3.0,), 1.0),))
     # matplotlib takes what stands between dollars for a formula, and raises for this one.
     for draw in (lights_curves, light_noise_curves):
-        assert (decode(draw([odd])) < 128).any()
+        assert (decode_rgb(draw([odd])) < 128).any()

@@ -1,7 +1,5 @@
 """Noise of the light directions: its size, and that lights stay above the horizon."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

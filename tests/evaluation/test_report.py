@@ -1,7 +1,5 @@
 """The report is valid HTML, loads nothing, shows what it was given, and escapes names."""
 
-from __future__ import annotations
-
 import base64
 import re
 from dataclasses import replace
@@ -71,10 +69,7 @@ def test_several_evaluations_begin_with_their_averages() -> None:
     evaluations.append(evaluation_of(["ls", "iw12"], ["ball"], trials=1, n_lights=None))
     page = Page(html_report(evaluations, [], []))
     headings = page.text["h2"]
-    assert headings[-4:] == [
-        "Averages over the captures",
-        *(f"Results with {k} lights" for k in (4, 10, "all")),
-    ]
+    assert headings[-4:] == ["Averages over the captures", *(f"Results with {k} lights" for k in (4, 10, "all"))]
     assert "Notes" not in headings
     assert "Figures" not in headings
     assert "4 or 1" in page.text["dd"]  # trials

@@ -1,7 +1,5 @@
 """Whole evaluations: against analytic captures, hand-computed errors, and the published errors of DiLiGenT."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -143,11 +141,7 @@ def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) ->
 
 
 def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_path: Path) -> None:
-    good, untrue, few = (
-        write_dome("good"),
-        write_dome("untrue", ground_truth=False),
-        write_dome("few", n_lights=4),
-    )
+    good, untrue, few = (write_dome("good"), write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4))
     broken = write_dome("broken")
     (broken / "003.png").write_bytes(b"no image")
     folders = [untrue, good, broken, few, tmp_path / "missing"]
@@ -165,8 +159,7 @@ def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> No
     ls = make_estimator("ls")
     untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
     with pytest.raises(
-        InputError,
-        match=r"none of the 2 captures could be scored; the first: .*untrue: the capture has no gro",
+        InputError, match=r"none of the 2 captures could be scored; the first: .*untrue: the capture has no gro"
     ):
         evaluate([untrue, few], [ls], Protocol(n_lights=5))
     with pytest.raises(InputError, match="untrue: the capture has no ground truth"):

@@ -1,7 +1,5 @@
 """The pixels that are scored: those with ground truth, or a part of them, with their own observations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Paired tests against a textbook's example, SciPy's two-sample form and corrections done by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """The whole text of every document of an evaluation stands in tests/golden/."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -64,10 +62,7 @@ def test_rows_for_a_terminal() -> None:
 
 @pytest.mark.parametrize(
     ("name", "shown"),
-    [
-        ("a|b", r"a\|b"),
-        ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"),
-    ],
+    [("a|b", r"a\|b"), ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~")],
 )
 def test_names_are_text_in_markdown(name: str, shown: str) -> None:
     odd = replace(TEN, results=(replace(TEN.results[0], capture=name),))

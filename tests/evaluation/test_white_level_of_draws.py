@@ -1,7 +1,5 @@
 """The white level of each draw comes from its own images, as in `infer`, whatever other trials are read with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

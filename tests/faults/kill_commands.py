@@ -10,8 +10,6 @@ Then the same command runs again, and must end with the same files as an undistu
 sync every file before it renames it.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random
@@ -67,23 +65,13 @@ REPLACEMENTS = {
         "normals", f"{_INTEGRATE} --format ply,npy", f"{_INTEGRATE} --format obj,npy", report="surface.json"
     ),
     "evaluate": Replacement(
-        "earlier",
-        f"{_EVALUATE} --trials 1",
-        f"{_EVALUATE} --trials 2 --n-lights 5",
-        report="results.json",
+        "earlier", f"{_EVALUATE} --trials 1", f"{_EVALUATE} --trials 2 --n-lights 5", report="results.json"
     ),
     "prepare": Replacement(
-        "earlier",
-        "prepare capture -o out/set -q",
-        "prepare capture more -o out/set -q",
-        "out/set",
-        "manifest.json",
+        "earlier", "prepare capture -o out/set -q", "prepare capture more -o out/set -q", "out/set", "manifest.json"
     ),
     "info": Replacement(
-        "earlier",
-        "info capture --plot out/p.png -q",
-        "info more --plot out/p.png --overwrite -q",
-        report=None,
+        "earlier", "info capture --plot out/p.png -q", "info more --plot out/p.png --overwrite -q", report=None
     ),
     "train": Replacement("training", _TRAIN, f"{_TRAIN} --resume --steps 3", "out/run", None),
 }

@@ -3,8 +3,6 @@
 A kill does not lose what was written and not synced, so no kill finds a sync that is missing.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path

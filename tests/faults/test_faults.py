@@ -1,7 +1,5 @@
 """Commands under kills, on a tiny disk, under limits, and two at once."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -46,14 +44,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_kills_of_every_command() -> None:
-    script = [
-        sys.executable,
-        str(Path(__file__).with_name("kill_commands.py")),
-        "--steps",
-        "2",
-        "--kills",
-        "7",
-    ]
+    script = [sys.executable, str(Path(__file__).with_name("kill_commands.py")), "--steps", "2", "--kills", "7"]
     done = subprocess.run(script, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     for command in ("infer", "calibrate", "integrate", "evaluate", "prepare", "info", "train"):
@@ -198,10 +189,7 @@ def test_two_writers_of_one_folder(folder: Path) -> None:
             "splinecli: out/a: another splinecli process is writing into this folder."
             " Wait for it to end, or choose another -o.\n"
         )
-    assert set(content(folder / "out" / "a")) in (
-        {"normals.npy", "report.json"},
-        {"normals.tiff", "report.json"},
-    )
+    assert set(content(folder / "out" / "a")) in ({"normals.npy", "report.json"}, {"normals.tiff", "report.json"})
 
 
 def test_folders_and_files_without_permission(folder: Path) -> None:
@@ -211,10 +199,7 @@ def test_folders_and_files_without_permission(folder: Path) -> None:
     rights = "-dac_override,-dac_read_search"
     prefix = f"setpriv --bounding-set={rights} --inh-caps={rights} " if os.geteuid() == 0 else ""
     done = shell(f"{prefix}{COMMAND} infer a --method ls -o b -q", folder)
-    assert (done.returncode, done.stderr) == (
-        3,
-        "splinecli: a/2.png: the file cannot be read (Permission denied).\n",
-    )
+    assert (done.returncode, done.stderr) == (3, "splinecli: a/2.png: the file cannot be read (Permission denied).\n")
     assert not (folder / "b").exists()
     for command in ("infer a --method ls", "integrate out/a", "calibrate a --circle 30,30,20"):
         done = shell(f"{prefix}{COMMAND} {command} -o closed -q", folder)

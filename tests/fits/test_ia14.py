@@ -1,7 +1,5 @@
 """IA14 and its batched solver, against a library for quadratic programmes, SciPy, and scenes with such an inverse."""
 
-from __future__ import annotations
-
 from math import comb
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The robust Lambertian fit, on pixels made by the Lambertian law."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """ST14, on scenes that obey its model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

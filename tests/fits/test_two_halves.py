@@ -1,7 +1,5 @@
 """What two halves of the lights disagree about: random errors, and nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

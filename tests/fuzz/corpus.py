@@ -1,7 +1,5 @@
 """Small whole inputs of every kind that splinecli reads, and the commands that read them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -173,10 +171,7 @@ def thin(folder: Path) -> None:
 
 def meshes(folder: Path) -> None:
     """A tetrahedron in every format."""
-    corners, faces = (
-        ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
-        ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)),
-    )
+    corners, faces = (((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)))
     shape = trimesh.Trimesh(corners, faces)
     for ending in ("ply", "obj", "stl", "stl_ascii", "off"):
         shape.export(folder / f"m.{ending}", file_type=ending)
@@ -250,10 +245,7 @@ TARGETS = (
         "tiff",
         tiff_capture,
         ("*",),
-        (
-            "infer . --method ls -o out --overwrite",
-            "evaluate . --method ls --draws draws.txt -o out --overwrite",
-        ),
+        ("infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite"),
     ),
     Target(
         "lights",
@@ -278,12 +270,7 @@ TARGETS = (
             for name in ("n.png", "n.tif", "n.npy", "n.mat", "packed.mat")
         ),
     ),
-    Target(
-        "thin",
-        thin,
-        ("*/*",),
-        tuple(f"infer {name} --method ls -o out --overwrite" for name in ("column", "row")),
-    ),
+    Target("thin", thin, ("*/*",), tuple(f"infer {name} --method ls -o out --overwrite" for name in ("column", "row"))),
     Target(
         "meshes",
         meshes,
@@ -336,10 +323,7 @@ TARGETS = (
             "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite",
             "prepare capture -o out/set",
         ),
-        earlier=(
-            "evaluate capture --method ls --n-lights 4 --trials 1 -o out",
-            "infer capture --method ls -o out",
-        ),
+        earlier=("evaluate capture --method ls --n-lights 4 --trials 1 -o out", "infer capture --method ls -o out"),
     ),
     Target(
         "weights",

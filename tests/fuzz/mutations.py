@@ -1,7 +1,5 @@
 """Seeded mutations of files: of bytes, of texts and their numbers, of JSON values, of headers, of what a path is."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -175,11 +173,7 @@ def _bomb(suffix: str) -> bytes:
         return packed.getvalue()
     rows = zlib.compress(bytes(8000 * 8001), 1)
     if suffix == ".png":
-        parts = (
-            (b"IHDR", struct.pack(">IIBBBBB", 8000, 8000, 8, 0, 0, 0, 0)),
-            (b"IDAT", rows),
-            (b"IEND", b""),
-        )
+        parts = ((b"IHDR", struct.pack(">IIBBBBB", 8000, 8000, 8, 0, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b""))
         chunks = (kind + content for kind, content in parts)
         return b"\x89PNG\r\n\x1a\n" + b"".join(
             struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
@@ -239,15 +233,7 @@ def npy_header(data: bytes, rng: random.Random) -> bytes:
     header = data[10:end].decode("latin-1")
     if rng.random() < 0.5:
         shape = rng.choice(
-            (
-                "(100000, 100000, 3)",
-                "(-1, 3)",
-                "()",
-                "(0, 0, 3)",
-                "(3,)",
-                "(2, 2, 3, 1)",
-                "(1" + "," * 99 + ")",
-            )
+            ("(100000, 100000, 3)", "(-1, 3)", "()", "(0, 0, 3)", "(3,)", "(2, 2, 3, 1)", "(1" + "," * 99 + ")")
         )
         header = re.sub(r"'shape': \([^)]*\)", f"'shape': {shape}", header)
     else:

@@ -12,8 +12,6 @@ The cases run one after another in a process that has imported everything, so ea
 process or hangs, it fails, and another process takes the next.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json
@@ -237,12 +235,7 @@ def rename_one(folder: Path, files: list[Path], command: str, rng: random.Random
 
 
 def run_cases(
-    cases: int,
-    *,
-    first: int = 0,
-    minutes: float = 60.0,
-    names: tuple[str, ...] = (),
-    keep: Path | None = None,
+    cases: int, *, first: int = 0, minutes: float = 60.0, names: tuple[str, ...] = (), keep: Path | None = None
 ) -> tuple[int, Counter[str], list[str]]:
     """Run cases, and return their number, the counts of exit codes and kinds, and what failed."""
     prepare_process()
@@ -285,11 +278,7 @@ def main() -> int:
     options = parser.parse_args()
     started = time.monotonic()
     done, codes, failed = run_cases(
-        options.cases,
-        first=options.first,
-        minutes=options.minutes,
-        names=tuple(options.target),
-        keep=options.keep,
+        options.cases, first=options.first, minutes=options.minutes, names=tuple(options.target), keep=options.keep
     )
     counts = ", ".join(f"{count} x {key}" for key, count in sorted(codes.items()))
     print(f"{done} cases in {time.monotonic() - started:.0f} s, {len(failed)} failed: {counts}")

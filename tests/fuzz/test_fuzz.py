@@ -1,7 +1,5 @@
 """150 cases of the fuzzer; `python tests/fuzz/run.py` runs as many as asked for."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

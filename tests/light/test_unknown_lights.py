@@ -1,7 +1,5 @@
 """Lights that are found from the images: analytic spheres, whose lights are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The confidence falls where a capture as a whole contradicts its lights or its values."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Distilled estimators, taught by estimators whose answers and mistakes are known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -4,8 +4,6 @@ Two parts of a sphere's inside exchange the same share of light wherever they ar
 places receive the same indirect light, sum(B dA) / (4 pi R^2), where B is what the places send.
 """
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from unittest.mock import patch

@@ -1,7 +1,5 @@
 """Least squares, on scenes where it is exact."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

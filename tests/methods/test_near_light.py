@@ -1,7 +1,5 @@
 """Near lamps: analytic surfaces under points of light, by Lambert's law and the inverse square of the distance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

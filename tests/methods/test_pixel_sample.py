@@ -1,7 +1,5 @@
 """Samples that are spread over the appearance of pixels."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

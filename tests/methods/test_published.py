@@ -1,7 +1,5 @@
 """The compared methods on two objects of DiLiGenT: our own errors, and those of their papers and of the benchmark."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

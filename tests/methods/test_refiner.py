@@ -1,7 +1,5 @@
 """Refinement of a whole capture: tiles, masks, dark pixels, and the scores of single pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -54,20 +52,17 @@ def refine(
     refined = normals.copy()
     done: list[int] = []
     NetworkRefiner(net, "float32", tile=tile, margin=REACH).refine(
-        mask,
-        observations,
-        lambda rows: LampLight(observations[rows], LIGHTS),
-        refined,
-        errors,
-        progress=done.append,
+        mask, observations, lambda rows: LampLight(observations[rows], LIGHTS), refined, errors, progress=done.append
     )
     assert sum(done) == count
     return normals, refined, errors
 
 
-def test_tiles_change_nothing() -> None:
-    mask = np.random.default_rng(0).random((2 * REACH + 70, 2 * REACH + 50)) < 0.95
-    mask[30:60, 40:90] = False
+@pytest.mark.parametrize("shape", [(2 * REACH + 70, 40), (40, 2 * REACH + 70)])
+def test_tiles_change_nothing(shape: tuple[int, int]) -> None:
+    """Three tiles in a row or in a column. Seams of tiles on all sides: test_shipped_refinement.py."""
+    mask = np.random.default_rng(0).random(shape) < 0.95
+    mask[30:60, 10:30] = False
     _, normals, errors = refine(mask, 512)
     _, tiled, tiled_errors = refine(mask, REACH)
     np.testing.assert_allclose(tiled, normals, atol=1e-4)

@@ -1,12 +1,12 @@
 """The shipped refinement net invents nothing: analytic scenes whose normals are known everywhere."""
 
-from __future__ import annotations
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import directions_at
+from scenes import directions_at, halfway
 from splinecli.capture import Capture
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.light.lamp_light import LampLight
@@ -15,7 +15,7 @@ from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.refinement.tiles import MARGIN, NetworkRefiner
 
-SIZE = 64
+SIZE = 48
 AZIMUTH = np.arange(10) * np.radians(36)
 ZENITH = np.radians(np.where(np.arange(10) % 2, 25, 50))
 LIGHTS = directions_at(AZIMUTH, ZENITH)
@@ -37,31 +37,18 @@ def scene(
     """
     rng = np.random.default_rng(0)
     flat = normals.reshape(-1, 3)
-    half = unit(LIGHTS + np.array((0, 0, 1)))
     observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (flat @ LIGHTS.T).clip(0)
-    observations = unmeasured * (observations + gloss * (flat @ half.T).clip(0) ** 60)
+    observations = unmeasured * (observations + gloss * (flat @ halfway(LIGHTS).T).clip(0) ** 60)
     observations += noise * observations.max() * rng.normal(size=observations.shape)
     mask = np.ones(normals.shape[:2], np.bool_)
     return Capture(
-        "scene",
-        observations.clip(0).astype(np.float32),
-        LIGHTS,
-        tuple(range(10)),
-        mask,
-        normals.astype(np.float32),
+        "scene", observations.clip(0).astype(np.float32), LIGHTS, tuple(range(10)), mask, normals.astype(np.float32)
     )
 
 
-def refined_and_not(
-    normals: NDArray[np.floating],
-    albedo: NDArray[np.floating] | float,
-    *,
-    noise: float,
-    gloss: float = 0.0,
-    unmeasured: NDArray[np.floating] | float = 1.0,
-) -> tuple[NormalEstimate, NormalEstimate]:
+def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, NormalEstimate]:
     """Estimate a scene with and without refinement; see `scene`."""
-    capture = scene(normals, albedo, noise=noise, gloss=gloss, unmeasured=unmeasured)
+    capture = scene(*surface, **faults)
     refined, pixelwise = (
         estimate_normals(capture, make_estimator(name)) for name in ("spline-net", "spline-net-pixelwise")
     )
@@ -126,7 +113,7 @@ def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -
 @pytest.mark.parametrize("behind", [0.002, 0.3])
 def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
     """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the sphere."""
-    x, y = (COLUMNS - SIZE / 2 + 0.5) / 24, (SIZE / 2 - 0.5 - ROWS) / 24
+    x, y = (COLUMNS - SIZE / 2 + 0.5) / 18, (SIZE / 2 - 0.5 - ROWS) / 18
     height = np.sqrt((1 - x**2 - y**2).clip(0))
     sphere = height > 0.2
     normals = np.where(sphere[..., None], np.stack((x, y, height), axis=-1), PLATE)

@@ -1,7 +1,5 @@
 """The weights that come in the package: their size, their checksum, and a small stored prediction."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from scenes import shade
 from splinecli.capture import read_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.maths.normals import angle_between_deg, unit
@@ -30,10 +29,7 @@ def glossy_pixels(n_lights: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     step = (np.arange(n_lights) + 0.5) / n_lights
     azimuth, radius = 2.4 * np.arange(n_lights), 0.8 * np.sqrt(step)
     lights = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1)
-    half = unit(lights + np.array((0.0, 0.0, 1.0)))
-    shading = np.clip(normals @ lights.T, 0, None)
-    lobe = np.clip(normals @ half.T, 0, None) ** 60 * (shading > 0)
-    return normals, lights, (0.6 * shading + 0.5 * lobe).astype(np.float32)
+    return normals, lights, (0.6 * shade(normals, lights, gloss=5 / 6, exponent=60)).astype(np.float32)
 
 
 @pytest.mark.parametrize("name", sorted(manifest()))

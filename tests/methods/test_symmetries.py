@@ -1,7 +1,5 @@
 """What must not change a method's answer: the order of the lights, the scale of the images, the size of batches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

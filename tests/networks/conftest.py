@@ -1,7 +1,5 @@
 """Networks small enough for tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

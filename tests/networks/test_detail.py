@@ -1,7 +1,5 @@
 """Detail that is restored after the refinement net: only where it is real."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

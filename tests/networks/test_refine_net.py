@@ -1,7 +1,5 @@
 """The refinement net and its features: symmetries, the mask, and how far it sees."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor
@@ -93,19 +91,19 @@ def test_outside_of_the_mask_is_outside_of_the_image() -> None:
         torch.testing.assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
 
 
-def test_nothing_beyond_the_reach_counts() -> None:
+@pytest.mark.parametrize("turned", [False, True])
+def test_nothing_beyond_the_reach_counts(turned: bool) -> None:
+    """Along a strip that is as wide as two of the coarsest cells."""
     size = 2 * REACH + COARSEST
-    features, mask = random_maps(size, size)
+    features, mask = random_maps(*((2 * COARSEST, size) if turned else (size, 2 * COARSEST)))
     net = random_net().double()
     before = net(features.double(), mask.double())
     for place in (0, size - 1):
         changed = features.clone().double()
-        changed[..., place, :] += 1
-        changed[..., place] += 1
+        changed.select(-1 if turned else -2, place).add_(1)
         after = net(changed, mask.double())
-        distance = torch.arange(size).sub(place).abs()
-        far = torch.minimum(distance[:, None], distance[None]) >= REACH
+        far = torch.arange(size).sub(place).abs() >= REACH
         for one, other in zip(before, after, strict=True):
-            difference = (one - other).abs().amax(dim=(0, 1))
+            difference = (one - other).abs().amax(dim=(0, 1, 2 if turned else 3))
             assert difference[far].max() == 0
             assert difference.max() > 0

@@ -1,7 +1,5 @@
 """The whole network between observations and normals: shapes, limits, symmetries, and the error that it tells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -53,9 +51,7 @@ def test_dense_map_ends_with_the_unit_disc(
     assert (dense[:, 0, inside] != 0).float().mean() > 0.9
 
 
-def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
-    pixels: tuple[Tensor, Tensor],
-) -> None:
+def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels: tuple[Tensor, Tensor]) -> None:
     observations, lights = pixels
     network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)).double()
     expected = torch.nn.functional.normalize(fit_lambertian(observations / map_scale(observations), lights), dim=1)
@@ -81,10 +77,7 @@ def test_compact_estimates_turn_with_the_lights(
     observations, lights = pixels
     network = random_network(**settings).double()
     with torch.no_grad():
-        here, there = (
-            network(observations, lights).normals,
-            network(observations, turn(lights, degrees)).normals,
-        )
+        here, there = (network(observations, lights).normals, network(observations, turn(lights, degrees)).normals)
     torch.testing.assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
     # The correction is not nothing: without it the fit alone would pass.
     fit = fit_lambertian(observations / map_scale(observations), lights)

@@ -1,7 +1,5 @@
 """The normals that NE-Net starts from, and what it makes of them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

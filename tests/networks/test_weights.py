@@ -1,7 +1,5 @@
 """Weight files are read as they were written, and other files are refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import pickle
@@ -56,10 +54,7 @@ def test_round_trip(random_network: Make, tmp_path: Path, settings: dict[str, ob
     observations = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         torch.testing.assert_close(
-            loaded.network(observations, lights).normals,
-            network(observations, lights).normals,
-            atol=5e-3,
-            rtol=0,
+            loaded.network(observations, lights).normals, network(observations, lights).normals, atol=5e-3, rtol=0
         )
 
 

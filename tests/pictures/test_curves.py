@@ -1,13 +1,11 @@
 """Plots: every method is drawn, curves leave out what was not computed, and anything may be a title."""
 
-from __future__ import annotations
-
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
+from scenes import decode_rgb
 from splinecli.pictures.curves import Panel, Point, error_curves
 from splinecli.pictures.light_sky import sky_plot
 from splinecli.pictures.plotting import method_styles
@@ -17,15 +15,11 @@ POINTS = (Point(4, 6.0, 0.5), Point(10, 4.0, 0.2), Point(96, 3.0, 0.0))
 TICKS = {4: "4", 10: "10", 96: "96\n(all)"}
 
 
-def colours_of(png: bytes) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
-
-
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_every_method_has_its_colour(logarithmic: bool) -> None:
     higher = [point._replace(mae_deg=point.mae_deg + 2) for point in POINTS]
     panel = Panel("ball", TICKS, {("ls", ""): POINTS, ("spline-net", ""): higher})
-    picture = colours_of(error_curves([panel], label="number of lights", logarithmic=logarithmic))
+    picture = decode_rgb(error_curves([panel], label="number of lights", logarithmic=logarithmic)).astype(int)
     for style in method_styles(["ls", "spline-net"]).values():
         rgb = [int(style.colour[i : i + 2], 16) for i in (1, 3, 5)]
         assert (np.abs(picture - rgb).max(axis=2) <= 2).mean() > 0.001
@@ -52,10 +46,7 @@ def test_each_curve_leaves_out_what_was_not_computed() -> None:
     steps = [50, 100, 125]
     assert lines(loss) == {"weighted sum": [steps, [2.0, 1.0, 0.5]], "Ls, unweighted": [[100], [0.5]]}
     assert lines(angle) == {"training": [steps, [20, 10, 8]], "validation": [[100, 125], [12.5, 9]]}
-    assert lines(maps) == {
-        "all cells": [steps, [0.2, 0.1, 0.08]],
-        "cells with a light": [steps, [0.1, 0.05, 0.04]],
-    }
+    assert lines(maps) == {"all cells": [steps, [0.2, 0.1, 0.08]], "cells with a light": [steps, [0.1, 0.05, 0.04]]}
     assert {axes.get_xlabel() for axes in (loss, angle, maps)} == {"step"}
     assert loss.get_title() == "loss"
     assert loss.get_yscale() == "linear"

@@ -1,7 +1,5 @@
 """Known values and errors have known colours; maps of every size are legible; PNG files keep every value."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

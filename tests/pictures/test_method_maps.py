@@ -1,20 +1,14 @@
 """Known normals and errors have known colours at known places, in every size of picture."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import decode_rgb
 from splinecli.maths.normals import unit
 from splinecli.pictures.error_map import TOP_DEG, colour_errors
 from splinecli.pictures.method_maps import method_maps
-
-
-def decode(png: bytes) -> NDArray[np.uint8]:
-    """RGB (H, W, 3)."""
-    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
 
 
 def draw(
@@ -28,7 +22,7 @@ def draw(
     estimate = np.full_like(truth, np.nan)
     estimate[mask] = unit(np.array([1.0, 0.0, 1.0]))
     errors = np.where(mask, np.float32(error_deg), np.float32(np.nan))
-    return decode(
+    return decode_rgb(
         method_maps(truth, mask, dict.fromkeys(methods, estimate), dict.fromkeys(methods, errors), title=title)
     )
 
@@ -70,7 +64,7 @@ def test_the_frame_is_not_turned() -> None:
     truth[:50], truth[50:] = (0, 0, 1), unit(np.array([1.0, 0.0, 1.0]))
     errors = np.zeros((100, 100))
     errors[:, 50:] = 30
-    picture = decode(method_maps(truth, mask, {"a": truth}, {"a": errors}, title="t"))
+    picture = decode_rgb(method_maps(truth, mask, {"a": truth}, {"a": errors}, title="t"))
     assert [p[0] for p in places_of(BLUE, picture)] < [p[0] for p in places_of(TILTED, picture)]
     right = [place for place in places_of(error_colour(30), picture) if place[2] > 90]
     left = [place for place in places_of(error_colour(0), picture) if place[2] > 90]

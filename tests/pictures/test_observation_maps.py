@@ -1,18 +1,20 @@
 """A cell has its colour at its place in the figure; empty cells are gray."""
 
-from __future__ import annotations
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import decode_rgb
 from splinecli.pictures.observation_maps import observation_map_figure
 
 SIZE = 8
 YELLOW, VIOLET, GRAY = (253, 231, 36), (68, 1, 84), (217, 217, 217)  # viridis' ends; 0.85 of 255
 
 
+@cache
 def draw(
     n_pixels: int, *, with_truth: bool = True, with_dense: bool = True, named: bool = True, grid: str = "even"
 ) -> NDArray[np.uint8]:
@@ -28,7 +30,7 @@ def draw(
         title="$cat$, 10 lights" if named else "",
         grid=grid,  # type: ignore[arg-type]
     )
-    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
+    return decode_rgb(png)
 
 
 def boxes(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> list[NDArray[np.int32]]:

@@ -1,7 +1,5 @@
 """Shards of a batch."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

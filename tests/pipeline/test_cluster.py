@@ -1,7 +1,5 @@
 """Items on workers of a Dask cluster: lost workers, memory, workers that do not fit, and many captures."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket
@@ -279,11 +277,7 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
 
 
 def test_errors_travel(client):
-    for error in (
-        InputError("wrong", path="a", line=3, hint="Do it"),
-        OutputError("full"),
-        SplinecliError("x"),
-    ):
+    for error in (InputError("wrong", path="a", line=3, hint="Do it"), OutputError("full"), SplinecliError("x")):
         found = client.submit(lambda error: error, error, pure=False).result()
         assert (type(found), str(found), vars(found)) == (type(error), str(error), vars(error))
 

@@ -1,7 +1,5 @@
 """When a network is distilled, and what becomes of a capture that cannot be learned."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The options of `info`, and the lines of its report."""
 
-from __future__ import annotations
-
 from splinecli.pipeline.capture_memory import REFINED_PIXELS
 from splinecli.pipeline.info import ORIGINS
 

@@ -1,7 +1,5 @@
 """The options of `integrate`, and the command without a terminal."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

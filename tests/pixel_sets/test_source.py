@@ -1,7 +1,5 @@
 """Batches from a pixel set contain the stored pixels, under drawn lights, and dense maps fill only gaps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from distributions import generator as seeded
 from splinecli.maths.observation_map import cell_directions
 from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
 from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
@@ -20,10 +19,6 @@ FAULTLESS = CaptureConfig(
     light_intensity_error_share=0.0, saturated_share=0.0, sensor_noise=False, eight_bit_share=0.0,
 )  # fmt: skip
 MakeSet = Callable[..., PixelSet]
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def source_of(pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0) -> PixelSetSource:
@@ -46,9 +41,7 @@ def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtyp
         valid = batch.valid[pixel].numpy()
         used = set()
         for direction, observed in zip(
-            batch.light_directions[pixel].numpy()[valid],
-            batch.observations[pixel].numpy()[valid],
-            strict=True,
+            batch.light_directions[pixel].numpy()[valid], batch.observations[pixel].numpy()[valid], strict=True
         ):
             distance = np.abs(stored[name].light_directions - direction).max(axis=1)
             light = int(distance.argmin())

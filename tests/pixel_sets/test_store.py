@@ -1,7 +1,5 @@
 """Pixel sets are read as they were written, and damaged ones are refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import warnings
@@ -247,11 +245,7 @@ def test_a_damaged_array_is_named(make_set: MakeSet, array: str, damage: str) ->
 def test_an_overview_of_values_that_are_no_numbers(make_set: MakeSet) -> None:
     pixel_set = make_set()
     for value in (np.nan, np.inf, -1e38):
-        for array, shape in {
-            "observations": (40, 30),
-            "normals": (40, 3),
-            "light_directions": (30, 3),
-        }.items():
+        for array, shape in {"observations": (40, 30), "normals": (40, 3), "light_directions": (30, 3)}.items():
             np.save(pixel_set.folder / "a" / f"{array}.npy", np.full(shape, value, np.float32))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -261,11 +255,7 @@ def test_an_overview_of_values_that_are_no_numbers(make_set: MakeSet) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        (
-            "n_pixels",
-            41,
-            r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)",
-        ),
+        ("n_pixels", 41, r"observations\.npy: does not match the manifest: found an array of shape \(40, 30\)"),
         ("n_lights", 29, r"observations\.npy: .* expected \(40, 29\)"),
         ("name", 2.5, r"manifest\.json: the name, scene or source of an entry is no text"),
         ("name", "../b", r"manifest\.json: '\.\./b' is not the name of a folder"),
@@ -295,10 +285,7 @@ def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message:
         ("[]", "not the manifest of a pixel set: found format None, expected 'splinecli-pixel-set-1'"),
         ('{"format": "splinecli-pixel-set-2"}', "found format 'splinecli-pixel-set-2', expected"),
         (f'{{"format": "{FORMAT}", "complete": true}}', r"an entry is incomplete \('entries'\)"),
-        (
-            f'{{"format": "{FORMAT}", "complete": true, "entries": [{{"name": "a"}}]}}',
-            "an entry is incomplete",
-        ),
+        (f'{{"format": "{FORMAT}", "complete": true, "entries": [{{"name": "a"}}]}}', "an entry is incomplete"),
         (f'{{"format": "{FORMAT}", "complete": true, "entries": [5]}}', "an entry is incomplete"),
     ],
 )

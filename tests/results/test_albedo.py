@@ -1,7 +1,5 @@
 """Albedo maps of a coloured sphere with highlights and cast shadows, compared with its known albedo."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The page loads nothing, escapes names, stores the normals exactly, and lights them by Lambert's law."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Sequence
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from browser import OpenPage
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
+from scenes import decode_rgb
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.pictures.maps import albedo_picture
@@ -178,8 +177,7 @@ def views(open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bo
         if fragment != fragments[0]:
             page.evaluate(CHANGE, fragment)
         png = page.screenshot(clip={"x": edge, "y": edge, "width": SIDE, "height": SIDE})
-        picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-        seen.append(np.asarray(picture[..., ::-1], np.int64))
+        seen.append(decode_rgb(png).astype(np.int64))
     return seen
 
 

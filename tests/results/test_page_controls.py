@@ -1,7 +1,5 @@
 """A page under the user's hands: mouse, keys, fingers and the ruler, in a browser."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pages share one head, one set of colours and one list of terms, and open without errors in a browser."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 from unittest import mock
@@ -22,10 +20,7 @@ RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)
 
 def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):
     """It contains them, also after the results have moved, and leaves out what cannot be read."""
-    for name, content in (
-        ("a & b", cv2.imencode(".png", np.tile(RED, (100, 100, 1)))[1]),
-        ("cut", b"\x89PNG"),
-    ):
+    for name, content in (("a & b", cv2.imencode(".png", np.tile(RED, (100, 100, 1)))[1]), ("cut", b"\x89PNG")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "normals.png").write_bytes(bytes(content))
     report = {

@@ -1,7 +1,5 @@
 """Blocks of pixels: their number, and values at pixels between them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Decimated meshes in GLB: relit from the file as viewers do, they have the measured normals."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Integration of normals, against analytic surfaces and a dense solver."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -328,11 +326,7 @@ def test_coarse_to_fine_tears_at_the_same_places(monkeypatch: pytest.MonkeyPatch
 def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) -> None:
     normals, mask = bumps(12, 17), holes(12, 17)
     middle = 0.0 if camera is None else 1.0
-    for some in (
-        normals,
-        np.broadcast_to((1.0, 0, 0), normals.shape),
-        np.broadcast_to((0, 0.6, -0.8), normals.shape),
-    ):
+    for some in (normals, np.broadcast_to((1.0, 0, 0), normals.shape), np.broadcast_to((0, 0.6, -0.8), normals.shape)):
         found = integrate_normals(some, mask, camera_matrix=camera)
         assert np.isfinite(found[mask]).all()
         assert found[3, 4] == pytest.approx(middle, abs=1e-9)
@@ -395,12 +389,7 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
         ((NORMALS, MASK.T), {}, UsageError, "(3, 4, 3), expected (4, 3, 3) for this mask"),
         ((NORMALS, MASK.astype(np.uint8)), {}, UsageError, "the mask is uint8 (3, 4), expected bool (H, W)"),
         ((NORMALS, ~MASK), {}, InputError, "the mask is empty"),
-        (
-            (ZERO_AT_1_2, MASK),
-            {},
-            InputError,
-            "1 of 12 normals in the mask are not unit vectors, the first in row 1",
-        ),
+        ((ZERO_AT_1_2, MASK), {}, InputError, "1 of 12 normals in the mask are not unit vectors, the first in row 1"),
         ((NORMALS * np.nan, MASK), {}, InputError, "12 of 12 normals in the mask are not unit vectors"),
         ((NORMALS, MASK, np.eye(4)), {}, UsageError, "the camera matrix has shape (4, 4), expected (3, 3)"),
         ((NORMALS, MASK, np.diag([9.0, 0, 1])), {}, InputError, "is not a camera matrix"),

@@ -1,7 +1,5 @@
 """Meshes of height maps."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -43,10 +41,7 @@ def test_four_pixels() -> None:
     mesh = surface_mesh(depth, np.ones((2, 2), bool))
     np.testing.assert_array_equal(mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]])
     # The edge between pixels 0 and 3, which are nearly as high.
-    assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {
-        frozenset({0, 2, 3}),
-        frozenset({0, 3, 1}),
-    }
+    assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {frozenset({0, 2, 3}), frozenset({0, 3, 1})}
     assert (mesh.vertices.dtype, mesh.triangles.dtype, mesh.colours) == (np.float32, np.int32, None)
 
 
@@ -127,12 +122,7 @@ def test_normals_of_the_triangles() -> None:
         ((DEPTH, ~ALL), {}, InputError, "the mask is empty"),
         ((DEPTH * np.nan, ALL), {}, InputError, "a depth in the mask is not finite"),
         ((DEPTH - 9, ALL, CAMERA), {}, InputError, "a depth in the mask is not positive"),
-        (
-            (DEPTH, ALL, None, np.zeros((3, 4, 3))),
-            {},
-            UsageError,
-            "the colours are float64 (3, 4, 3), expected uint8",
-        ),
+        ((DEPTH, ALL, None, np.zeros((3, 4, 3))), {}, UsageError, "the colours are float64 (3, 4, 3), expected uint8"),
         ((DEPTH, ALL), {"largest_step": -1}, UsageError, "the largest step is -1, expected"),
         ((DEPTH + 9, ALL, np.eye(2)), {}, UsageError, "the camera matrix has shape (2, 2), expected (3, 3)"),
     ],

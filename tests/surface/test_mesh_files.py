@@ -1,7 +1,5 @@
 """Files of meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Backgrounds: the object stays as it is, its shadow falls away from the light, and masks show more than the object."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Each effect against the distribution that its docstring states. Seeds are fixed: nothing here is left to chance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 
@@ -89,16 +87,12 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
 
 
 def test_a_known_wall_hides_the_lights_behind_it() -> None:
-    wall = draw_wall(draw_visible_normals(1, generator()), 1.0, generator())
-    wall = type(wall)(
+    wall = replace(
+        draw_wall(draw_visible_normals(1, generator()), 1.0, generator()),
         azimuth=torch.tensor([[0.0, 1.0, 0.0]]),
         tan_height=torch.tensor([[1.0]]),
         tan_half_width=torch.tensor([[math.tan(math.radians(30))]]),
         softness=torch.tensor([[0.01]]),
-        facing=wall.facing,
-        reflectance=wall.reflectance,
-        towards=wall.towards,
-        has_pixel_material=wall.has_pixel_material,
     )
 
     def towards(azimuth_deg: float, elevation_deg: float) -> list[float]:

@@ -1,7 +1,5 @@
 """Engraved pieces: unit normals towards the camera, attached shadows, and detail of a few pixels."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

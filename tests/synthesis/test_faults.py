@@ -1,7 +1,5 @@
 """The faults of a capture, each against the distribution that it states."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

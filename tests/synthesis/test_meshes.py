@@ -1,7 +1,5 @@
 """Meshes as files give them, and as rendering needs them."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Any

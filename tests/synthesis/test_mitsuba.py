@@ -4,8 +4,6 @@ The full comparison is benchmarks/render_accuracy.py; here a small image under t
 wrong lobe, factor, frame or bounce.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 from pathlib import Path
@@ -109,12 +107,7 @@ def test_normals_and_frame_agree(scene: Scene, rendered: dict[int, RenderedScene
 @pytest.mark.parametrize("bounces", [0, 4])
 @pytest.mark.parametrize(("name", "most_off"), [("diffuse", 0.04), ("specular", 0.04), ("metallic", 0.06)])
 def test_images_agree(
-    scene: Scene,
-    rendered: dict[int, RenderedScene],
-    benchmark: ModuleType,
-    name: str,
-    bounces: int,
-    most_off: float,
+    scene: Scene, rendered: dict[int, RenderedScene], benchmark: ModuleType, name: str, bounces: int, most_off: float
 ) -> None:
     ours = rendered[bounces]
     shapes = benchmark.mitsuba_shapes(scene, name)

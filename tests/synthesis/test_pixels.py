@@ -1,7 +1,5 @@
 """The pixel generator: scenes that turn as a whole, and batches that a capture could hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,6 +1,6 @@
 """The principled BRDF against its equations, written out a second time in numpy with explicit vectors."""
 
-from __future__ import annotations
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -11,21 +11,7 @@ from scipy import integrate
 from splinecli.synthesis.principled import PrincipledMaterial, draw_material
 
 Vectors = NDArray[np.float64]
-NAMES = (
-    "base",
-    "metallic",
-    "specular",
-    "roughness",
-    "sheen",
-    "clearcoat",
-    "clearcoat_gloss",
-    "interface_loss",
-    "minnaert",
-    "tail_exponent",
-    "second_share",
-    "second_roughness",
-    "retro",
-)
+NAMES = tuple(field.name for field in fields(PrincipledMaterial))
 
 
 def material(**values: float) -> PrincipledMaterial:
@@ -56,11 +42,7 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
     def facets(nh: float, nl: float, nv: float, roughness: float, gamma: float) -> float:
         alpha = max(roughness, 0.1) ** 2
         area, _ = integrate.quad(
-            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
-            0,
-            1,
-            points=[1 - alpha**2],
-            epsrel=1e-9,
+            lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma, 0, 1, points=[1 - alpha**2], epsrel=1e-9
         )
         ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
         return float(ndf * g1(nl, alpha) * g1(nv, alpha))

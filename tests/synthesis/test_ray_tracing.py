@@ -1,7 +1,5 @@
 """Rays against surfaces whose intersections are known."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenes: reproducible one by one, and drawn from the stated ranges."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np
@@ -13,14 +11,7 @@ pytest.importorskip("embreex", reason="needs the extra 'render'")
 from splinecli.errors import UsageError
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import CLASSES, draw_class
-from splinecli.synthesis.scenes import (
-    MIN_LIGHT_Z,
-    SceneConfig,
-    draw_lights,
-    draw_patches,
-    draw_scene,
-    render_scene,
-)
+from splinecli.synthesis.scenes import MIN_LIGHT_Z, SceneConfig, draw_lights, draw_patches, draw_scene, render_scene
 
 SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
 

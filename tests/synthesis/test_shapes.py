@@ -1,24 +1,18 @@
 """Procedural shapes: sound surfaces, true normals, hollows, and fields against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from splinecli.synthesis import fields
-from splinecli.synthesis.meshes import REACH, Floats, Mesh
+from splinecli.synthesis.meshes import REACH, Floats
 from splinecli.synthesis.shapes import KINDS, draw_shape, draw_shape_of_kind
+from synthesis.test_meshes import outward_volume
 
 pytest.importorskip("skimage", reason="needs the extra 'render'")
 
 
 def points(count: int = 2000, seed: int = 0) -> Floats:
     return np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
-
-
-def volume(mesh: Mesh) -> float:
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
-    return float((a * np.cross(b, c)).sum() / 6)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +58,7 @@ def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
     expected = (mesh.vertices - centre) / 0.25
     assert (expected * mesh.vertex_normals).sum(axis=1).min() > 0.9999
     # Anticlockwise from outside, closed, and of the volume 2 pi^2 R r^2.
-    assert volume(mesh) == pytest.approx(2 * np.pi**2 * 0.6 * 0.25**2, rel=0.01)
+    assert outward_volume(mesh) == pytest.approx(2 * np.pi**2 * 0.6 * 0.25**2, rel=0.01)
 
 
 def test_crumbs_and_the_empty_field_are_dropped() -> None:
@@ -90,7 +84,7 @@ def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pyte
     dense = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
     assert sparse is not None and dense is not None
     assert len(sparse.faces) == len(dense.faces)
-    np.testing.assert_allclose(volume(sparse), volume(dense), rtol=1e-5)
+    np.testing.assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -101,7 +95,7 @@ def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatc
     assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
     assert mesh.faces.min() == 0 and mesh.faces.max() == len(mesh.vertices) - 1
     np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
-    assert volume(mesh) > 0
+    assert outward_volume(mesh) > 0
     reach = np.abs(mesh.vertices[:, :2]).max()
     # A relief goes beyond the frame, so that no pixel sees its edge.
     assert reach > 1 if kind == "relief" else reach == pytest.approx(REACH, abs=1e-4)

@@ -1,7 +1,5 @@
 """Fixtures of a training run that takes a second."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Checkpoints restore a run completely, and damaged ones are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

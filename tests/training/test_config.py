@@ -1,7 +1,5 @@
 """Training configurations and presets, and the names of them that load without PyTorch."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 
@@ -30,10 +28,7 @@ def test_settings_left_out_have_their_defaults() -> None:
     ("values", "message"),
     [
         ({"stepz": 5}, "unknown training setting 'stepz'; known are angle_weight, asymmetric_weight"),
-        (
-            {"pixels": {"lights": 5}},
-            "unknown training setting 'lights'; known are ambient_share, cast_shadows",
-        ),
+        ({"pixels": {"lights": 5}}, "unknown training setting 'lights'; known are ambient_share, cast_shadows"),
         ({"network": {"lights": 5}}, "unknown network setting 'lights'"),
         ({"pixels": ["wall_share"]}, "'pixels' is .* expected a table of settings"),
         ({"steps": 0}, "training setting 'steps' is 0; expected a whole number from 1"),

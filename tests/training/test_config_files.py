@@ -1,7 +1,5 @@
 """Training configurations from presets, files and options."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,15 +25,11 @@ def write(path: Path, text: str) -> Path:
 
 def test_a_toml_file_over_a_preset(tmp_path: Path) -> None:
     file = write(
-        tmp_path / "a.toml",
-        'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n',
+        tmp_path / "a.toml", 'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n'
     )
     paper = preset("paper")
     expected = replace(
-        paper,
-        batch_size=64,
-        pixels=replace(paper.pixels, wall_share=0.3),
-        network=replace(paper.network, map_size=16),
+        paper, batch_size=64, pixels=replace(paper.pixels, wall_share=0.3), network=replace(paper.network, map_size=16)
     )
     assert configure(None, file) == expected
     # A preset that is asked for by name comes before the file's.
@@ -152,8 +146,7 @@ def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
-    [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))],
+    ("text", "expected"), [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))]
 )
 def test_light_counts(text: str, expected: tuple[int, int, int]) -> None:
     assert tuple(parse_light_counts(text).values()) == expected

@@ -1,7 +1,5 @@
 """Several processes have the losses of one process, and a run survives the failure of a process."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -123,7 +121,7 @@ run()
 def test_a_run_outlives_one_of_its_processes(tmp_path: Path) -> None:
     # On the processor, one process of two is killed after the first checkpoint; torchrun starts both again.
     (tmp_path / "worker.py").write_text(FAILING)
-    steps = 60
+    steps = 30
     settings = ["network.width=8", "network.li_blocks=1", "network.ne_blocks=1", "network.head_width=8"]
     settings += ["batch_size=8", "precision=float32"]
     options = [word for setting in settings for word in ("--param", setting)]

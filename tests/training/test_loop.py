@@ -1,7 +1,5 @@
 """The training loop: it learns, it can be stopped and taken up, and it says when it cannot go on."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """The losses have known values, and agree with independent computations."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

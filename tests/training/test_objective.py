@@ -1,7 +1,5 @@
 """What is minimised: which terms, by which weights, and whose parameters they move."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whole scenes as captures, and the training of the refinement net on them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,11 +86,7 @@ def bumpy_set(tmp_path: Path) -> PixelSet:
         observations = (normals @ lights.T).clip(0) * rng.uniform(0.5, 1.5, (196, 9))
         mask = np.ones((14, 14), np.bool_)
         writer.add(
-            f"s{index}",
-            f"s{index}",
-            "a test",
-            {},
-            Pixels(observations.astype(np.float32), normals, lights, mask),
+            f"s{index}", f"s{index}", "a test", {}, Pixels(observations.astype(np.float32), normals, lights, mask)
         )
     return writer.finish()
 

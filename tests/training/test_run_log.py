@@ -1,16 +1,13 @@
 """The log files of a run: metrics.csv, the figures and TensorBoard's events."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import fields, replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
+from scenes import decode_rgb
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.loop import Trainer
@@ -59,19 +56,13 @@ def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) 
     assert read_metrics(tmp_path / METRICS) == ROWS[:2]
 
 
-def read_png(path: Path) -> np.ndarray:
-    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    return picture
-
-
 def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     Trainer(replace(tiny, steps=2), tmp_path, torch.device("cpu")).run()
     assert {path.name for path in tmp_path.iterdir()} == {
         "checkpoint.safetensors", "config.json", CURVES, MAPS, METRICS, "weights.safetensors",
     }  # fmt: skip
-    assert read_png(tmp_path / CURVES).std() > 5
-    assert read_png(tmp_path / MAPS).std() > 20
+    assert decode_rgb((tmp_path / CURVES).read_bytes()).std() > 5
+    assert decode_rgb((tmp_path / MAPS).read_bytes()).std() > 20
 
 
 def test_tensorboard_s_events(tmp_path: Path) -> None:

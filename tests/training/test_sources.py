@@ -1,7 +1,5 @@
 """Sources of training and validation pixels: weights of a mixture, and scenes kept for validation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from distributions import generator as seeded
 from splinecli.errors import InputError
 from splinecli.pixel_sets.source import SampledPixels
 from splinecli.pixel_sets.store import Entry, PixelSet
@@ -18,10 +17,6 @@ from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.sources import open_sources, split_scenes
 
 MakeSet = Callable[..., PixelSet]
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def assert_same(one: PixelBatch, other: PixelBatch) -> None:
@@ -118,7 +113,7 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
         opened = open_sources(config, seeded(seed), seeded(seed + 1))
         return [opened.training.draw(5) for _ in range(count)], [opened.validation.draw(5) for _ in range(count // 4)]
 
-    (training, validation), again = draw(5, 120), draw(5, 8)
+    (training, validation), again = draw(5, 60), draw(5, 8)
     for batches, others in ((training, again[0]), (validation, again[1])):
         for batch, other in zip(batches[: len(others)], others, strict=True):
             assert_same(batch, other)
@@ -128,7 +123,7 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     # A batch has one source. The set gives a quarter of the batches.
     from_set = [sum(normal in stored for normal in normals_of(batch)) for batch in training]
     assert all(count in (0, len(normals_of(batch))) for count, batch in zip(from_set, training, strict=True))
-    assert sum(count > 0 for count in from_set) == pytest.approx(30, abs=4 * np.sqrt(120 * 0.25 * 0.75))
+    assert sum(count > 0 for count in from_set) == pytest.approx(15, abs=4 * np.sqrt(60 * 0.25 * 0.75))
     found = set().union(*(normals_of(batch) for batch in validation)) & rows_of(pixel_set, "a", "b", "c")
     assert found <= rows_of(pixel_set, *for_validation)
     # Both kinds of truth give maps of one shape.

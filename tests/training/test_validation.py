@@ -1,7 +1,5 @@
 """The validation error, and the sample maps of maps.png."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """BMP and TGA images, written by Pillow."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curves of colour profiles: profiles written here after ISO 15076-1, and one of LittleCMS."""
 
-from __future__ import annotations
-
 import io
 import struct
 import tracemalloc
@@ -16,6 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
+from scenes import with_chunk
 from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.colour_profile import profile_curve
 from splinecli.capture.formats.facts import StatedCurve, read_facts
@@ -56,8 +55,7 @@ def write(path: Path, icc: bytes | None, pixels: NDArray[Any] = PIXELS) -> Path:
     else:
         png = cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
         if icc is not None:
-            body = b"iCCP" + b"p\0\0" + zlib.compress(icc)
-            png = png[:33] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[33:]
+            png = with_chunk(png, b"iCCP", b"p\0\0" + zlib.compress(icc))
         path.write_bytes(png)
     return path
 

@@ -1,7 +1,5 @@
 """Films of an analytic sphere, written by OpenCV: which frames are taken, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -9,15 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import shade, sphere
+from scenes import directions_at, shade, sphere
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.formats.film import (
-    FEWEST_FRAMES,
-    MOST_FRAMES,
-    choose_frames,
-    is_film,
-    read_frames,
-)
+from splinecli.capture.formats.film import FEWEST_FRAMES, MOST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, decode_transfer
 from splinecli.pictures.png import encode_png
@@ -51,8 +43,7 @@ def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Pa
 
 def path_of_lamp(count: int) -> NDArray[np.float64]:
     """Lights (count, 3) along a slow spiral, as a lamp is carried."""
-    azimuth, zenith = np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count))
-    return np.stack((np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), 1)
+    return directions_at(np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count)))
 
 
 @pytest.mark.parametrize(("name", "codec"), [("clip.avi", "MJPG"), ("clip.mp4", "mp4v")])

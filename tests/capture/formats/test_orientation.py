@@ -1,7 +1,5 @@
 """EXIF orientations: one for all images, or none at all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

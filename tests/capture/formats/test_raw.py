@@ -1,7 +1,5 @@
 """RAW files: DNGs written here, of known radiance, so that what LibRaw makes of them is known too."""
 
-from __future__ import annotations
-
 import struct
 import sys
 from collections.abc import Sequence
@@ -204,17 +202,7 @@ def names_of(images: Sequence[Path]) -> list[str]:
 
 
 def test_one_file_of_each_photograph_counts(tmp_path: Path) -> None:
-    touch(
-        tmp_path,
-        "img2.NEF",
-        "IMG2.jpg",
-        "img10.nef",
-        "img10.tif",
-        "img10.jpg",
-        "img3.png",
-        "img3.jpg",
-        "notes.txt",
-    )
+    touch(tmp_path, "img2.NEF", "IMG2.jpg", "img10.nef", "img10.tif", "img10.jpg", "img3.png", "img3.jpg", "notes.txt")
     listed = list_images(tmp_path, leave_out_stems=(), leave_out=())
     # Of img2 the RAW file and not the camera's copy, of img10 what was developed; without a RAW file, all count.
     assert names_of(listed) == ["img2.NEF", "img3.jpg", "img3.png", "img10.tif"]

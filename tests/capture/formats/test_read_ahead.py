@@ -1,7 +1,5 @@
 """Reading ahead: the order, errors, and messages that are printed meanwhile."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

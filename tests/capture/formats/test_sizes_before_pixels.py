@@ -1,7 +1,5 @@
 """Files that claim or hide far more than they show are refused from their headers, without taking memory."""
 
-from __future__ import annotations
-
 import io
 import os
 import resource
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from scenes import png_chunk
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.capture import open_capture
 from splinecli.capture.formats.decoding import decode_image
@@ -34,16 +33,14 @@ MOST_GROWTH = 300 * 2**20
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
 
 
-def chunk(name: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-
-
 def write_png(path: Path, size: int = HUGE) -> None:
     """A whole PNG of zeros, with few bytes."""
     rows = zlib.compressobj(1)
     data = b"".join(rows.compress(bytes(size + 1)) for _ in range(size)) + rows.flush()
     header = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IDAT", data) + png_chunk(b"IEND", b"")
+    )
 
 
 def write_claim(path: Path, height: int, width: int) -> None:
@@ -51,7 +48,7 @@ def write_claim(path: Path, height: int, width: int) -> None:
     cv2.imwrite(str(path), np.zeros(SMALL, np.uint8))
     content = path.read_bytes()
     header = struct.pack(">II", width, height) + content[24:29]
-    path.write_bytes(content[:8] + chunk(b"IHDR", header) + chunk(b"IEND", b""))
+    path.write_bytes(content[:8] + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
 
 
 def write_jpeg(path: Path) -> None:
@@ -194,7 +191,7 @@ def test_headers_without_end(tmp_path: Path) -> None:
     jpeg.write_bytes(b"\xff\xd8" + b"\xff\xe1\0\2" * 2_000_000)
     refused(lambda: decode_image(jpeg), "the JPEG is truncated")
     plain = cv2.imencode(".png", np.zeros(SMALL, np.uint8))[1].tobytes()
-    png.write_bytes(plain[:33] + chunk(b"tEXt", b"") * 1_000_000 + plain[33:])
+    png.write_bytes(plain[:33] + png_chunk(b"tEXt", b"") * 1_000_000 + plain[33:])
     assert read_facts(png).white_level is None
     refused(lambda: decode_image(png), "the PNG is truncated")
     png.write_bytes(plain[:33])
@@ -240,10 +237,7 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
 
 def test_light_files_with_too_much_text(tmp_path: Path) -> None:
     (tmp_path / "long.txt").write_text("0 0 1" + " " * 1_000_000)
-    refused(
-        lambda: read_light_directions(tmp_path / "long.txt"),
-        "found 1.0 MB, expected a text file of at most 1.0",
-    )
+    refused(lambda: read_light_directions(tmp_path / "long.txt"), "found 1.0 MB, expected a text file of at most 1.0")
     (tmp_path / "lines.txt").write_text("1\n" * 60_000)
     refused(lambda: read_light_directions(tmp_path / "lines.txt"), "found 60001 lines, expected at most 50000")
     (tmp_path / "words.txt").write_text("1 " * 400_000)

@@ -1,7 +1,5 @@
 """The layout of CyclesPS, on trees written here as they are published: what goes in comes out, value for value."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

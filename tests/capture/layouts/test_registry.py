@@ -1,7 +1,5 @@
 """Which files of a folder are taken for what."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -26,13 +24,7 @@ def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
         " lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png normals.png error_map.png",
     )
     files = find_capture_files(folder)
-    assert [path.name for path in files.images] == [
-        "img1.png",
-        "img2.PNG",
-        "Img3.tif",
-        "img04.jpeg",
-        "img10.png",
-    ]
+    assert [path.name for path in files.images] == ["img1.png", "img2.PNG", "Img3.tif", "img04.jpeg", "img10.png"]
     assert (files.name, files.folder) == ("vase", folder)
     assert files.light_directions == folder / "lights.txt"
     assert files.light_intensities == folder / "light_intensities.txt"
@@ -73,18 +65,10 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     for name, overrides, message in (
         ("nowhere", Overrides(), r"nowhere: the folder does not exist\."),
         ("file", Overrides(), r"found a file, expected a folder of images\."),
-        (
-            "empty",
-            Overrides(),
-            r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA and RAW files count",
-        ),
+        ("empty", Overrides(), r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA and RAW files count"),
         ("dataset", Overrides(), r"no images\. There are captures in .*dataset, such as .*a: give these"),
         ("dark", Overrides(), r"2 images but no light file \(light_directions.txt, .*Pass --lights FILE"),
-        (
-            "dark",
-            Overrides(lights=tmp_path / "file", mask=tmp_path / "none.png"),
-            r"none\.png: the file does",
-        ),
+        ("dark", Overrides(lights=tmp_path / "file", mask=tmp_path / "none.png"), r"none\.png: the file does"),
         ("dark", Overrides(lights=tmp_path), r"found a folder, expected a file\."),
     ):
         with pytest.raises(InputError, match=message):

@@ -1,7 +1,5 @@
 """Light files of MATLAB and OpenCV, written by SciPy and OpenCV themselves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Draws of lights: what they depend on, and the text of every complaint about a draws file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Light files: every accepted way of writing one, and the message for every wrong one."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Light files as people have them: headers, names, counts, other encodings, decimal commas, angles, arrays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Light files that name their images: RTI's .lp and AliceVision's JSON."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -119,10 +117,7 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(write_folder: Writ
         ("1\na.png 0 0 0", "2: found a zero vector, expected a light direction"),
         ("2\na.png 0 0 1\nb.png 0 1 -1", "3: found a light below the horizon (z = -1), expected z > 0"),
         ("2\na.png 0 0 1\nA.PNG 0 1 1", '3: a second light for the image "A.PNG"'),
-        (
-            "2\nshot 1.png 0 0 1\nx.png 0 1 1",
-            '3: found 2 lights but 5 images; the image "x.png" is not among them',
-        ),
+        ("2\nshot 1.png 0 0 1\nx.png 0 1 1", '3: found 2 lights but 5 images; the image "x.png" is not among them'),
     ],
 )
 def test_refused_lp_files(write_folder: WriteFolder, text: str, message: str) -> None:

@@ -1,7 +1,5 @@
 """The object is found by its brightness, against drawn scenes whose masks are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -33,8 +31,7 @@ def test_the_largest_part_with_its_holes_filled():
 
 
 @pytest.mark.parametrize(
-    ("brightness", "said"),
-    [(np.zeros((SIDE, SIDE)), "are black"), (np.full((SIDE, SIDE), 0.5), "covers 100.0 %")],
+    ("brightness", "said"), [(np.zeros((SIDE, SIDE)), "are black"), (np.full((SIDE, SIDE), 0.5), "covers 100.0 %")]
 )
 def test_nothing_stands_out(brightness, said):
     with pytest.raises(InputError, match=said):
@@ -42,8 +39,7 @@ def test_nothing_stands_out(brightness, said):
 
 
 @pytest.mark.parametrize(
-    "place",
-    ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse", "synth/L17/bowl_S"],
+    "place", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse", "synth/L17/bowl_S"]
 )
 def test_real_objects(shared_data, place):
     """Intersection over union with the masks that people drew."""

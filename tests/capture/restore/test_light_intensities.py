@@ -1,7 +1,5 @@
 """Light intensities estimated from images, against scenes and captures with known intensities."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

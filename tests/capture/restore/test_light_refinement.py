@@ -1,7 +1,5 @@
 """Refined lights on made-up pixels, whose true lights are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

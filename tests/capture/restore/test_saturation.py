@@ -1,7 +1,5 @@
 """Overexposed Lambertian pixels come back as bright as they were."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

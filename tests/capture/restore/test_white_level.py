@@ -1,9 +1,6 @@
 """White levels: found where cameras clip below the full scale of 16 bits, and not where something else looks flat."""
 
-from __future__ import annotations
-
 import struct
-import zlib
 from pathlib import Path
 
 import cv2
@@ -12,7 +9,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from scenes import shade, sphere_cap, spiral_lights, write_capture
+from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
 from splinecli.capture import open_capture
 from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
 from splinecli.errors import InputError
@@ -179,14 +176,6 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
     assert ls_error_deg(folder, normals, white_level=4095) == found
 
 
-def add_sbit(path: Path, *bits: int) -> None:
-    """Put the chunk sBIT behind a PNG's header."""
-    data, chunk = path.read_bytes(), b"sBIT" + bytes(bits)
-    end = 8 + 12 + 13
-    packed = struct.pack(">I", len(bits)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    path.write_bytes(data[:end] + packed + data[end:])
-
-
 @pytest.mark.parametrize(("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)])
 def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int | None) -> None:
     images = bright(100)
@@ -195,7 +184,7 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
         images = np.repeat(images[..., None], 3, axis=-1)
     folder = write_capture(tmp_path / "vase", images, LIGHTS)
     for path in folder.glob("*.png"):
-        add_sbit(path, *bits)
+        path.write_bytes(with_chunk(path.read_bytes(), b"sBIT", bytes(bits)))
     expected = WhiteLevel(65_535, "full scale") if level is None else WhiteLevel(level, "file")
     assert open_capture(folder).read().white_level == expected
     (folder / "011.png").write_bytes(cv2.imencode(".png", images[11])[1].tobytes())  # not all of them
@@ -203,8 +192,7 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
 
 
 @pytest.mark.parametrize(
-    ("tag", "value", "level"),
-    [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)],
+    ("tag", "value", "level"), [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)]
 )
 def test_tiff_states_its_level(tmp_path: Path, tag: int, value: int, level: int | None) -> None:
     folder = tmp_path / "vase"
