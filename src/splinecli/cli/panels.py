@@ -69,8 +69,9 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
             "--pixel-size",
             "--convention",
             "--colours",
+            "--prior",
         ),
-        "Method": ("--stiffness", "--largest-step"),
+        "Method": ("--stiffness", "--prior-detail", "--largest-step"),
         "Output": ("--output", "--format", "--decimate", *REPEAT),
     },
     "evaluate": {
