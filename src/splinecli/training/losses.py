@@ -42,7 +42,8 @@ def map_loss(dense: Tensor, truth: Tensor, known: Tensor, norm: Norm = "mean") -
         known: 1 in cells with a known true value, else 0, of the same shape.
         norm: average or sum over the cells.
     """
-    return _over(known, (dense - truth).abs(), norm)
+    total = ((dense - truth).abs() * known).sum((1, 2, 3))
+    return (total if norm == "sum" else total / known.sum((1, 2, 3)).clamp(min=1)).mean()
 
 
 def masked_map_loss(dense: Tensor, truth: Tensor, known: Tensor, occupied: Tensor, norm: Norm = "mean") -> Tensor:
@@ -52,12 +53,7 @@ def masked_map_loss(dense: Tensor, truth: Tensor, known: Tensor, occupied: Tenso
         dense, truth, known, norm: as for map_loss.
         occupied: 1 in cells of the sparse map that have an observation, else 0, (P, 1, w, w).
     """
-    return _over(known * occupied, (dense - truth).abs(), norm)
-
-
-def _over(cells: Tensor, values: Tensor, norm: Norm) -> Tensor:
-    total = (values * cells).sum((1, 2, 3))
-    return (total if norm == "sum" else total / cells.sum((1, 2, 3)).clamp(min=1)).mean()
+    return map_loss(dense, truth, known * occupied, norm)
 
 
 def mirror(maps: Tensor, normals: Tensor) -> Tensor:

@@ -134,8 +134,9 @@ def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> De
     """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values above 1 cut off."""
     dense = batch.truth.rotate(maps.cosine, maps.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
-    dense = DenseMap(values, dense.known, dense.filled)
-    return dense.flip_y() if maps.mirrored else dense
+    cells = values, dense.known, dense.filled
+    # The cells lie symmetrically, so reversed rows are the maps of the mirrored pixels.
+    return DenseMap(*(each.flip(2) for each in cells) if maps.mirrored else cells)
 
 
 @contextmanager
