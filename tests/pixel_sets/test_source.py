@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from splinecli.maths.observation_map import cell_directions
-from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
-from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
+from splinecli.pixel_sets.source import FILL_ROUNDS, PixelSetSource, SampledPixels, fill_gaps
 from splinecli.pixel_sets.store import PixelSet
 from splinecli.synthesis.batches import CaptureConfig
 
