@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from near_lamps import height_field, sphere
+from point_lights import render_point_lights
 from splinecli.capture import Capture, open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
@@ -27,7 +28,6 @@ from splinecli.diagnosis.checks import check_arrays, check_capture
 from splinecli.maths.transfer import encode_srgb
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.point_lights import render_point_lights
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import SceneConfig, draw_scene

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from point_lights import render_point_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.record import in_one_plane
@@ -30,7 +31,6 @@ from splinecli.refinement.tiles import NetworkRefiner
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.point_lights import render_point_lights
 from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect

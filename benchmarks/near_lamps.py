@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from point_lights import render_point_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.inference import NormalEstimate, estimate_normals
@@ -25,7 +26,6 @@ from splinecli.methods import make_estimator
 from splinecli.surface.integration import integrate_normals
 from splinecli.synthesis.camera import VisibleSurface, find_visible_surface
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.point_lights import render_point_lights
 from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct

@@ -9,8 +9,7 @@ import torch
 
 from distributions import generator as seeded
 from splinecli.maths.observation_map import cell_directions
-from splinecli.pixel_sets.dense_maps import FILL_ROUNDS, fill_gaps
-from splinecli.pixel_sets.source import PixelSetSource, SampledPixels
+from splinecli.pixel_sets.source import FILL_ROUNDS, PixelSetSource, SampledPixels, fill_gaps
 from splinecli.pixel_sets.store import PixelSet
 from splinecli.synthesis.batches import CaptureConfig
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from point_lights import render_point_lights
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.point_lights import render_point_lights
 from splinecli.synthesis.ray_tracing import Tracer
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")

@@ -68,7 +68,8 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
     tensors = _flip_rows(_read_li_net(li_net_file, network.li_net), "li_net.")
     ne_net = _read_ne_net(ne_net_file, network.ne_net)
     side = network.config.map_size // 2
-    ne_net["hidden.weight"] = _flip_columns(ne_net["hidden.weight"], side)
+    hidden = ne_net["hidden.weight"]
+    ne_net["hidden.weight"] = hidden.reshape(len(hidden), -1, side, side).flip(2).flatten(1)
     ne_net["stem.weight"] = ne_net["stem.weight"].flip(1)
     tensors |= _flip_rows(ne_net, "ne_net.")
     load_strictly(network, tensors, li_net_file)
@@ -78,11 +79,6 @@ def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
 def _flip_rows(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Flip every kernel (every 4-dimensional tensor) along its height."""
     return {prefix + name: tensor.flip(2) if tensor.ndim == 4 else tensor for name, tensor in tensors.items()}
-
-
-def _flip_columns(weight: Tensor, side: int) -> Tensor:
-    """Flip the map rows in the weight (out, C * side * side) of a linear layer."""
-    return weight.reshape(len(weight), -1, side, side).flip(2).flatten(1)
 
 
 def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
@@ -114,18 +110,7 @@ def _rename(
     names: dict[str, str],
     dropped: dict[str, torch.Size],
 ) -> dict[str, Tensor]:
-    """Return their tensors under our names, float32.
-
-    Args:
-        path: the file, for messages.
-        state: the tensors of the file by their name.
-        network: our network, for the expected shapes.
-        names: their name by our name. The file must have each of them.
-        dropped: expected shapes of tensors that are not needed, by their name.
-
-    Raises:
-        ModelError: a tensor is missing, unknown, of another shape or type, or not finite.
-    """
+    """Return their tensors under our names, float32; `names` gives theirs by ours, `dropped` the shapes not needed."""
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
     shapes = {theirs: network.state_dict()[ours].shape for ours, theirs in names.items()}
     missing = [name for name in shapes if name not in state]

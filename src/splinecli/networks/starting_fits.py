@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,11 +16,12 @@ def _least_squares(observations: Tensor, light_directions: Tensor, valid: Tensor
     return weighted_least_squares(observations, light_directions, valid.to(observations.dtype))[0]
 
 
-def _sparse(observations: Tensor, light_directions: Tensor, valid: Tensor) -> Tensor:
-    return iw12.solve(observations, light_directions, valid, shadow_share=0)
-
-
-STARTING_FITS = {"ls": _least_squares, "iw12": iw12.solve, "iw12-all": _sparse, "ia14": ia14.solve}
+STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "ls": _least_squares,
+    "iw12": iw12.solve,
+    "iw12-all": partial(iw12.solve, shadow_share=0),
+    "ia14": ia14.solve,
+}
 """Fits by their names in NetworkConfig.fits. "iw12-all" uses every observation, which is far better on metals."""
 
 

@@ -17,7 +17,7 @@ from splinecli.pixel_sets.store import Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture, CaptureFiles, CaptureSource
+    from splinecli.capture import Capture, CaptureSource
 
 
 class CaptureChangedError(OutputError):
@@ -98,27 +98,25 @@ def add_capture(
         if difference is None:
             return
         if not update:
-            raise _changed(name, difference, folder)
+            problem = f"its entry {name} was made with {difference}"
+            if difference.startswith("files ="):
+                problem = f"its files changed since the entry {name} was made"
+            hint = "Add --update to read it again, or choose another -o"
+            raise CaptureChangedError(problem, path=folder, hint=hint)
     if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
     pixels = _pixels(source.read(as_stored=as_stored), source, folder)
     # The materials of an object of CyclesPS share its shape.
-    scene = _folder_of(source.files).name if source.files.boundaries else name
+    scene = source.files.folder.absolute().name if source.files.boundaries else name
     writer.add(name, scene, str(folder), recipe, pixels)
-
-
-def _changed(name: str, difference: str, folder: Path) -> CaptureChangedError:
-    problem = f"its entry {name} was made with {difference}"
-    if difference.startswith("files ="):
-        problem = f"its files changed since the entry {name} was made"
-    return CaptureChangedError(problem, path=folder, hint="Add --update to read it again, or choose another -o")
 
 
 def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
     """Return the pixels of a capture that have a true normal. Raises InputError if there are none."""
     assert capture.ground_truth is not None
     normals = capture.ground_truth[capture.mask]
-    step = _pixel_step(source.files)
+    # The images of CyclesPS's PRPS count at half their size.
+    step = 2 if source.files.boundaries and source.files.folder.absolute().parent.name == "PRPS" else 1
     rows, columns = np.nonzero(capture.mask)
     used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
     if not used.any():
@@ -131,12 +129,3 @@ def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
         light_directions=capture.light_directions.astype(np.float32),
         mask=mask[::step, ::step],
     )
-
-
-def _pixel_step(files: CaptureFiles) -> int:
-    """Return 2 for the images of CyclesPS's PRPS, which count at half their size, else 1."""
-    return 2 if files.boundaries and _folder_of(files).parent.name == "PRPS" else 1
-
-
-def _folder_of(files: CaptureFiles) -> Path:
-    return files.folder.absolute()

@@ -60,10 +60,6 @@ class DenseMap(NamedTuple):
     known: Tensor
     filled: Tensor
 
-    def flip_y(self) -> DenseMap:
-        """Return the maps of the mirrored pixels. The cells lie symmetrically, so this reverses the rows."""
-        return DenseMap(*(cells.flip(2) for cells in self))
-
 
 class PixelTruth(Protocol):
     """The true normals and dense maps of P pixels."""

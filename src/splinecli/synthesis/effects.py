@@ -6,7 +6,7 @@ They depend on the light direction, so they also shape the dense map. The faults
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -80,16 +80,8 @@ class Wall:
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Wall:
         """Turn the wall about the view axis."""
-        return Wall(
-            rotate_about_view_axis(self.azimuth, cosine, sine),
-            self.tan_height,
-            self.tan_half_width,
-            self.softness,
-            rotate_about_view_axis(self.facing, cosine, sine),
-            self.reflectance,
-            rotate_about_view_axis(self.towards, cosine, sine),
-            self.has_pixel_material,
-        )
+        vectors = {"azimuth": self.azimuth, "facing": self.facing, "towards": self.towards}
+        return replace(self, **{name: rotate_about_view_axis(each, cosine, sine) for name, each in vectors.items()})
 
 
 def draw_wall(

@@ -153,10 +153,8 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
     reach = 2 * COARSE * spacing * np.sqrt(3) / 2
     near = np.abs(coarse) < reach
     close = np.zeros([size - 1 for size in coarse.shape], dtype=bool)
-    for x in (0, 1):
-        for y in (0, 1):
-            for z in (0, 1):
-                close |= near[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]]
+    for x, y, z in np.ndindex(2, 2, 2):
+        close |= near[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]]
     far = coarse
     for axis in range(3):
         close, far = np.repeat(close, COARSE, axis), np.repeat(far, COARSE, axis)
@@ -164,10 +162,8 @@ def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
     values = np.ascontiguousarray(far[: shape[0], : shape[1], : shape[2]])
     exact = np.zeros(shape, dtype=bool)
     # The upper faces of a cell belong to it, too.
-    for x in (0, 1):
-        for y in (0, 1):
-            for z in (0, 1):
-                exact[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]] |= close
+    for x, y, z in np.ndindex(2, 2, 2):
+        exact[x : x + close.shape[0], y : y + close.shape[1], z : z + close.shape[2]] |= close
     at = exact.nonzero()
     values[at] = _evaluate(field, *(axis[index] for axis, index in zip(axes, at, strict=True)))
     return values

@@ -7,18 +7,14 @@ al., ICCV 2021) trains a per-pixel network in this way, without rendered objects
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from splinecli.maths.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
 from splinecli.synthesis.batches import CaptureConfig, DenseMap, PixelBatch, photograph
-from splinecli.synthesis.effects import (
-    Wall,
-    draw_ambient,
-    draw_wall,
-)
+from splinecli.synthesis.effects import Wall, draw_ambient, draw_wall
 from splinecli.synthesis.lights import draw_light_counts, draw_light_directions
 from splinecli.synthesis.principled import PrincipledMaterial, choose, draw_material
 
@@ -69,14 +65,8 @@ class PixelScene:
         mixed = self.mixed
         if mixed is not None:
             mixed = mixed.rotate(cosine[: len(mixed.normals)], sine[: len(mixed.normals)])
-        return PixelScene(
-            rotate_about_view_axis(self.normals, cosine, sine),
-            self.material,
-            tuple(wall.rotate(cosine, sine) for wall in self.walls),
-            self.ambient,
-            mixed,
-            self.mixed_weight,
-        )
+        walls = tuple(wall.rotate(cosine, sine) for wall in self.walls)
+        return replace(self, normals=rotate_about_view_axis(self.normals, cosine, sine), walls=walls, mixed=mixed)
 
     def dense_map(self, size: int = MAP_SIZE) -> Tensor:
         """Return the complete map (P, 1, size, size): radiance at the cells' centres, zero outside the unit disc."""

@@ -35,7 +35,8 @@ def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor)
     # Lobes of the same kind use different parts of the sequence.
     u = (u + lobe * 0.25) % 1.0
     alpha = torch.tensor(LOBES)[lobe][:, None]
-    matte = _cosine_direction(u, v)
+    radius, angle = u.sqrt(), 2 * math.pi * v
+    matte = torch.stack((radius * angle.cos(), radius * angle.sin(), (1 - u).sqrt()), dim=1)
     half = _visible_normal(local_view, alpha.clamp(min=0.01), u, v)
     mirrored = 2 * (local_view * half).sum(-1, keepdim=True) * half - local_view
     local = torch.where(alpha == 0, matte, mirrored)
@@ -65,11 +66,6 @@ def basis(normals: Tensor) -> tuple[Tensor, Tensor]:
     b = x * y * a
     tangent = torch.stack((1 + sign * x * x * a, sign * b, -sign * x), dim=1)
     return tangent, torch.stack((b, sign + y * y * a, -y), dim=1)
-
-
-def _cosine_direction(u: Tensor, v: Tensor) -> Tensor:
-    radius, angle = u.sqrt(), 2 * math.pi * v
-    return torch.stack((radius * angle.cos(), radius * angle.sin(), (1 - u).sqrt()), dim=1)
 
 
 def _visible_normal(view: Tensor, alpha: Tensor, u: Tensor, v: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, 
 from splinecli.training.distributed import Workers
 from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_log import Metrics, RunLog, none_for_nan
-from splinecli.training.tasks import DROPOUT_STREAM, open_task, stream_seed
+from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask, stream_seed
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
@@ -89,7 +89,8 @@ class Trainer:
             raise OutputError(
                 "already contains a run", path=folder, hint="Continue it with --resume, or choose another -o"
             )
-        self.task = open_task(config, self.shards, device)
+        task = RefinementTask if config.updates == "refine_net" else PixelTask
+        self.task: PixelTask | RefinementTask = task(config, self.shards, device)
         self.sets, self.single_scene_sets = self.task.sets, self.task.single_scene_sets
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
@@ -188,15 +189,8 @@ class Trainer:
         """
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
-        save_checkpoint(
-            self.folder / CHECKPOINT,
-            self.config,
-            self.network,
-            self.average,
-            self.optimizer,
-            self.counters,
-            self.sets,
-        )
+        state = self.network, self.average, self.optimizer, self.counters
+        save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.sets)
 
     def _check_weights(self) -> None:
         """Raise ModelError where a weight is not finite, before it is saved."""
@@ -215,8 +209,7 @@ class Trainer:
         # The decay grows with the steps, because a young average would depend on the start for too long.
         decay = min(self.config.average_decay, (1 + self.counters.step) / (10 + self.counters.step))
         with torch.no_grad():
-            pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
-            for averaged, current in pairs:
+            for averaged, current in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 averaged.lerp_(current, 1 - decay)
 
     def _metrics(self, means: Tensor, *, check: bool) -> Metrics:

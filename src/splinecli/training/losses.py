@@ -33,30 +33,16 @@ def angles(normals: Tensor, truth: Tensor) -> Tensor:
     return torch.atan2(sine, (normals * truth).sum(-1))
 
 
-def map_loss(dense: Tensor, truth: Tensor, known: Tensor, norm: Norm = "mean") -> Tensor:
-    """Return |D - D_gt| over the cells with a known true value.
+def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:
+    """Return |D - D_gt| over some cells, or |M_s o (D - D_gt)| over those of the sparse map.
 
     Args:
         dense: LI-Net's maps D, (P, 1, w, w).
         truth: the true maps D_gt, of the same shape.
-        known: 1 in cells with a known true value, else 0, of the same shape.
+        cells: 1 in the cells that count, whose true value is known, else 0, of the same shape.
         norm: average or sum over the cells.
     """
-    return _over(known, (dense - truth).abs(), norm)
-
-
-def masked_map_loss(dense: Tensor, truth: Tensor, known: Tensor, occupied: Tensor, norm: Norm = "mean") -> Tensor:
-    """Return |M_s o (D - D_gt)|, over the cells of the sparse map alone.
-
-    Args:
-        dense, truth, known, norm: as for map_loss.
-        occupied: 1 in cells of the sparse map that have an observation, else 0, (P, 1, w, w).
-    """
-    return _over(known * occupied, (dense - truth).abs(), norm)
-
-
-def _over(cells: Tensor, values: Tensor, norm: Norm) -> Tensor:
-    total = (values * cells).sum((1, 2, 3))
+    total = ((dense - truth).abs() * cells).sum((1, 2, 3))
     return (total if norm == "sum" else total / cells.sum((1, 2, 3)).clamp(min=1)).mean()
 
 
@@ -86,8 +72,9 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
 def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
     """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and (P,).
 
-    p is average pooling with stride 2. Only filled cells with a filled mirror image are compared. Near the rim and
-    beside gaps, a mirrored value would be mixed with empty cells.
+    The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with stride 2. Only filled
+    cells with a filled mirror image are compared. Near the rim and beside gaps, a mirrored value would be mixed with
+    empty cells.
 
     Args:
         dense: maps D, (P, 1, w, w).
@@ -100,11 +87,6 @@ def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor,
     fine = difference.abs().sum((1, 2, 3))
     coarse = avg_pool2d(difference, 2).abs().sum((1, 2, 3))
     return fine, coarse
-
-
-def symmetric_loss(fine: Tensor) -> Tensor:
-    """Return Ls = |D - r(D, n)|, the loss for isotropic reflectance, from the first result of `asymmetries`."""
-    return fine.mean()
 
 
 def asymmetric_loss(fine: Tensor, coarse: Tensor, *, eta: float, lambda_c: float) -> Tensor:

@@ -14,15 +14,7 @@ from splinecli.networks.error_head import error_negative_log_likelihood
 from splinecli.networks.spline_net import PixelMaps, Rotation, SplineNet, to_pixel_frame
 from splinecli.synthesis.batches import DenseMap, PixelBatch
 from splinecli.training.config import TrainingConfig
-from splinecli.training.losses import (
-    angles,
-    angular_loss,
-    asymmetric_loss,
-    asymmetries,
-    map_loss,
-    masked_map_loss,
-    symmetric_loss,
-)
+from splinecli.training.losses import angles, angular_loss, asymmetric_loss, asymmetries, map_loss
 
 Part = Literal["both", "ne_net", "li_net", "error_head", "refine_net"]
 
@@ -91,15 +83,15 @@ def compute_losses(
     if dense is not None and dense_truth is not None:
         dense = dense.float()
         on_map = map_loss(dense, dense_truth.values, dense_truth.known)
-        masked = masked_map_loss(dense, dense_truth.values, dense_truth.known, maps.occupied)
+        masked = map_loss(dense, dense_truth.values, dense_truth.known * maps.occupied)
     symmetric = asymmetric = angle.new_full((), torch.nan)
     if dense_truth is not None and (config.symmetric_weight or config.asymmetric_weight):
         symmetric, asymmetric = _special(dense, normals, dense_truth, normal_truth, config, part)
     total = config.angle_weight * angle
     if part != "ne_net" and dense is not None and dense_truth is not None:
-        against = (dense, dense_truth.values, dense_truth.known)
-        total = total + config.map_weight * map_loss(*against, config.li_net_norm)
-        total = total + config.masked_weight * masked_map_loss(*against, maps.occupied, config.li_net_norm)
+        for weight, cells in ((config.map_weight, 1), (config.masked_weight, maps.occupied)):
+            known = dense_truth.known * cells
+            total = total + weight * map_loss(dense, dense_truth.values, known, config.li_net_norm)
     if config.symmetric_weight:
         total = total + config.symmetric_weight * symmetric
     if config.asymmetric_weight:
@@ -125,7 +117,7 @@ def _special(
     for maps, axes, norm in terms:
         fine, coarse = asymmetries(maps, axes, dense_truth.filled)
         share = 1 / cells if norm == "mean" else 1
-        symmetric = symmetric + share * symmetric_loss(fine)
+        symmetric = symmetric + share * fine.mean()
         asymmetric = asymmetric + share * asymmetric_loss(fine, coarse, eta=config.eta, lambda_c=config.lambda_c)
     return symmetric, asymmetric
 
@@ -134,8 +126,9 @@ def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> De
     """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values above 1 cut off."""
     dense = batch.truth.rotate(maps.cosine, maps.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
-    dense = DenseMap(values, dense.known, dense.filled)
-    return dense.flip_y() if maps.mirrored else dense
+    cells = values, dense.known, dense.filled
+    # The cells lie symmetrically, so reversed rows are the maps of the mirrored pixels.
+    return DenseMap(*(each.flip(2) for each in cells) if maps.mirrored else cells)
 
 
 @contextmanager

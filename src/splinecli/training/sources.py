@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, TypeVar
 
 import torch
 
@@ -18,18 +18,12 @@ from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 from splinecli.training.config import GENERATOR, TrainingConfig
 
 
-class PixelSource(Protocol):
-    """Draws batches of pixels. Its random generator determines the batches."""
-
-    def draw(self, pixels: int) -> PixelBatch:
-        """Draw a batch of P pixels."""
-        ...
-
-
 class MixedSource:
     """Draws each batch from one of several sources, with probabilities proportional to their weights."""
 
-    def __init__(self, sources: Sequence[PixelSource], weights: Sequence[float], generator: torch.Generator) -> None:
+    def __init__(
+        self, sources: Sequence[PixelGenerator | PixelSetSource], weights: Sequence[float], generator: torch.Generator
+    ) -> None:
         self.sources = tuple(sources)
         self.weights = torch.tensor(weights, dtype=torch.float64)
         self.generator = generator
@@ -64,24 +58,34 @@ def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], l
     )
 
 
+PixelSource = PixelGenerator | PixelSetSource | MixedSource
+"""Draws batches of pixels. Its random generator determines the batches."""
+
+SceneSource = tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]
+"""Pixel sets for the refinement net: of each its scenes for training or validation, and its weight."""
+
+Source = TypeVar("Source", PixelSource, SceneSource)
+
+
 @dataclass(frozen=True)
-class Sources:
+class Sources(Generic[Source]):
     """The sources of a run.
 
     Attributes:
-        training: draws training pixels.
-        validation: draws validation pixels, with a generator of its own.
+        training, validation: the sources for either; pixels for validation have a generator of their own.
         sets: SHA-256 of each pixel set by path.
         single_scene_sets: the sets without a validation scene, which are validated on their training pixels.
     """
 
-    training: PixelSource
-    validation: PixelSource
+    training: Source
+    validation: Source
     sets: dict[str, str]
     single_scene_sets: tuple[str, ...]
 
 
-def open_sources(config: TrainingConfig, generator: torch.Generator, validation_generator: torch.Generator) -> Sources:
+def open_sources(
+    config: TrainingConfig, generator: torch.Generator, validation_generator: torch.Generator
+) -> Sources[PixelSource]:
     """Open the sources of a configuration.
 
     Validation draws from the validation scenes, under `usual_lights` lights. A set with a single scene has no
@@ -98,7 +102,7 @@ def open_sources(config: TrainingConfig, generator: torch.Generator, validation_
     validation_pixels = replace(config.pixels, min_lights=usual, max_lights=usual)
 
     def open_all(pixels: PixelGeneratorConfig, own: torch.Generator, *, validate: bool) -> PixelSource:
-        opened: list[PixelSource] = []
+        opened: list[PixelGenerator | PixelSetSource] = []
         for name in weights:
             if name == GENERATOR:
                 opened.append(PixelGenerator(pixels, own))
@@ -116,20 +120,7 @@ def open_sources(config: TrainingConfig, generator: torch.Generator, validation_
     )
 
 
-@dataclass(frozen=True)
-class Scenes:
-    """The pixel sets for the refinement net: of each its scenes for training or validation, and its weight.
-
-    See Sources for `sets` and `single_scene_sets`.
-    """
-
-    training: tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]
-    validation: tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]
-    sets: dict[str, str]
-    single_scene_sets: tuple[str, ...]
-
-
-def open_scenes(config: TrainingConfig) -> Scenes:
+def open_scenes(config: TrainingConfig) -> Sources[SceneSource]:
     """Open the pixel sets of a configuration as whole scenes.
 
     Raises:
@@ -144,13 +135,13 @@ def open_scenes(config: TrainingConfig) -> Scenes:
     sets = {name: open_pixel_set(Path(name)) for name, weight in config.sources.items() if weight > 0}
     parts = _split_sets(sets, config.held_share)
 
-    def together(validate: bool) -> tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]:
+    def together(validate: bool) -> SceneSource:
         return tuple(
             (sets[name], tuple(validation or training if validate else training), config.sources[name])
             for name, (training, validation) in parts.items()
         )
 
-    return Scenes(
+    return Sources(
         together(False),
         together(True),
         {name: pixel_set.sha256 for name, pixel_set in sets.items()},

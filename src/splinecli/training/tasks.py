@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -42,40 +41,6 @@ def stream_seed(seed: int, step: int, stream: int) -> int:
     return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
 
 
-class Task(Protocol):
-    """Draws what a run trains on, and judges a network by it.
-
-    Attributes:
-        sets, single_scene_sets: see Sources.
-    """
-
-    sets: dict[str, str]
-    single_scene_sets: tuple[str, ...]
-
-    def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
-        ...
-
-    def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
-        """Yield the losses of each of this process's shards of a step's batch."""
-        ...
-
-    def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
-        """Return the mean angular error on what is not trained on, in degrees."""
-        ...
-
-    def sample_maps(self, network: SplineNet) -> SampleMaps | None:
-        """Return observation maps for maps.png, if the task has some."""
-        ...
-
-
-def open_task(config: TrainingConfig, shards: range, device: torch.device) -> Task:
-    """Open the sources of a run. Raises InputError, UsageError."""
-    if config.updates == "refine_net":
-        return RefinementTask(config, shards, device)
-    return PixelTask(config, shards, device)
-
-
 class PixelTask:
     """Batches of pixels from the sources of a run.
 
@@ -97,6 +62,7 @@ class PixelTask:
         self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
+        """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
         if rank == 0:
             pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
             draws = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
@@ -123,6 +89,7 @@ class PixelTask:
         return shards, mirrored
 
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
+        """Yield the losses of each of this process's shards of a step's batch."""
         shards, mirrored = self.draw(step)
         # One shard at a time: its pixels have about equally many lights, so hardly any padding is computed.
         for batch, turn_deg in shards:
