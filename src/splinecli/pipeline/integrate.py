@@ -128,9 +128,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 
     from splinecli.capture import read_normal_map
     from splinecli.capture.capture_size import BYTES_OF_SURFACE
+    from splinecli.capture.formats.depth_files import read_depth
     from splinecli.capture.formats.image_size import ExpectedSize, check_memory
     from splinecli.capture.lights.lamp_files import read_camera_matrix
-    from splinecli.capture.formats.depth_files import read_depth
     from splinecli.system.publishing import new_files
 
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
