@@ -126,7 +126,7 @@ BAD_PRIORS = {
     "integers": (np.ones(SHAPE, np.uint16), "expected floating-point numbers"),
     "vectors": (np.ones((*SHAPE, 2), np.float32), "expected floating-point numbers"),
     "nothing": (np.full(SHAPE, np.nan, np.float32), "the prior has no value in the mask"),
-    "negated": (-sphere()[1].astype(np.float32), "the slopes of the prior are -0."),
+    "negated": (-sphere()[1].astype(np.float32), "the slopes of the prior are -"),
 }
 
 

@@ -34,7 +34,8 @@ _SOLVES_OF_COARSEST = 150
 _MOST_SOLVES, _FEWEST_SOLVES = 20, 4  # the most at finer scales, of small maps and of large ones
 _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
 _PRIOR_DETAIL = 0.15  # of the root of the mask's area
-_CLEARLY_CORRELATED, _MOST_TIMES_STEEPER = 0.5, 2.0  # slopes of prior and normals
+_CORRELATED = 0.3  # slopes of prior and normals
+_LEAST_STEEP, _MOST_STEEP = 0.02, 5.0  # times the normals' slopes; a blurred prior is flatter
 _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
 
 Progress = Callable[[float], object]
@@ -193,7 +194,7 @@ def _heights_of_prior(
 
 def _check_prior(surface: _Surface) -> None:
     """Raise InputError for a prior that is negated, or in another unit than the normals."""
-    step = max(1, min(round(surface.prior_detail), min(surface.mask.shape) // 4))
+    step = max(1, round(min(surface.prior_detail, *surface.mask.shape) / 4))
     coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
     equations = BilateralEquations.from_normals(coarse.normal_map, coarse.mask, coarse.camera_matrix)
     assert coarse.prior is not None
@@ -207,7 +208,7 @@ def _check_prior(surface: _Surface) -> None:
     both = float(found @ wanted)
     correlation = both / max(float(np.linalg.norm(found) * np.linalg.norm(wanted)), 1e-12)
     steeper = both / max(float(wanted @ wanted), 1e-12)
-    if abs(correlation) > _CLEARLY_CORRELATED and not 1 / _MOST_TIMES_STEEPER <= steeper <= _MOST_TIMES_STEEPER:
+    if abs(correlation) > _CORRELATED and not _LEAST_STEEP < steeper < _MOST_STEEP:
         raise InputError(
             f"the slopes of the prior are {steeper:.2g} times those of the normals, expected about 1",
             hint="Give heights towards the camera, or depths with a camera matrix, in the unit of the result",
