@@ -138,6 +138,15 @@ def test_a_bad_prior(run, case):
     assert (result.code, message in result.err, Path("out/surface.json").exists()) == (3, True, False), result.err
 
 
+def test_a_prior_that_breaks_off(run):
+    """The library prints warnings, which belong neither to stdout nor to stderr."""
+    prior = write_depth("exr", np.ones(SHAPE, np.float32))
+    whole = Path(prior).read_bytes()
+    Path(prior).write_bytes(whole[: len(whole) // 2])
+    result = run("integrate", "normals.png", "--prior", prior, "-o", "out")
+    assert (result.code, result.out, result.err.count("\n"), "cannot be read" in result.err) == (3, "", 1, True), result
+
+
 def test_a_damaged_prior(run):
     for name in ("prior.npy", "prior.tif", "prior.exr"):
         Path(name).write_bytes(b"\x93NUMPY\x01\x00garbage")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
+from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.system.extras import import_extra
@@ -34,7 +37,7 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
             stored = _read_exr(path, expected)
         else:
             stored = decode_image(path, expected)
-    except (OSError, ValueError, RuntimeError, EOFError) as error:
+    except (OSError, ValueError, RuntimeError, EOFError, LookupError, TypeError) as error:
         raise InputError(f"the depth map cannot be read ({error})", path=path) from error
     if stored.ndim == 3 and stored.shape[2] in (1, 3, 4):
         stored = stored[..., 0]
@@ -53,10 +56,15 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
 def _read_exr(path: Path, expected: ExpectedSize) -> NDArray[Any]:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
-    low, high = library.File(str(path), header_only=True).header()["dataWindow"]
+    with native_stderr():
+        low, high = library.File(str(path), header_only=True).header()["dataWindow"]
     shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
     check_stored_size(shape, 4, path, expected)
-    channels = library.File(str(path)).channels()
+    # Of damaged pixels, the library only prints a warning; stdout belongs to the product of a command.
+    with redirect_stdout(io.StringIO()) as printed, native_stderr():
+        channels = library.File(str(path)).channels()
+    if printed.getvalue():
+        raise InputError("the EXR file is damaged and cannot be read", path=path)
     for name in (*_EXR_CHANNELS, *channels):
         if name in channels:
             return np.asarray(channels[name].pixels)
