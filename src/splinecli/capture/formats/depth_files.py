@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
 from splinecli.capture.formats.native_stderr import native_stderr
+from splinecli.capture.formats.normal_arrays import read_guarded
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.system.extras import import_extra
@@ -28,17 +29,8 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
         UsageError: the file is an EXR file, and OpenEXR is not installed.
     """
     check_file(path, "a depth map")
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".npy":
-            stored: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-            check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
-        elif suffix == ".exr":
-            stored = _read_exr(path, expected)
-        else:
-            stored = decode_image(path, expected)
-    except (OSError, ValueError, RuntimeError, EOFError, LookupError, TypeError) as error:
-        raise InputError(f"the depth map cannot be read ({error})", path=path) from error
+    read = {".npy": _map_npy, ".exr": _read_exr}.get(path.suffix.lower(), decode_image)
+    stored = read_guarded(path, "the depth map is damaged and cannot be read", read, expected)
     if stored.ndim == 3 and stored.shape[2] in (1, 3, 4):
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
@@ -53,7 +45,13 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
     return depth
 
 
-def _read_exr(path: Path, expected: ExpectedSize) -> NDArray[Any]:
+def _map_npy(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
+    stored: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+    check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
+    return stored
+
+
+def _read_exr(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
     with native_stderr():

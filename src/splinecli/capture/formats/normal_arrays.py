@@ -14,7 +14,7 @@ from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
 from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
 from splinecli.capture.paths import check_file
-from splinecli.errors import InputError
+from splinecli.errors import InputError, SplinecliError
 from splinecli.system.memory import is_out_of_memory
 
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
@@ -56,10 +56,10 @@ def read_vectors(path: Path, expected: ExpectedSize | None = None, *, text: bool
     suffix = path.suffix.lower()
     check_file(path, "a normal map")
     if suffix == ".mat":
-        values = _read_file(path, "the MATLAB file is damaged and cannot be read", read_mat, expected)
+        values = read_guarded(path, "the MATLAB file is damaged and cannot be read", read_mat, expected)
     elif suffix == ".npy":
         problem = "the .npy file is damaged, or contains no array of numbers"
-        values = _read_file(path, problem, _read_npy, expected)
+        values = read_guarded(path, problem, _read_npy, expected)
     elif suffix == ".txt" and text and expected is not None:
         values = _read_text(path, expected.shape)
     else:
@@ -76,16 +76,16 @@ def check_vectors(shape: tuple[int, ...], path: Path) -> None:
         )
 
 
-def _read_file(
+def read_guarded(
     path: Path,
     problem: str,
     read: Callable[[Path, ExpectedSize | None], NDArray[Any]],
     expected: ExpectedSize | None,
 ) -> NDArray[Any]:
-    """Return what a reader returns. Whatever it raises for a damaged file becomes an InputError."""
+    """Return what a reader returns. Whatever it raises for a damaged file becomes an InputError with this problem."""
     try:
         return read(path, expected)
-    except InputError:
+    except SplinecliError:
         raise
     except PermissionError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
