@@ -229,10 +229,13 @@ def _further_files(
         ("preview", files.write_preview),
         ("gradient", files.write_gradient),
         ("curvature", files.write_curvature),
-        ("relief", files.write_relief),
     ):
         if name in options.maps:
             writers.append(partial(write, estimate))
+    if "relief" in options.maps:
+        from splinecli.surface.relief import relief_of_normals
+
+        writers.append(partial(files.write_relief, relief_of_normals(estimate.normal_map, capture.mask)))
     light_plot = None
     if capture.light_errors_deg is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)

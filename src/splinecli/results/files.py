@@ -25,7 +25,6 @@ from splinecli.pictures.maps import (
 )
 from splinecli.pictures.png import encode_png
 from splinecli.results.clock import Clock
-from splinecli.surface.relief import relief_of_normals
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import NewFiles, is_plain, new_files
@@ -249,9 +248,8 @@ def write_curvature(estimate: NormalEstimate, new: NewFiles) -> None:
     new.write(CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], CURVATURE_SCALE), {"curvature": scale}))
 
 
-def write_relief(estimate: NormalEstimate, new: NewFiles) -> None:
-    """Write the relief (H, W) as a float32 NPY file and as a gray picture."""
-    relief = relief_of_normals(estimate.normal_map, estimate.capture.mask)
+def write_relief(relief: NDArray[np.float32], new: NewFiles) -> None:
+    """Write a relief (H, W) as a float32 NPY file and as a gray picture."""
     with new.open(RELIEF) as file:
         np.save(file, relief, allow_pickle=False)
     scale = f"height, black {-RELIEF_SCALE}, gray 0, white {RELIEF_SCALE} pixels"
