@@ -8,7 +8,7 @@ figures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ class Candidate:
     Args:
         name: in words, such as "y negated".
         frame: its frame, relative to the given one. None where it is an order that no frame stands for.
+        matrix: (3, 3) M, where lights @ M' are those of this reading.
         misfit: distance between the images and these lights, as a share of the median of random orders; None where
             there are too few lights.
         curl: of the normals; 0 is a surface.
@@ -59,6 +60,7 @@ class Candidate:
 
     name: str
     frame: LightFrame | None
+    matrix: Array = field(compare=False)
     misfit: float | None
     curl: float
     rim: float | None
@@ -165,23 +167,21 @@ def _check_frame_and_order(
         weight = 0.0
     weight = float(np.clip(weight, 0, 1))
     frames = [
-        _candidate(frame.describe() or _AS_GIVEN, frame, normals.transformed(frame.matrix), found.misfit, weight)
+        _candidate(frame.describe() or _AS_GIVEN, frame, frame.matrix, normals, found.misfit, weight)
         for frame in PLANE_FRAMES
         if frame.signs[0] > 0
     ]
     first, *others = (*frames, *map(_negated, frames))
     for row, matrix in found.turns:
         words, steps = shift_words(row, len(light_directions)), shift_steps(row, len(light_directions))
-        turned = _candidate(words, None, normals.transformed(matrix), found.misfit, weight)
+        turned = _candidate(words, None, matrix, normals, found.misfit, weight)
         others.append(replace(turned, steps=steps))
     ranked = sorted((_judge(other, first, weight) for other in others), key=lambda other: -other.advantage)
     # Where no order fits, the normals are no evidence.
     best = None if found.order == UNKNOWN_ORDER else _best(ranked, in_order=found.order is not None)
     order, mended = found.order, None
     if order != UNKNOWN_ORDER and (order is not None or best is not None):
-        matrices = {shift_words(row, len(light_directions)): matrix for row, matrix in found.turns}
-        matrix = np.eye(3) if best is None else matrices[best.name] if best.frame is None else best.frame.matrix
-        mended = found.lights @ matrix.T
+        mended = found.lights if best is None else found.lights @ best.matrix.T
     if order is not None and best is not None and best.frame is None:
         order, best = best.name, None  # one of several orders that fit, told by the normals
     return LightCheck(
@@ -201,9 +201,10 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
 
 
 def _candidate(
-    name: str, frame: LightFrame | None, normals: RoughNormals, misfit: float | None, weight: float
+    name: str, frame: LightFrame | None, matrix: Array, normals: RoughNormals, misfit: float | None, weight: float
 ) -> Candidate:
-    return Candidate(name, frame, misfit, normals.curl(), normals.rim() if weight > 0 else None)
+    normals = normals.transformed(matrix)
+    return Candidate(name, frame, matrix, misfit, normals.curl(), normals.rim() if weight > 0 else None)
 
 
 def _negated(candidate: Candidate) -> Candidate:
@@ -211,7 +212,7 @@ def _negated(candidate: Candidate) -> Candidate:
     assert candidate.frame is not None
     frame = BOTH_NEGATED.after(candidate.frame)
     rim = None if candidate.rim is None else -candidate.rim
-    return replace(candidate, name=frame.describe(), frame=frame, rim=rim)
+    return replace(candidate, name=frame.describe(), frame=frame, matrix=frame.matrix, rim=rim)
 
 
 def _judge(other: Candidate, given: Candidate, weight: float) -> Candidate:

@@ -133,9 +133,10 @@ def check_order(
     found = _better_reading(given, (*shifts, *others), usual)
     if found.misfit > MIN_RING_MISFIT * usual and np.array_equal(chosen, np.arange(len(light_directions))):
         words, mended, misfit = mend_rings(compared, lights)
-        others += [_Reading(words, mended, misfit)] if words else []
-        if words and misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
-            found = others[-1]
+        if words:
+            others.append(_Reading(words, mended, misfit))
+            if misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
+                found = others[-1]
     if found is given and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
     turns: tuple[tuple[int, Array], ...] = ()

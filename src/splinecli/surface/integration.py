@@ -115,13 +115,13 @@ class _Surface(NamedTuple):
         return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
 
 
-def _integrate(known: _Surface, stiffness: float, progress: Progress) -> Floats:
+def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Floats:
     """Return the heights (P,) of the mask's pixels; see integrate_normals.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by how much, is found
     at the coarsest scale, where many solves take little time. Finer scales follow the edges.
     """
-    normal_map, mask, camera_matrix, prior, prior_detail = known
+    normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
     heights: Floats = np.zeros(n_pixels)
@@ -131,7 +131,7 @@ def _integrate(known: _Surface, stiffness: float, progress: Progress) -> Floats:
     is_huge = n_pixels > _FINEST
     if is_huge or (n_pixels > _COARSEST and stiffness > 0):
         blocks = Blocks.of_step(mask, 2)
-        coarse = known.of_blocks(blocks, keep_edges=not is_huge)
+        coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
         of_blocks[blocks.mask] = _integrate(
             coarse,
