@@ -49,6 +49,7 @@ def estimate_capture(
     from splinecli.capture.capture_warnings import ROUGH_LIGHTS
     from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
     from splinecli.inference import estimate_normals
+    from splinecli.methods.near_light import find_surface
     from splinecli.pipeline.distillation import distil_for
 
     clock = clock or Clock()
@@ -60,6 +61,8 @@ def estimate_capture(
         capture = refine_lights(capture)
         warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
         warnings += capture.warnings[before:]
+    clock.begin("estimate")
+    capture = find_surface(capture)
     clock.begin("distil")
     distilled, found = distil_for(capture, estimator, distil, observer)
     with ExitStack() as stages:
