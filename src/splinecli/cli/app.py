@@ -19,6 +19,7 @@ from splinecli.cli.info import info
 from splinecli.cli.integrate import integrate
 from splinecli.cli.prepare import prepare
 from splinecli.cli.train import train
+from splinecli.cli.watch import watch
 
 app = typer.Typer(
     name="splinecli",
@@ -59,5 +60,5 @@ def _add(command: Callable[..., object]) -> None:
     app.command(cls=Command)(command)
 
 
-for _command in (infer, info, calibrate, integrate, evaluate, prepare, train, import_weights):
+for _command in (infer, watch, info, calibrate, integrate, evaluate, prepare, train, import_weights):
     _add(_command)

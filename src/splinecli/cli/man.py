@@ -99,6 +99,7 @@ EXAMPLES = (
         "splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html",
         "Also write albedo, preview, mesh and page.",
     ),
+    ("splinecli watch parts/ -- --lights l.txt --jsonl", "Compute each part that arrives."),
     ("splinecli info obj/", "Show what infer would read."),
     (
         "splinecli info obj/ --transfer srgb --plot lights.png",

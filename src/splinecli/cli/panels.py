@@ -43,6 +43,7 @@ PANELS: dict[str, dict[str, tuple[str, ...]]] = {
         "Speed": ("--distil", *SPEED),
         "Processes and machines": ("--workers", "--cluster", "--shard"),
     },
+    "watch": {"Captures": ("--marker", "--settle")},
     "info": {
         "Input": ("--mask", *PART, "--ground-truth", *VALUES),
         "Lights": (
