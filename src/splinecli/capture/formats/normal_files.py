@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.facts import stored_size
+from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import cut_out, read_mask
 from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors
@@ -54,7 +54,7 @@ def read_normal_map(
     expected = None
     if mask is not None:
         # Both headers are compared before either file is decoded.
-        shape = stored_size(mask)[0] if isinstance(mask, Path) else mask.shape
+        shape = read_facts(mask).size[0] if isinstance(mask, Path) else mask.shape
         expected = ExpectedSize(shape, "the mask", "a normal map")
     stored = read_vectors(path, expected)
     if isinstance(mask, Path):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.facts import is_image
+from splinecli.capture.formats.facts import JPEG, PNG, TIFF
 from splinecli.capture.paths import check_file, is_substitution
 from splinecli.errors import InputError
 
@@ -146,7 +146,7 @@ def read_lines(
     try:
         text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError:
-        if is_image(content):
+        if content.startswith((PNG, JPEG, *TIFF)):
             raise InputError(f"found an image, expected {expected}", path=path) from None
         if not else_latin_1:
             hint = "Save it as plain UTF-8 text"
