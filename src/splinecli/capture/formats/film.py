@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from splinecli.capture.formats.image_size import check_stored_size
 from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.paths import check_file, is_folder
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
 
 if TYPE_CHECKING:
@@ -41,13 +42,8 @@ _MOST_CLIPPED = 0.01  # share of pixels that are overexposed
 _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
 
 
-class _Candidate(NamedTuple):
-    """A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels."""
-
-    number: int
-    thumbnail: NDArray[np.float32]
-    sharpness: float
-    clipped: float
+_Candidate = tuple[int, NDArray[np.float32], float, float]
+"""A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels."""
 
 
 def is_film(path: Path) -> bool:
@@ -61,25 +57,27 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     Raises:
         InputError: the film cannot be read, or its light does not move.
     """
-    candidates = _candidates(film)
-    light = np.array([frame.thumbnail.mean() for frame in candidates])
-    clipped = np.array([frame.clipped for frame in candidates])
+    numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
+    light = thumbnails.mean(axis=1)
+    # Under another light, sharpness is another: only the frames around are compared.
+    around = [
+        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]) for place in range(len(sharpness))
+    ]
     usable = (
-        _sharp(np.array([frame.sharpness for frame in candidates]))
+        (sharpness >= _BLURRED * np.array(around))
         & (light >= _DARK * np.median(light))
         & (light > 0)
         & (clipped <= max(_MOST_CLIPPED, float(np.median(clipped))))
     )
-    frames = [frame for frame, use in zip(candidates, usable, strict=True) if use]
-    chosen = _farthest([frame.thumbnail for frame in frames])
+    chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"found {len(chosen)} of {len(candidates)} frames that are sharp and differ in their light,"
+            f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light,"
             f" expected at least {FEWEST_FRAMES}",
             path=film,
             hint="Film from a tripod while the lamp moves all around the object, with focus and exposure locked",
         )
-    return tuple(sorted(frames[place].number for place in chosen))
+    return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
 def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
@@ -133,23 +131,14 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     clipped = float((small.max(axis=2) >= _CLIPPED).mean())
     stored = np.asarray(reduced(small, _THUMBNAIL) / 255, np.float32)
     linear = np.asarray(decode_transfer(stored, BT709).mean(axis=2), np.float32)
-    return _Candidate(number, linear.ravel(), sharpness, clipped)
+    return number, linear.ravel(), sharpness, clipped
 
 
-def _sharp(sharpness: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which frames are about as sharp as those around them. Under another light, sharpness is another."""
-    around = [
-        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]) for place in range(len(sharpness))
-    ]
-    return np.asarray(sharpness >= _BLURRED * np.array(around))
-
-
-def _farthest(thumbnails: list[NDArray[np.float32]]) -> list[int]:
-    """Choose thumbnails one by one, each the farthest from those chosen. Their brightness does not count."""
-    if not thumbnails:
+def _farthest(thumbnails: NDArray[np.float32]) -> list[int]:
+    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Their brightness does not count."""
+    if not len(thumbnails):
         return []
-    vectors = np.stack(thumbnails)
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    vectors = unit(thumbnails)
     distance = np.linalg.norm(vectors - vectors.mean(axis=0), axis=1)
     chosen = [int(distance.argmax())]
     distance = np.linalg.norm(vectors - vectors[chosen[0]], axis=1)
