@@ -12,8 +12,7 @@ from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
 LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
-NAMED_LIGHTS = (".lp", "lights.json")
-"""Endings of the names of light files that name the image of each light."""
+_NAMED_LIGHTS = (".lp", "lights.json")  # endings of the names of light files that name the image of each light
 LIGHT_POSITIONS = ("light_positions.txt",)
 LIGHT_FILES = "light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt"
 """The usual names of light files, for messages."""
@@ -136,7 +135,7 @@ def find_lights(folder: Path) -> Path | None:
     plain = find_named(folder, LIGHT_DIRECTIONS)
     if plain is not None:
         return plain
-    named = [e for e in list_folder(folder) if e.name.lower().endswith(NAMED_LIGHTS) and is_found_file(e)]
+    named = [e for e in list_folder(folder) if e.name.lower().endswith(_NAMED_LIGHTS) and is_found_file(e)]
     if len(named) > 1:
         raise InputError(
             f"found {len(named)} light files: {', '.join(path.name for path in named)}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os.path
 import re
 import stat
 from collections.abc import Collection, Sequence
@@ -26,7 +27,7 @@ class NoImagesError(InputError):
     """A folder contains no images."""
 
 
-def natural_key(path: Path) -> tuple[list[int | str], str]:
+def _natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.
     parts: list[int | str] = [
@@ -50,10 +51,12 @@ def list_folder(folder: Path) -> list[Path]:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise InputError(f"the folder cannot be read ({error.strerror})", path=folder) from None
-    return sorted(entries, key=natural_key)
+    return sorted(entries, key=_natural_key)
 
 
-def list_images(folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]) -> tuple[Path, ...]:
+def list_images(
+    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path] = ()
+) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
     Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and
@@ -72,15 +75,13 @@ def list_images(folder: Path, *, leave_out_stems: Collection[str], leave_out: Co
         and is_found_file(entry)
         and resolve(entry) not in others
     ]
-    raw, developed = (
-        {image.stem.lower() for image in images if image.suffix.lower() in suffixes}
-        for suffixes in (RAW_SUFFIXES, _DEVELOPED)
-    )
+    names = [(image.stem.lower(), image.suffix.lower()) for image in images]
+    raw = {stem for stem, suffix in names if suffix in RAW_SUFFIXES}
+    developed = {stem for stem, suffix in names if suffix in _DEVELOPED}
     return tuple(
         image
-        for image in images
-        if image.stem.lower() not in raw
-        or image.suffix.lower() in (_DEVELOPED if image.stem.lower() in developed else RAW_SUFFIXES)
+        for image, (stem, suffix) in zip(images, names, strict=True)
+        if stem not in raw or suffix in (_DEVELOPED if stem in developed else RAW_SUFFIXES)
     )
 
 
@@ -113,17 +114,9 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
                 line=line,
                 hint="Copy the image into the folder, or set a link to it there, and name that",
             )
-        try:
-            exists = find_mode(image) is not None
-        except InputError:  # the system refuses, for example because the name is too long
-            exists = False
-        if not exists:
-            raise InputError(
-                f'the image "{name}" does not exist',
-                path=path,
-                line=line,
-                hint="Correct the name or remove the line",
-            )
+        if not os.path.exists(image):  # noqa: PTH110 - Path.exists raises for a name that is too long
+            hint = "Correct the name or remove the line"
+            raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
         check_file(image, "an image")
         if image in images:
             raise InputError(f'the image "{name}" is also on line {images[image]}', path=path, line=line)

@@ -89,7 +89,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
-    return [folder] if _looks_like_capture(folder) else cyclesps.list_captures(folder)
+    return [folder] if _looks_like_capture(folder) else cyclesps.list_captures(folder) or []
 
 
 def _captures_below(folder: Path) -> list[Path]:
@@ -107,7 +107,6 @@ def _looks_like_capture(folder: Path) -> bool:
         return False
     if find_named(folder, [FILENAMES]) is not None:
         return True
-    objects = psbox.list_objects(folder)
-    if objects is not None:
-        return bool(objects)
-    return bool(list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=()))
+    objects = folder / psbox.OBJECTS
+    is_psbox = is_folder(objects) and find_named(folder, psbox.LIGHT_DIRECTIONS) is not None
+    return bool(list_images(objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS))
