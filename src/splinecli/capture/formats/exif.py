@@ -13,9 +13,7 @@ from splinecli.errors import InputError
 UPRIGHT = 1
 """The orientation of images that are shown as they are stored."""
 
-SAME = 0.1
-"""Exposures within this share of each other count as one: shutters and ISO numbers are rounded."""
-
+_SAME = 0.1  # share within which two exposures count as one: shutters and ISO numbers are rounded
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 
 
@@ -55,7 +53,7 @@ def check_exposures(images: Sequence[ImageFacts]) -> None:
     found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
     for facts, exposure in found[1:]:
         first, expected = found[0]
-        if abs(exposure.relative / expected.relative - 1) > SAME:
+        if abs(exposure.relative / expected.relative - 1) > _SAME:
             raise InputError(
                 f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
                 path=facts.path,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.damage import damage_as_input_error
 from splinecli.capture.formats.image_size import check_stored_size
 from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.paths import check_file, is_folder
@@ -89,8 +90,8 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
                 while place <= number and video.grab():
                     place += 1
             if place <= number:
-                raise _damaged(film)
-            yield np.ascontiguousarray(_picture(video, film)[..., ::-1])
+                raise ValueError
+            yield np.ascontiguousarray(_picture(video)[..., ::-1])
 
 
 def _candidates(film: Path) -> list[_Candidate]:
@@ -104,12 +105,12 @@ def _candidates(film: Path) -> list[_Candidate]:
         with native_stderr():
             while video.grab():
                 if number % step == 0:
-                    found.append(_candidate(number, _picture(video, film)))
+                    found.append(_candidate(number, _picture(video)))
                 if len(found) >= _CANDIDATES:
                     found, step = found[::2], 2 * step
                 number += 1
-    if not found:
-        raise _damaged(film)
+        if not found:
+            raise ValueError
     if number < _LEAST_READ * stated:
         raise InputError(
             f"the film breaks off: {number} of {stated:.0f} frames can be read", path=film, hint="Copy it again"
@@ -150,40 +151,31 @@ def _farthest(thumbnails: NDArray[np.float32]) -> list[int]:
 
 @contextmanager
 def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
-    """Yield an opened film. Raises InputError."""
+    """Yield an opened film. What is raised for a damaged one becomes an InputError."""
     import cv2
 
     check_file(film, "a film")
-    try:
+    problem = "the film is damaged, or in a form that cannot be read"
+    with damage_as_input_error(film, problem, "Copy it again, or convert it to MP4 with H.264"):
         with film.open("rb") as file:
             start = file.read(16)
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=film) from None
-    if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
-        raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
-    with native_stderr():
-        video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
-    try:
-        if not video.isOpened():
-            raise _damaged(film)
-        size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
-        check_stored_size(size, 1, film)
-        yield video
-    finally:
-        video.release()
+        if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
+            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+        with native_stderr():
+            video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
+        try:
+            if not video.isOpened():
+                raise ValueError
+            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
+            check_stored_size(size, 1, film)
+            yield video
+        finally:
+            video.release()
 
 
-def _picture(video: cv2.VideoCapture, film: Path) -> NDArray[np.uint8]:
-    """Return the frame that was grabbed, (H, W, 3) in BGR order. Raises InputError."""
+def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
+    """Return the frame that was grabbed, (H, W, 3) in BGR order. Raises ValueError."""
     done, picture = video.retrieve()
     if not done or picture is None or picture.ndim != 3:
-        raise _damaged(film)
+        raise ValueError
     return np.asarray(picture, np.uint8)
-
-
-def _damaged(film: Path) -> InputError:
-    return InputError(
-        "the film is damaged, or in a form that cannot be read",
-        path=film,
-        hint="Copy it again, or convert it to MP4 with H.264",
-    )

@@ -78,12 +78,13 @@ def _numbers(file: BinaryIO, variable: _Variable) -> NDArray[Any]:
 
 def _choose(variables: list[_Variable], path: Path) -> _Variable:
     """Return the variable that is the normal map. Raises InputError."""
-    maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
-    named = next((v for v in variables if v.name == KEY), None)
-    if named is None and len(maps) != 1:
-        found = ", ".join(maps) or "none"
-        raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
-    chosen = named or next(iter(maps.values()))
+    chosen = next((v for v in variables if v.name == KEY), None)
+    if chosen is None:
+        maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
+        if len(maps) != 1:
+            found = ", ".join(maps) or "none"
+            raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
+        (chosen,) = maps.values()
     check_vectors(chosen.shape, path)
     return chosen
 

@@ -198,8 +198,7 @@ def _to_number(word: str) -> float | None:
 def parse_number(word: str, path: Path, line: int) -> float:
     """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
     value = _to_number(word)
-    if value is None:
-        raise InputError(f'found "{word[:40]}", expected a number', path=path, line=line)
-    if not np.isfinite(value):
-        raise InputError(f'found "{word[:40]}", expected a finite number', path=path, line=line)
+    if value is None or not np.isfinite(value):
+        what = "a number" if value is None else "a finite number"
+        raise InputError(f'found "{word[:40]}", expected {what}', path=path, line=line)
     return value

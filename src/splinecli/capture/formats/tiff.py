@@ -17,8 +17,6 @@ from splinecli.capture.formats.damage import COPY_AGAIN, damage_as_input_error
 from splinecli.errors import InputError
 from splinecli.system.memory import is_out_of_memory
 
-_DAMAGED = "the TIFF is damaged and cannot be read"
-
 _LONGEST_EMPTY_PART = 1 << 16  # bytes, such as the tables of a JPEG in a TIFF
 _LARGEST_EMPTY_PART = 1 << 24  # bytes by which a tile may be larger than the whole picture
 
@@ -65,7 +63,7 @@ def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
     logger = logging.getLogger("tifffile")
     before, logger.disabled = logger.disabled, True  # the error says what a user needs
     try:
-        with damage_as_input_error(path, _DAMAGED, COPY_AGAIN):
+        with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
             _check_tags(file)
             file.seek(0)
             with tifffile.TiffFile(file, name=path.name) as pages:

@@ -25,25 +25,13 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
-NOT_PHOTOGRAPHS = frozenset(
-    {Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)}
-    # What splinecli writes, for an output folder that is also the capture's.
-    | {
-        "normals",
-        "normals_8bit",
-        "error_map",
-        "albedo",
-        "confidence",
-        "curvature",
-        "relief",
-        "preview",
-        "depth",
-        "mesh",
-        "found_mask",
-        "calibration",
-        "lights",
-    }
-)
+_WRITTEN = {
+    "normals", "normals_8bit", "error_map", "albedo", "confidence", "curvature", "relief", "preview", "depth", "mesh",
+    "found_mask", "calibration", "lights",
+}  # fmt: skip
+"""Stems of what splinecli writes, for an output folder that is also the capture's."""
+
+NOT_PHOTOGRAPHS = frozenset({Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)} | _WRITTEN)
 """Lower-case stems of pictures in a capture's folder that are not images of the object under one light."""
 
 
@@ -109,7 +97,9 @@ def gather_files(
     images: tuple[Path, ...],
     lights: Path | None,
     overrides: Overrides,
+    *,
     ground_truth_names: Sequence[str] = GROUND_TRUTH,
+    others: tuple[Path, ...] = (),
 ) -> CaptureFiles:
     """Return the images and lights with the other files of the folder. Files named by the user replace those."""
     return CaptureFiles(
@@ -121,6 +111,7 @@ def gather_files(
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
         mask=overrides.mask or find_named(folder, MASK),
         ground_truth=overrides.ground_truth or find_named(folder, ground_truth_names),
+        others=others,
     )
 
 

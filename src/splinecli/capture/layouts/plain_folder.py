@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 from splinecli.capture.layouts.capture_files import (
@@ -58,4 +57,4 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     if filenames is not None and find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
         layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
-    return replace(gather_files(layout, folder, images, lights, overrides, ground_truth), others=others)
+    return gather_files(layout, folder, images, lights, overrides, ground_truth_names=ground_truth, others=others)
