@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP"}
 """The first bytes of the files. Those of a PNG are the longest."""
 
 PILLOW_KINDS = ("BMP", "TGA")
@@ -74,7 +75,6 @@ class ImageFacts:
     """What the header of an image file states.
 
     Args:
-        path: the file.
         kind: "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them.
         stated_size: None for a RAW file, and for a damaged one.
         curve: that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
@@ -119,20 +119,15 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
     check_file(path, "an image")
     try:
         with path.open("rb") as file:
-            start = file.read(len(PNG))
+            start, suffix = file.read(len(PNG)), path.suffix.lower()
             file.seek(0)
-            if start and path.suffix.lower() in RAW_SUFFIXES:
-                kind = "RAW"
-            elif start.startswith((PNG, JPEG)):
-                kind = "PNG" if start == PNG else "JPEG"
-            elif start.startswith(TIFF):
-                kind = "TIFF"
-            elif start.startswith(b"BM"):
-                kind = "BMP"
-            elif start and path.suffix.lower() == ".tga":  # its files begin with nothing that is only theirs
-                kind = "TGA"
-            else:
-                raise InputError("found neither PNG, TIFF, JPEG nor BMP" if start else "the file is empty", path=path)
+            if not start:
+                raise InputError("the file is empty", path=path)
+            otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
+            found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
+            kind = "RAW" if suffix in RAW_SUFFIXES else found
+            if kind is None:
+                raise InputError("found neither PNG, TIFF, JPEG nor BMP", path=path)
             yield file, kind
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None

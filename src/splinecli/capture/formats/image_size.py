@@ -15,12 +15,9 @@ from splinecli.system.memory import LARGEST_IMAGE, available_memory
 
 @dataclass(frozen=True)
 class ExpectedSize:
-    """The size that an image must have.
+    """The size (H, W) or (H, W, C) that an image must have.
 
-    Args:
-        shape: (H, W) or (H, W, C).
-        like: where it comes from, such as the name of the first image.
-        what: what the image is, with its article.
+    Messages say `like` what, such as the name of the first image, and `what` the image is, with its article.
     """
 
     shape: tuple[int, ...]

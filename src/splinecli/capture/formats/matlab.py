@@ -54,7 +54,15 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
         KeyError, ValueError, struct.error, zlib.error: the file is damaged.
     """
     with path.open("rb") as file:
-        variable = _choose(list(_variables(file, path)), path)
+        variables = list(_variables(file, path))
+        variable = next((v for v in variables if v.name == KEY), None)
+        if variable is None:
+            maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
+            if len(maps) != 1:
+                found = ", ".join(maps) or "none"
+                raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
+            (variable,) = maps.values()
+        check_vectors(variable.shape, path)
         check_stored_size(variable.shape, 8, path, expected)
         return _numbers(file, variable)
 
@@ -74,19 +82,6 @@ def _numbers(file: BinaryIO, variable: _Variable) -> NDArray[Any]:
     content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
     kind, numbers = next(islice(_parts(content, variable.order), 3, None))
     return np.frombuffer(numbers, variable.order + _NUMBERS[kind]).reshape(variable.shape, order="F")
-
-
-def _choose(variables: list[_Variable], path: Path) -> _Variable:
-    """Return the variable that is the normal map. Raises InputError."""
-    chosen = next((v for v in variables if v.name == KEY), None)
-    if chosen is None:
-        maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
-        if len(maps) != 1:
-            found = ", ".join(maps) or "none"
-            raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
-        (chosen,) = maps.values()
-    check_vectors(chosen.shape, path)
-    return chosen
 
 
 def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:

@@ -50,16 +50,14 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
                 output_color=rawpy.ColorSpace.raw,
                 output_bps=16,
                 gamma=(1, 1),
-                # White balance of the camera, or an automatic one, would differ between images. LibRaw's daylight
-                # balance is fixed, but brightens red and blue, which would reach full scale before saturation.
+                # Other white balances differ between images, or bring red and blue to full scale before saturation.
                 user_wb=[1, 1, 1, 1],
                 no_auto_bright=True,
                 user_sat=_full_scale(raw),  # the default is each image's own maximum, if that is near
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
-                # Other algorithms choose the direction of interpolation by the image, so differently under each light.
-                # For textured objects their normals have two to three times the error (AHD 1.4 degrees, LINEAR 0.5).
-                # For uniform objects their normals are better (0.2 and 0.4 degrees).
+                # Others interpolate differently under each light: normals of textured objects have two to three
+                # times the error (AHD 1.4 degrees, LINEAR 0.5), those of uniform objects half of it (0.2, 0.4).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
     # Some sensors have four colours. The fourth must not become an alpha channel.

@@ -31,13 +31,9 @@ DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 @dataclass(frozen=True)
 class NumberRows:
-    """The rows of numbers of a text file, which may differ in length.
+    """The rows of numbers of a text file, all finite; their lengths may differ.
 
-    Args:
-        path: the file.
-        rows: the numbers of each row, all finite.
-        lines: the one-based line of each row in the file.
-        texts: these lines as written, without comments.
+    `lines` has the one-based line of each row in the file, `texts` these lines as written, without comments.
     """
 
     path: Path
@@ -155,10 +151,8 @@ def read_number_rows(path: Path, *, expected: str = "a text file", most: int = M
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
-    content = [
-        (line, text.partition("#")[0].strip())
-        for line, text in enumerate(read_lines(path, expected=expected, most=most), start=1)
-    ]
+    stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
+    content = [(line, text.partition("#")[0].strip()) for line, text in stored]
     commas = uses_decimal_commas([text for _, text in content if text], 3)
     rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
     return NumberRows.from_words(path, [(line, text, words) for line, text, words in rows if words])

@@ -36,10 +36,7 @@ _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """Return the capture's files, or None for another layout.
-
-    Args:
-        folder: images_<kind> in an object's folder, or an object's folder with one such folder.
+    """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
     Raises:
         InputError: the object has no folder of images or several; or no light.txt or no boundary masks, and none are
@@ -48,9 +45,17 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
     captures = list_captures(folder)
     if captures is None:
         return None
-    if len(captures) != 1:
-        raise _not_one_folder(folder, captures)
-    images_folder = captures[0]
+    if not captures:
+        expected = f"{_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse"
+        raise InputError(f"found no folder of images, expected {expected}", path=folder)
+    images_folder, *more = captures
+    if more:
+        names = ", ".join(path.name for path in captures)
+        raise InputError(
+            f"found {len(captures)} folders of images ({names}), expected one",
+            path=folder,
+            hint=f"Give one of them, such as {images_folder}",
+        )
     holder = _parent(images_folder)
     lights = overrides.lights or find_named(holder, [_LIGHTS])
     if lights is None:
@@ -106,20 +111,6 @@ def _has_marks(folder: Path) -> bool:
 def _parent(folder: Path) -> Path:
     # "." and ".." are their own parents to pathlib.
     return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
-
-
-def _not_one_folder(holder: Path, folders: list[Path]) -> InputError:
-    if not folders:
-        return InputError(
-            f"found no folder of images, expected {_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse",
-            path=holder,
-        )
-    names = ", ".join(folder.name for folder in folders)
-    return InputError(
-        f"found {len(folders)} folders of images ({names}), expected one",
-        path=holder,
-        hint=f"Give one of them, such as {folders[0]}",
-    )
 
 
 def _find_boundaries(holder: Path) -> tuple[Path, ...]:

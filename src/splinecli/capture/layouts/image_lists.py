@@ -60,11 +60,8 @@ def list_images(
     """Return the images of the folder in natural order, by their suffixes.
 
     Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and
-    replaces it. A JPEG is a copy that the camera made, and does not count.
-
-    Args:
-        leave_out_stems: lower-case names without suffix that have another meaning, such as "mask".
-        leave_out: files that have another meaning.
+    replaces it. A JPEG is a copy that the camera made, and does not count. What is left out has another meaning, by its
+    stem in lower case, such as "mask", or as a file that the user named.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -108,12 +105,8 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
             continue
         image = path.parent / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise InputError(
-                f'the image "{name}" is outside of this folder',
-                path=path,
-                line=line,
-                hint="Copy the image into the folder, or set a link to it there, and name that",
-            )
+            hint = "Copy the image into the folder, or set a link to it there, and name that"
+            raise InputError(f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint)
         if not os.path.exists(image):  # noqa: PTH110 - Path.exists raises for a name that is too long
             hint = "Correct the name or remove the line"
             raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)

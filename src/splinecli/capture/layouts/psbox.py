@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splinecli.capture.layouts.capture_files import (
-    NOT_PHOTOGRAPHS,
-    CaptureFiles,
-    Overrides,
-    find_named,
-    gather_files,
-)
+from splinecli.capture.layouts.capture_files import NOT_PHOTOGRAPHS, CaptureFiles, Overrides, find_named, gather_files
 from splinecli.capture.layouts.image_lists import check_not_empty, list_images
 from splinecli.capture.paths import is_folder
 

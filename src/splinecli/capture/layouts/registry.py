@@ -83,7 +83,14 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
-    return [folder] if _looks_like_capture(folder) else cyclesps.list_captures(folder) or []
+    if find_lights(folder) is not None:
+        objects = folder / psbox.OBJECTS
+        is_psbox = is_folder(objects) and find_named(folder, psbox.LIGHT_DIRECTIONS) is not None
+        if find_named(folder, [FILENAMES]) is not None or list_images(
+            objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
+        ):
+            return [folder]
+    return cyclesps.list_captures(folder) or []
 
 
 def _captures_below(folder: Path) -> list[Path]:
@@ -94,13 +101,3 @@ def _captures_below(folder: Path) -> list[Path]:
         return _captures_in(folder)
     except InputError:
         return [folder]
-
-
-def _looks_like_capture(folder: Path) -> bool:
-    if find_lights(folder) is None:
-        return False
-    if find_named(folder, [FILENAMES]) is not None:
-        return True
-    objects = folder / psbox.OBJECTS
-    is_psbox = is_folder(objects) and find_named(folder, psbox.LIGHT_DIRECTIONS) is not None
-    return bool(list_images(objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS))
