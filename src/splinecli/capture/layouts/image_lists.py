@@ -27,7 +27,7 @@ class NoImagesError(InputError):
     """A folder contains no images."""
 
 
-def _natural_key(path: Path) -> tuple[list[int | str], str]:
+def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value: img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.
     parts: list[int | str] = [
@@ -51,7 +51,7 @@ def list_folder(folder: Path) -> list[Path]:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise InputError(f"the folder cannot be read ({error.strerror})", path=folder) from None
-    return sorted(entries, key=_natural_key)
+    return sorted(entries, key=natural_key)
 
 
 def list_images(
