@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -51,7 +52,8 @@ def words(out: str, shell: str) -> list[str]:
     if out == "_files\n":
         return []
     assert out.startswith("_arguments '*: :((")
-    return [entry.split('"')[1] for entry in out.removeprefix("_arguments '*: :((").splitlines()]
+    # A long help has several lines.
+    return re.findall(r'^"(.+?)"', out.removeprefix("_arguments '*: :(("), re.MULTILINE)
 
 
 COMPLETED = {

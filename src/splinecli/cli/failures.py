@@ -1,9 +1,6 @@
-"""Errors as one message, an exit code, and the JSON document that stands in place of a report."""
+"""Errors as one message and an exit code."""
 
 from __future__ import annotations
-
-import json
-from typing import Any
 
 import typer
 
@@ -35,19 +32,3 @@ def explain(error: Exception) -> tuple[str, int]:
 def is_defect(error: Exception) -> bool:
     """Return whether splinecli did not expect the error."""
     return not isinstance(error, SplinecliError | ParserError | OSError) and not is_out_of_memory(error)
-
-
-def error_document(error: Exception) -> dict[str, Any]:
-    """Return {"error", "exit_code"}."""
-    message, exit_code = explain(error)
-    return {"error": message, "exit_code": exit_code}
-
-
-def batch_error_document(error: Exception) -> dict[str, Any]:
-    """Return {"capture", "error", "exit_code"} for an error that ends infer's batch; it is no capture's."""
-    return {"capture": None, **error_document(error)}
-
-
-def print_error_document(error: Exception, *, as_list: bool) -> None:
-    """Print on stdout the document of an error that ends a command; the list of infer's documents with `as_list`."""
-    print(json.dumps([batch_error_document(error)] if as_list else error_document(error), indent=2))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from splinecli.cli.values import listed
+
 _NUMBERS = {"int": "a whole number", "float": "a number"}
 _LIMITS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
 _SYNTAX = (
@@ -83,8 +85,4 @@ def _syntax(text: str) -> str:
 
 
 def _suggestion(names: list[str]) -> str:
-    names = [name for name in names if name]
-    if not names:
-        return ""
-    *most, last = names
-    return f" Did you mean {', '.join(most)} or {last}?" if most else f" Did you mean {last}?"
+    return f" Did you mean {listed(names)}?" if any(names) else ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from enum import StrEnum
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -18,44 +18,12 @@ if TYPE_CHECKING:
 _MOST_DIGITS = 18  # of a number of images
 
 
-class Device(StrEnum):
-    """Device to compute on."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-class FirstLight(StrEnum):
-    """Side of the image from which a light comes."""
-
-    left = "left"
-    right = "right"
-    above = "above"
-    below = "below"
-
-
-class LightForm(StrEnum):
-    """Numbers of a light: a vector, or azimuth and elevation in degrees."""
-
-    xyz = "xyz"
-    azel = "azel"
-    slant_tilt = "slant-tilt"
-
-
-class NormalConvention(StrEnum):
-    """Direction of the green channel of a normal map: up in opengl, down in directx."""
-
-    opengl = "opengl"
-    directx = "directx"
-
-
-class Precision(StrEnum):
-    """Number format to compute in."""
-
-    auto = "auto"
-    float32 = "float32"
-    bfloat16 = "bfloat16"
+# Each is a type of Typer: the values that an option may have.
+Device = StrEnum("Device", ["auto", "cpu", "cuda"])
+FirstLight = StrEnum("FirstLight", ["left", "right", "above", "below"])
+LightForm = StrEnum("LightForm", {"xyz": "xyz", "azel": "azel", "slant_tilt": "slant-tilt"})
+NormalConvention = StrEnum("NormalConvention", ["opengl", "directx"])
+Precision = StrEnum("Precision", ["auto", "float32", "bfloat16"])
 
 
 def complete_curves() -> list[str]:
@@ -69,29 +37,31 @@ def complete_weights() -> list[str]:
     return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
 
 
-def complete_list(*items: str | Callable[[], list[str]]) -> Callable[[str], list[str]]:
-    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma.
+def listed(names: Iterable[str]) -> str:
+    """Return "a, b or c"."""
+    *most, last = names
+    return f"{', '.join(most)} or {last}" if most else last
 
-    Args:
-        items: the items, or functions that return them.
-    """
+
+def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma."""
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")
-        names = [name for item in items for name in ([item] if isinstance(item, str) else item())]
-        return [",".join([*typed, name]) for name in names if name not in typed]
+        return [",".join([*typed, name]) for name in items if name not in typed]
 
     return complete
 
 
-def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
+def split_commas(text: str, option: str, allowed: Iterable[str]) -> tuple[str, ...]:
     """Return the items of "a,b". Raises UsageError for an item that is not allowed."""
-    items = [item.strip() for item in text.split(",") if item.strip()]
+    names = list(allowed)
+    items = tuple(item.strip() for item in text.split(",") if item.strip())
     for item in items:
-        if item not in allowed:
-            raise UsageError(f"{option} has {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}")
+        if item not in names:
+            raise UsageError(f"{option} has {item!r}; expected a list of {', '.join(names)}, such as {names[0]}")
     if not items:
-        raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
+        raise UsageError(f"{option} is empty; expected a list of {', '.join(names)}")
     return items
 
 
@@ -112,10 +82,10 @@ def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False
     return ClusterOptions(workers=number, address=address, gpu=gpu)
 
 
-def parse_indices(text: str, option: str) -> list[int]:
+def parse_indices(text: str, option: str) -> tuple[int, ...]:
     """Return the whole numbers of "0,5,12". Raises UsageError."""
     try:
-        return [int(item) for item in text.split(",")]
+        return tuple(int(item) for item in text.split(","))
     except ValueError:
         raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
 
