@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 
@@ -52,13 +51,13 @@ def words(out: str, shell: str) -> list[str]:
     if out == "_files\n":
         return []
     assert out.startswith("_arguments '*: :((")
-    # A long help has several lines.
-    return re.findall(r'^"(.+?)"', out.removeprefix("_arguments '*: :(("), re.MULTILINE)
+    return [entry.split('"')[1] for entry in out.removeprefix("_arguments '*: :((").splitlines()]
 
 
 COMPLETED = {
     "splinecli in": ["infer", "info", "integrate"],
     "splinecli evaluate --me": ["--method"],
+    "splinecli info --l": ["--light-distance", "--light-frame", "--light-positions", "--lights", "--lights-format"],
     "splinecli evaluate data --method ls": ["ls", "ls-trimmed"],
     "splinecli infer capture --device c": ["cpu", "cuda"],
     "splinecli infer capture --weights cnn": ["cnn-ps"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import textwrap
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from splinecli.system.memory import check_address_space, keep_freed_memory
 
 TERM_WIDTH = 30
 """Columns of the names of options in the help; a longer name has a line of its own."""
+
+HINT_WIDTH = 72
+"""Columns of the help that a shell shows beside the name of an option. Typer breaks it at 80."""
 
 ARGUMENTS = "Arguments"
 
@@ -66,6 +70,13 @@ class Command(TyperCommand):
             if ctx.params.get("as_json") and ctx.info_name != INFER and not isinstance(error, typer.Exit | typer.Abort):
                 print(json.dumps(error_document(error), indent=2))
             raise
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Return what a word may become, each with a line of help: shells take a second line for another word."""
+        items = super().shell_complete(ctx, incomplete)
+        for item in items:
+            item.help = textwrap.shorten(item.help or "", HINT_WIDTH, placeholder=" ...")
+        return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line, without the braces that Typer sets about arguments."""
