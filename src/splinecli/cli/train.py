@@ -86,9 +86,19 @@ def train(
     if steps is not None and minutes is not None:
         raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
 
+    from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
     from splinecli.training.run import configure_run, open_run, resumes
 
-    changes = _changes(sets or [], generator_weight, n_lights, start_from, param or [], seed)
+    changes: list[Settings] = []  # in the order of their precedence
+    if sets or generator_weight is not None:
+        changes.append({"sources": parse_sources(sets or [], generator_weight)})
+    if n_lights is not None:
+        changes.append({"pixels": parse_light_counts(n_lights)})
+    if start_from is not None:
+        changes.append({"start_from": start_from})
+    changes += [parse_parameter(text) for text in param or []]
+    if seed is not None:
+        changes.append({"seed": seed})
     resume = resumes(output, resume=resume)
     settings = configure_run(output, preset, config, changes, resume=resume)
     if steps is not None:
@@ -100,30 +110,6 @@ def train(
         _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
         if not quiet and trainer.workers.leads:
             print(printable(output / defaults.WEIGHTS))
-
-
-def _changes(
-    sets: list[Path],
-    generator_weight: float | None,
-    n_lights: str | None,
-    start_from: str | None,
-    parameters: list[str],
-    seed: int | None,
-) -> list[Settings]:
-    """Return the settings that the options change, in the order of their precedence. Raises UsageError."""
-    from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
-
-    changes: list[Settings] = []
-    if sets or generator_weight is not None:
-        changes.append({"sources": parse_sources(sets, generator_weight)})
-    if n_lights is not None:
-        changes.append({"pixels": parse_light_counts(n_lights)})
-    if start_from is not None:
-        changes.append({"start_from": start_from})
-    changes += [parse_parameter(text) for text in parameters]
-    if seed is not None:
-        changes.append({"seed": seed})
-    return changes
 
 
 def _run(trainer: Trainer, messages: Messages) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from splinecli.errors import OutputError, UsageError
 from splinecli.pipeline.finished import inputs_sha256
@@ -14,14 +17,13 @@ from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from splinecli.capture import Capture, CaptureSource
     from splinecli.inference import NormalEstimate
     from splinecli.methods import Estimator
     from splinecli.results.clock import Clock
-    from splinecli.system.publishing import NewFiles
+    from splinecli.system.publishing import Content
 
 
 def infer_capture(
@@ -109,7 +111,7 @@ def _infer_into(
         formats=options.formats,
         convention=options.convention,
         clock=clock,
-        more=further,
+        more=chain.from_iterable(further),
     )
 
 
@@ -205,13 +207,14 @@ def _further_files(
     options: InferOptions,
     observer: Observer,
     clock: Clock,
-) -> list[Callable[[NewFiles], None]]:
-    """Compute what else the options ask for. Each function that is returned writes some files."""
+) -> list[Iterable[tuple[str, Content]]]:
+    """Compute what else the options ask for, and return the names and contents of the files."""
     from splinecli.pictures.light_sky import sky_plot
+    from splinecli.pictures.png import encode_png
     from splinecli.results import files
 
     capture = estimate.capture
-    writers: list[Callable[[NewFiles], None]] = []
+    found: list[Iterable[tuple[str, Content]]] = [files.map_files(estimate, options.maps)]
     albedo = colours = None
     clock.begin("pictures")
     if "albedo" in options.maps or options.html:
@@ -222,33 +225,35 @@ def _further_files(
             albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
         colours = albedo_picture(albedo, capture.mask)
         if "albedo" in options.maps:
-            writers.append(partial(files.write_albedo, albedo, capture.mask, exr="exr" in options.formats))
-    if "confidence" in options.maps and estimate.confidence_map is not None:
-        writers.append(partial(files.write_confidence, estimate.confidence_map))
-    for name, write in (
-        ("preview", files.write_preview),
-        ("gradient", files.write_gradient),
-        ("curvature", files.write_curvature),
-    ):
-        if name in options.maps:
-            writers.append(partial(write, estimate))
+            found.append(files.albedo_files(albedo, capture.mask, exr="exr" in options.formats))
     if "relief" in options.maps:
         from splinecli.surface.relief import relief_of_normals
 
-        writers.append(partial(files.write_relief, relief_of_normals(estimate.normal_map, capture.mask)))
+        found.append(files.relief_files(relief_of_normals(estimate.normal_map, capture.mask)))
     light_plot = None
     if capture.light_errors_deg is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
-        writers.append(partial(files.write_lights, capture, light_plot))
+        found.append(files.light_files(capture, light_plot))
     if source.automatic_mask is not None:
-        writers.append(partial(files.write_mask, source.window.filled(capture.mask)))
+        found.append([(files.FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
         clock.begin("surface")
-        writers.append(_surface(estimate, colours, report, options, observer))
+        found.append(_surface(estimate, colours, report, options, observer))
     if options.html:
+        from splinecli.results.page import result_page
+
         clock.begin("pictures")
-        writers.append(_page(estimate, albedo, {**report, "seconds": clock.seconds()}, light_plot))
-    return writers
+        page = result_page(
+            {**report, "seconds": clock.seconds()},
+            estimate.normal_map,
+            capture.mask,
+            albedo=albedo,
+            confidence_map=estimate.confidence_map,
+            error_map_deg=estimate.error_map_deg,
+            light_plot=light_plot,
+        )
+        found.append([(files.PAGE, page)])
+    return found
 
 
 def _surface(
@@ -257,8 +262,8 @@ def _surface(
     report: dict[str, Any],
     options: InferOptions,
     observer: Observer,
-) -> Callable[[NewFiles], None]:
-    """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
+) -> Iterator[tuple[str, bytes]]:
+    """Integrate the normals, put what the report says of the surface into it, and return the files."""
     from splinecli.pipeline.surface import make_surface, view_of_report
     from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 
@@ -273,31 +278,4 @@ def _surface(
             pixel_size_mm=pixel_size,
             progress=advance,
         )
-    formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
-
-    def write(new: NewFiles) -> None:
-        for name, content in encode_surface(surface, formats):
-            new.write(name, content)
-
-    return write
-
-
-def _page(
-    estimate: NormalEstimate,
-    albedo: NDArray[np.float32] | None,
-    report: dict[str, Any],
-    light_plot: bytes | None,
-) -> Callable[[NewFiles], None]:
-    from splinecli.results.files import PAGE
-    from splinecli.results.page import result_page
-
-    page = result_page(
-        report,
-        estimate.normal_map,
-        estimate.capture.mask,
-        albedo=albedo,
-        confidence_map=estimate.confidence_map,
-        error_map_deg=estimate.error_map_deg,
-        light_plot=light_plot,
-    )
-    return lambda new: new.write(PAGE, page)
+    return encode_surface(surface, (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ())))

@@ -11,7 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.system.files import (
     UNFINISHED,
@@ -22,6 +25,9 @@ from splinecli.system.files import (
     sync_names,
 )
 from splinecli.system.locks import RefusedFolderError, locked
+
+Content = bytes | str | NDArray[Any]
+"""The content of a file; see NewFiles.write."""
 
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
@@ -83,10 +89,13 @@ class NewFiles:
                 yield file
             sync(self._hidden[name])
 
-    def write(self, name: str, content: bytes | str) -> None:
-        """Write a new file. Text becomes UTF-8, and what is not valid text becomes escapes. Raises OutputError."""
+    def write(self, name: str, content: Content) -> None:
+        """Write a new file. An array becomes NPY, text UTF-8 with escapes for what is not valid. Raises OutputError."""
         with self.open(name) as file:
-            file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
+            if isinstance(content, np.ndarray):
+                np.save(file, content, allow_pickle=False)
+            else:
+                file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:
         """Remove the earlier files, and rename the new ones to their places, the report last. Raises OSError."""
