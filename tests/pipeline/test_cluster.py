@@ -289,7 +289,7 @@ def test_the_number_of_workers(tmp_path, monkeypatch):
     options = InferOptions(method="ls")
     assert 0 < expected_bytes(members[0], options) < 10**6
     assert expected_bytes(members[1], options) == 0
-    monkeypatch.setattr("splinecli.system.devices.count_available_cores", lambda: 4)
-    monkeypatch.setattr("splinecli.system.memory.available_memory", lambda: 1.7e9)
+    monkeypatch.setattr("splinecli.pipeline.capture_memory.count_available_cores", lambda: 4)
+    monkeypatch.setattr("splinecli.pipeline.capture_memory.available_memory", lambda: 1.7e9)
     assert choose_workers(members, options) == 3
     assert choose_workers(members[:2], options) == 2

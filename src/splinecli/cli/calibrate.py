@@ -10,7 +10,6 @@ from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.records import record_from
 from splinecli.cli.values import complete_curves, parse_circle
-from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
 
 def calibrate(
@@ -59,9 +58,13 @@ def calibrate(
     With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
     light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
+    given = locals()
+
+    from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
+
     options = record_from(
         CalibrateOptions,
-        locals(),
+        given,
         circles=tuple(parse_circle(text) for text in circle or ()),
         masks=tuple(mask or ()),
     )

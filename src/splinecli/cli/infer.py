@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from typer import Argument, Option
 
@@ -28,12 +28,11 @@ from splinecli.cli.values import (
 )
 from splinecli.errors import UsageError, printable
 from splinecli.methods import method_names
-from splinecli.pipeline.batch import infer_batch, worst_exit_code
-from splinecli.pipeline.capture_list import Shard
-from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.member import Outcome, Redo, Status
 from splinecli.results.files import MAPS, NORMALS
 from splinecli.results.index import HEADER, INDEX, Row, row_of
+
+if TYPE_CHECKING:
+    from splinecli.pipeline.member import Outcome, Redo
 
 _WORDS = {"skipped": "already done", "changed": "changed but kept"}
 """How the last line names the outcomes that have other words there."""
@@ -158,6 +157,10 @@ def infer(
     """
     given = locals()
 
+    from splinecli.pipeline.batch import infer_batch
+    from splinecli.pipeline.capture_list import Shard
+    from splinecli.pipeline.infer_options import InferOptions
+
     with printed_documents(as_list=as_json, as_lines=as_json_lines) as document:
         if as_json and as_json_lines:
             raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
@@ -193,6 +196,8 @@ def _show_all(
     summaries: bool,
 ) -> int:
     """Print what becomes of each capture, and return the exit code."""
+    from splinecli.pipeline.batch import worst_exit_code
+
     statuses: Counter[str] = Counter()
     codes: set[int] = set()
     rows: list[Row] = []
@@ -222,6 +227,8 @@ def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: b
 
 
 def _show_table(rows: Sequence[Row], statuses: Counter[str], output: Path, messages: Messages) -> None:
+    from splinecli.pipeline.member import Status
+
     if rows:
         columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
         messages.table(list(zip(*columns, strict=True)))

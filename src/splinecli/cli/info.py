@@ -12,8 +12,6 @@ from splinecli.cli.console import Messages, print_report
 from splinecli.cli.records import record_from
 from splinecli.cli.values import FirstLight, LightForm
 from splinecli.errors import InputError
-from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
-from splinecli.pipeline.reading import Reading
 
 
 def info(
@@ -57,6 +55,10 @@ def info(
     but the plot and the mended lights.
     """
     given = locals()
+
+    from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
+    from splinecli.pipeline.reading import Reading
+
     options = record_from(InfoOptions, given, reading=record_from(Reading, given))
     messages = Messages(quiet=quiet)
     report = describe_capture(options, messages)

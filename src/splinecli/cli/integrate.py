@@ -10,7 +10,6 @@ from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.records import record_from
 from splinecli.cli.values import NormalConvention, complete_list, split_commas
-from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 
 
@@ -96,6 +95,10 @@ def integrate(
     Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object,
     depth.png and surface.json.
     """
-    options = record_from(IntegrateOptions, locals(), formats=split_commas(formats, "--format", SURFACE_FILES))
+    given = locals()
+
+    from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
+
+    options = record_from(IntegrateOptions, given, formats=split_commas(formats, "--format", SURFACE_FILES))
     report = integrate_normal_map(options, Messages(quiet=quiet))
     print_report(report, summary_line(options, report), as_json=as_json, quiet=quiet)

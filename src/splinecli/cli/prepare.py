@@ -11,7 +11,6 @@ from splinecli.capture import find_captures
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
 from splinecli.cli.values import parse_cluster
-from splinecli.pipeline.batch import worst_exit_code
 
 
 def prepare(
@@ -49,6 +48,7 @@ def prepare(
     interruption, and adds to a set that exists. Captures that cannot be read are reported and skipped. Rendering needs
     the extra packages of 'splinecli[render]'.
     """
+    from splinecli.pipeline.batch import worst_exit_code
     from splinecli.pipeline.prepare import PrepareOptions, prepare_pixel_set
     from splinecli.pixel_sets.rendered import ScenePlan
     from splinecli.synthesis.scenes import SceneConfig

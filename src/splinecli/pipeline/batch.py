@@ -10,16 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splinecli.errors import InputError, ModelError, SplinecliError
+from splinecli.methods import Estimator, MethodOptions
 from splinecli.pipeline.capture_list import Member, Shard, list_captures
+from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Outcome, Redo, failed, run_member
 from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.results.index import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
+from splinecli.system.files import check_writable, write_text
+from splinecli.system.publishing import held_folder
 
 if TYPE_CHECKING:
-    from splinecli.methods import Estimator, MethodOptions
     from splinecli.pipeline.connection import ClusterOptions
-    from splinecli.results.index import Entry
 
 
 def infer_batch(
@@ -53,9 +56,6 @@ def infer_batch(
         OutputError: the output folder cannot be written, or the disk is full.
         SplinecliError: the connection to a Dask scheduler was lost.
     """
-    from splinecli.results.index import Entry, check_index_free, has_index
-    from splinecli.system.files import check_writable
-
     members = list_captures(folders, shard)
     options.check_files()
     output = Path(options.output)
@@ -64,32 +64,24 @@ def infer_batch(
     if with_index:
         check_index_free(output, overwrite=redo == "all")
     entries: dict[int, Entry] = {}
-    for number, outcome in _outcomes(members, options, observer, redo, cluster):
+    if cluster is not None and cluster.address is None:
+        if not cluster.workers:
+            cluster = replace(cluster, workers=choose_workers(members, options))
+        cluster = cluster.on_cores(len(members))
+    outcomes = (
+        enumerate(_one_by_one(members, options, observer, redo))
+        if cluster is None
+        else _on_workers(members, options, observer, redo, cluster)
+    )
+    for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)
         yield outcome
     if with_index and members:
-        _write_index([entries[number] for number in sorted(entries)], output, observer)
-
-
-def _outcomes(
-    members: Sequence[Member],
-    options: InferOptions,
-    observer: Observer,
-    redo: Redo,
-    cluster: ClusterOptions | None,
-) -> Iterator[tuple[int, Outcome]]:
-    """Yield the number and the outcome of each capture."""
-    if cluster is not None and cluster.address is None:
-        from splinecli.pipeline.capture_memory import choose_workers
-
-        if not cluster.workers:
-            cluster = replace(cluster, workers=choose_workers(members, options))
-        cluster = cluster.on_cores(len(members))
-    if cluster is None:
-        yield from enumerate(_one_by_one(members, options, observer, redo))
-        return
-    yield from _on_workers(members, options, observer, redo, cluster)
+        with held_folder(output, observer.warn, wait=True):
+            # Of those that changed it shows the results that were kept.
+            shown = with_earlier([entries[number] for number in sorted(entries)], output)
+            write_text(output / INDEX, index_page(shown, output))
 
 
 def _one_by_one(members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo) -> Iterator[Outcome]:
@@ -109,7 +101,6 @@ def _on_workers(
     members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and the outcome of each capture as it ends on another process."""
-    from splinecli.pipeline.capture_memory import expected_bytes
     from splinecli.pipeline.distribution import Item, LostError, distributor
 
     # On any device: the machine of the command may have none of the workers' GPUs.
@@ -209,13 +200,3 @@ def worst_exit_code(codes: Iterable[int]) -> int:
     """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
-
-
-def _write_index(entries: Sequence[Entry], output: Path, observer: Observer) -> None:
-    """Write the page of all captures. Of those that changed it shows the results that were kept."""
-    from splinecli.results.index import INDEX, index_page, with_earlier
-    from splinecli.system.files import write_text
-    from splinecli.system.publishing import held_folder
-
-    with held_folder(output, observer.warn, wait=True):
-        write_text(output / INDEX, index_page(with_earlier(entries, output), output))

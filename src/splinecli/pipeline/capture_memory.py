@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splinecli.capture import CaptureSource
+from splinecli.capture.capture_size import capture_bytes
+from splinecli.capture.formats.facts import StoredSize
 from splinecli.errors import SplinecliError
-
-if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource
-    from splinecli.capture.formats.facts import StoredSize
-    from splinecli.pipeline.capture_list import Member
-    from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.capture_list import Member
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.system.devices import choose_device, count_available_cores
+from splinecli.system.memory import available_memory
 
 BASE_BYTES = 500 * 2**20
 """Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
@@ -34,8 +36,6 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
         n_pixels: the number of the mask's pixels.
         n_lights: the number of images that are read.
     """
-    from splinecli.capture.capture_size import capture_bytes
-
     of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
     return capture_bytes(largest, n_pixels, n_lights) + of_pixels
 
@@ -55,8 +55,6 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
         open_source: returns the capture.
         n_lights: the number of images that are read; 0 for all.
     """
-    import numpy as np
-
     try:
         source = open_source()
         size = source.facts[0].size
@@ -75,9 +73,6 @@ def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
 
     A GPU computes one at a time.
     """
-    from splinecli.system.devices import choose_device, count_available_cores
-    from splinecli.system.memory import available_memory
-
     if choose_device(options.device).type == "cuda":
         return 1
     asked = members[:: max(1, len(members) // _ASKED)]

@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splinecli.capture import Capture
+from splinecli.capture.capture_warnings import CaptureWarning, not_distilled
 from splinecli.errors import UsageError
+from splinecli.methods import Estimator
+from splinecli.methods.estimator import ConfidentEstimator, tells_confidence
+from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize, student_sizes
 from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture
-    from splinecli.capture.capture_warnings import CaptureWarning
-    from splinecli.methods import Estimator
     from splinecli.methods.distilled import DistilledEstimator
-    from splinecli.methods.estimator import ConfidentEstimator
-    from splinecli.methods.student_size import StudentSize
 
 AUTOMATIC_FROM = 100_000
 """Pixels of the smallest capture for which a network is distilled unless the user asks for it."""
@@ -24,10 +26,7 @@ GAIN = 2.0
 
 
 def distil_for(
-    capture: Capture,
-    estimator: Estimator,
-    wanted: bool | None,
-    observer: Observer = SILENT,
+    capture: Capture, estimator: Estimator, wanted: bool | None, observer: Observer = SILENT
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
@@ -39,23 +38,19 @@ def distil_for(
     Raises:
         UsageError: it is wanted, but the lamps are near, the method gives no confidence, or the capture is too small.
     """
-    from splinecli.methods.estimator import tells_confidence
-
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not tells_confidence(estimator):
         return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
     if capture.lamps is not None:
         return _refuse(wanted, f"{capture.name}: captures under near lamps cannot be distilled")
-    from splinecli.capture.capture_warnings import not_distilled
-    from splinecli.methods.distilled import distil
-    from splinecli.methods.student_size import FEWEST_PIXELS, student_sizes
-
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     if wanted is None and not _is_faster(capture, estimator, sizes[0]):
         return None, []
+    from splinecli.methods.distilled import distil
+
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
@@ -75,8 +70,6 @@ def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarnin
 
 def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: StudentSize) -> bool:
     """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
-    import numpy as np
-
     from splinecli.methods.distilled import seconds_of_learning
 
     rows = np.linspace(0, capture.n_pixels - 1, 1024).astype(np.intp)

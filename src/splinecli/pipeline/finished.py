@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splinecli import __version__
+from splinecli.capture import CaptureSource
+from splinecli.capture.stamp import digest
 from splinecli.errors import SplinecliError
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
+from splinecli.results.index import Entry
+from splinecli.system.files import file_sha256
 from splinecli.system.locks import RefusedFolderError
-
-if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource
+from splinecli.system.publishing import is_plain
 
 
 @dataclass(frozen=True)
@@ -37,10 +40,6 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
         InputError: the capture cannot be read.
         RefusedFolderError: both are one folder, which may have files of the user with the names of results.
     """
-    from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
-    from splinecli.results.index import Entry
-    from splinecli.system.publishing import is_plain
-
     try:
         report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
@@ -72,9 +71,6 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
     `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
     """
-    from splinecli.capture.stamp import digest
-    from splinecli.system.files import file_sha256
-
     if weights is not None and Path(weights).is_file():
         weights = loaded or file_sha256(Path(weights))
     return digest([*source.stamp, weights])

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.capture.lights.light_files import rows_text
-from splinecli.inference import NormalEstimate
 from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
 from splinecli.maths.normals import Convention, describe, encode_picture
 from splinecli.pictures.error_map import error_map_picture
@@ -25,10 +24,13 @@ from splinecli.pictures.maps import (
     signed_picture,
 )
 from splinecli.pictures.png import encode_png
-from splinecli.results.clock import Clock
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
+
+if TYPE_CHECKING:
+    from splinecli.inference import NormalEstimate
+    from splinecli.results.clock import Clock
 
 NORMALS = {
     "png": "normals.png",
