@@ -61,12 +61,17 @@ def colour_errors(error_map_deg: NDArray[np.floating], top_deg: float) -> Pictur
     return picture
 
 
+def bounding_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and the columns of the smallest box that has all of a mask (H, W)."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
 def _colour_bar(height: int, top_deg: float) -> Picture:
     """Return the colour bar with ticks, labels and a vertical title: (height, W, 3), W as large as needed."""
     scale = max(1.0, height / _USUAL_HEIGHT)
-    labels = [(value, f"{value:g}") for value in _ticks_deg(top_deg)]
-    labels[-1] = (top_deg, f"{top_deg:g}+")
-    texts = [_text(label, scale) for _, label in labels]
+    ticks = _ticks_deg(top_deg)
+    texts = [_text(f"{value:g}{'+' * (value == top_deg)}", scale) for value in ticks]
     title = np.rot90(_text(TITLE, scale))
     gap, bar_width, line = round(8 * scale), round(18 * scale), max(1, round(scale))
     margin = texts[0].shape[0]  # keeps the outermost labels whole
@@ -77,7 +82,7 @@ def _colour_bar(height: int, top_deg: float) -> Picture:
     panel = np.full((height, title_x + title.shape[1] + gap, 3), _BACKGROUND, np.uint8)
     column = np.linspace(top_deg, 0, bar_height)[:, None].repeat(bar_width, axis=1)
     panel[margin : margin + bar_height, 2 * gap : 2 * gap + bar_width] = colour_errors(column, top_deg)
-    for (value, _), text in zip(labels, texts, strict=True):
+    for value, text in zip(ticks, texts, strict=True):
         y = margin + round((1 - value / top_deg) * (bar_height - 1))
         top = min(y - line // 2, margin + bar_height - line)
         panel[top : top + line, 2 * gap + bar_width : label_x - gap // 2] = _INK
@@ -103,9 +108,7 @@ def _text(text: str, scale: float) -> Picture:
     canvas = np.full((height + below + 2 * thickness, width + 2 * thickness), _BACKGROUND, np.uint8)
     cv2.putText(canvas, text, (thickness, height + thickness), font, size, _INK, thickness, cv2.LINE_AA)
     # OpenCV 4 and 5 have different fonts and report different heights, so crop to the drawn pixels.
-    ink = canvas < _BACKGROUND
-    rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
-    return canvas[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return canvas[bounding_box(canvas < _BACKGROUND)]
 
 
 def _paste(panel: Picture, gray: Picture, y: int, x: int) -> None:
