@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import os
 import warnings
 from collections.abc import Iterator
@@ -126,7 +125,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     import dask
     from distributed import LocalCluster
 
-    threads = max(1, min(count_available_cores() // options.workers, _threads_of_user()))
+    of_user = os.environ.get("OMP_NUM_THREADS", "")
+    threads = count_available_cores() // options.workers
+    threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
     settings: dict[str, Any] = {
@@ -135,9 +136,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
         "distributed.scheduler.allowed-failures": RETRIES,
         "distributed.worker.preload": [_IGNORE_INTERRUPTS],
         "logging": dict.fromkeys(_LOGGERS, "critical"),
+        # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives it up.
+        "distributed.deploy.lost-worker-timeout": "1 h",
     }
-    # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives the worker up.
-    settings["distributed.deploy.lost-worker-timeout"] = "1 h"
     _start_resource_tracker()
     with dask.config.set(settings):
         cluster = LocalCluster(
@@ -167,12 +168,6 @@ def _start_resource_tracker() -> None:
         del os.environ["PYTHONWARNINGS"]
         if before is not None:
             os.environ["PYTHONWARNINGS"] = before
-
-
-def _threads_of_user() -> float:
-    """Return the threads that OMP_NUM_THREADS allows."""
-    number = os.environ.get("OMP_NUM_THREADS", "")
-    return int(number) if number.isdecimal() else math.inf
 
 
 def _address(text: str) -> str:

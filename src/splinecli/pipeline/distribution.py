@@ -143,7 +143,10 @@ class Distributor:
             SplinecliError: what an item raised, or what is wrong with a worker. The message names the worker.
             SplinecliError: the scheduler was lost.
         """
-        self._check_installed()
+        # Where splinecli is not installed, a worker could not even read an item.
+        for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
+            if isinstance(found, metadata.PackageNotFoundError):
+                raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
         source, following = iter(items), None
         free_memory, began = available_memory(), time.monotonic()
         for n_looks in count():
@@ -156,7 +159,15 @@ class Distributor:
                     break
                 largest = max(map(_memory_limit, workers.values()))
                 if following.memory > largest:
-                    yield following, _too_large(following, largest)
+                    yield (
+                        following,
+                        LostError(
+                            f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
+                            f" {largest / 1e9:.1f} GB",
+                            path=following.name,
+                            hint="Start fewer workers on each machine, with more memory each",
+                        ),
+                    )
                 elif self._has_room(following, free_memory):
                     self._submit(following, workers)
                 else:
@@ -172,12 +183,6 @@ class Distributor:
                     hint="If there is too little memory, use fewer. Dask's output says more",
                 )
             yield from self._take_results()
-
-    def _check_installed(self) -> None:
-        """Raise UsageError if splinecli is not installed on a worker: it could not even read an item."""
-        for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
-            if isinstance(found, metadata.PackageNotFoundError):
-                raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
 
     def _workers(self) -> dict[str, dict[str, Any]]:
         """Return what Dask says of the workers that may be used. Raises SplinecliError if the scheduler is lost."""
@@ -206,15 +211,9 @@ class Distributor:
         needed = {"GPU": 1.0} if self.options.gpu else {}
         if any("MEMORY" in _resources(info) for info in workers.values()):
             needed["MEMORY"] = item.memory
+        key, resources = f"splinecli-{uuid.uuid4().hex}", needed or None
         try:
-            future = self.client.submit(
-                _do,
-                self.work,
-                *item.args,
-                key=f"splinecli-{uuid.uuid4().hex}",
-                resources=needed or None,
-                pure=False,
-            )
+            future = self.client.submit(_do, self.work, *item.args, key=key, resources=resources, pure=False)
         except (OSError, RuntimeError) as error:
             raise _scheduler_lost() from error
         self.running[future] = item
@@ -242,7 +241,12 @@ class Distributor:
             future.add_done_callback(self._done.put)  # the worker was lost with the result: Dask repeats it
             return
         except KilledWorker as error:
-            result = _lost(item, error)
+            last = getattr(error.last_worker, "address", error.last_worker)
+            result = LostError(
+                f"its worker was lost {error.allowed_failures + 1} times, the last one {last}",
+                path=item.name,
+                hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
+            )
         del self.running[future]
         yield item, result
 
@@ -252,25 +256,7 @@ def _resources(info: dict[str, Any]) -> dict[str, float]:
 
 
 def _memory_limit(info: dict[str, Any]) -> float:
-    """Return the bytes of memory of a worker."""
     return float(_resources(info).get("MEMORY") or info.get("memory_limit") or math.inf)
-
-
-def _too_large(item: Item, largest: float) -> LostError:
-    return LostError(
-        f"it takes about {item.memory / 1e9:.1f} GB of memory, but the largest worker has {largest / 1e9:.1f} GB",
-        path=item.name,
-        hint="Start fewer workers on each machine, with more memory each",
-    )
-
-
-def _lost(item: Item, error: Any) -> LostError:
-    last = error.last_worker
-    return LostError(
-        f"its worker was lost {error.allowed_failures + 1} times, the last one {getattr(last, 'address', last)}",
-        path=item.name,
-        hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
-    )
 
 
 def _scheduler_lost() -> SplinecliError:

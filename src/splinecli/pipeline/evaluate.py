@@ -185,6 +185,12 @@ def evaluate_captures(
     read_draws_file(protocols[0])
     _check_counts(captures, protocols)
     estimators = _make_estimators(options)
+    jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
+    elsewhere: Elsewhere | None = None
+    if (cluster := options.cluster and options.cluster.on_cores()) is not None:
+        from splinecli.pipeline.evaluate_on_workers import OnWorkers
+
+        elsewhere = OnWorkers(estimators, options.method_options, protocols, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(
@@ -192,8 +198,8 @@ def evaluate_captures(
                 estimators,
                 protocols,
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
-                jobs=_default_jobs(estimators) if options.jobs is None else options.jobs,
-                elsewhere=_elsewhere(options, estimators, protocols, observer),
+                jobs=options.jobs or jobs,
+                elsewhere=elsewhere,
                 on_progress=_follow(advance),
             )
         plots = make_plots(evaluations)
@@ -203,21 +209,6 @@ def evaluate_captures(
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
         document = write_results(output, evaluations, plots, figures)
     return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
-
-
-def _elsewhere(
-    options: EvaluateOptions,
-    estimators: Sequence[Estimator],
-    protocols: Sequence[Protocol],
-    observer: Observer,
-) -> Elsewhere | None:
-    """Return what scores trials in other processes, if the options ask for it."""
-    cluster = None if options.cluster is None else options.cluster.on_cores()
-    if cluster is None:
-        return None
-    from splinecli.pipeline.evaluate_on_workers import OnWorkers
-
-    return OnWorkers(estimators, options.method_options, protocols, cluster, Path(options.output), observer)
 
 
 def _make_estimators(options: EvaluateOptions) -> list[Estimator]:
@@ -237,12 +228,6 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
             raise UsageError(f"{protocol.n_lights} lights were requested, but the captures have at most {most}")
-
-
-def _default_jobs(estimators: Sequence[Estimator]) -> int:
-    if any(estimator.device.startswith("cuda") for estimator in estimators):
-        return 1
-    return count_available_cores()
 
 
 def _follow(advance: Callable[..., None]) -> Callable[[float, int, str], None]:
