@@ -13,7 +13,7 @@ from splinecli.errors import InputError, OutputError, SplinecliError
 from splinecli.methods import Estimator
 from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.films import unpacked
-from splinecli.pipeline.finished import find_earlier
+from splinecli.pipeline.finished import ChangedError, find_earlier
 from splinecli.pipeline.infer import held_results, infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
@@ -68,36 +68,21 @@ def run_member(
     try:
         folder = unpacked(member.folder, Path(options.output), options, observer, redo=redo)
         member = replace(member, folder=folder)
-        outcome = _earlier_outcome(member, options, observer, redo)
+        if redo != "all":
+            with held_results(member.name, options, observer) as target:
+                report = find_earlier(target, folder, options, observer.warn)
+            if report is not None:
+                return Outcome(member.name, "skipped", report)
+    except ChangedError as error:
+        if redo == "nothing":
+            return failed(member.name, error, status="changed")
     except Exception as error:
-        outcome = _failure(member, error)
-    if outcome is not None:
-        return outcome
+        return _failure(member, error)
     estimator = method()
     try:
         return Outcome(member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator))
     except Exception as error:
         return _failure(member, error)
-
-
-def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, redo: Redo) -> Outcome | None:
-    """Return the outcome of a capture that is not to be computed, or None."""
-    if redo == "all":
-        return None
-    with held_results(member.name, options, observer) as target:
-        earlier = find_earlier(target, member.folder, options)
-    if earlier.report is not None:
-        return Outcome(member.name, "skipped", earlier.report)
-    if earlier.unfinished:
-        observer.warn(f"{target}: {earlier.unfinished}, so it is computed again")
-    if not earlier.changed or redo == "changed":
-        return None
-    error = OutputError(
-        earlier.changed,
-        path=target,
-        hint="Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o",
-    )
-    return failed(member.name, error, status="changed")
 
 
 def _failure(member: Member, error: Exception) -> Outcome:
