@@ -41,8 +41,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _splinecli(
     version: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     pass

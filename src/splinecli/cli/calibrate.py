@@ -63,10 +63,7 @@ def calibrate(
     from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
 
     options = record_from(
-        CalibrateOptions,
-        given,
-        circles=tuple(parse_circle(text) for text in circle or ()),
-        masks=tuple(mask or ()),
+        CalibrateOptions, given, circles=tuple(parse_circle(text) for text in circle or ()), masks=tuple(mask or ())
     )
     report = calibrate_lights(options, Messages(quiet=quiet))
     print_report(report, str(output / DIRECTIONS), as_json=as_json, quiet=quiet)

@@ -91,9 +91,7 @@ def evaluate(
     ),
     figures: bool = Option(False, "--figures", help="Draw every method's maps for the first draw of each capture."),
     pixel: list[str] | None = Option(
-        None,
-        metavar="ROW,COLUMN",
-        help="With --figures: show the observation maps of this pixel. May be repeated.",
+        None, metavar="ROW,COLUMN", help="With --figures: show the observation maps of this pixel. May be repeated."
     ),
     output: Path = Option(Path("evaluation"), "--output", "-o", metavar="OUT", help="Folder of the results."),
     overwrite: bool = Option(False, "--overwrite", help="Compute all trials again, also those stored in OUT."),
@@ -137,7 +135,6 @@ def evaluate(
 
 
 def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
-    """Print what went wrong, warnings and notes on stderr."""
     for entry in outcome.document["skipped"]:
         talk.error(f"{entry['capture']} was skipped: {entry['reason']}")
     for problem in outcome.figure_problems:

@@ -49,9 +49,7 @@ def infer(
     light_positions: Path | None = shared.LIGHT_POSITIONS,
     light_distance: float | None = shared.LIGHT_DISTANCE,
     pixel_size: float | None = Option(
-        None,
-        metavar="S",
-        help=f"{shared.PIXEL_SIZE} With --surface: in millimetres, for a surface in millimetres.",
+        None, metavar="S", help=f"{shared.PIXEL_SIZE} With --surface: in millimetres, for a surface in millimetres."
     ),
     object_width: float | None = shared.OBJECT_WIDTH,
     camera_matrix: Path | None = shared.CAMERA_MATRIX,
@@ -71,10 +69,7 @@ def infer(
     as_stored: bool = shared.AS_STORED,
     output: Path = Option(Path("out"), "--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/."),
     method: str = Option(
-        "spline-net",
-        metavar="METHOD",
-        help=f"Method to use: {listed(method_names())}.",
-        autocompletion=method_names,
+        "spline-net", metavar="METHOD", help=f"Method to use: {listed(method_names())}.", autocompletion=method_names
     ),
     weights: str | None = shared.WEIGHTS,
     n_lights: int | None = Option(None, metavar="K", help="Use K lights drawn at random. [default: all]"),
@@ -105,14 +100,10 @@ def infer(
         autocompletion=complete_list(MAPS),
     ),
     html: bool = Option(
-        False,
-        "--html",
-        help="Also write page.html: the maps, and a view of the surface under a light that you move.",
+        False, "--html", help="Also write page.html: the maps, and a view of the surface under a light that you move."
     ),
     surface: bool = Option(
-        False,
-        "--surface",
-        help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.",
+        False, "--surface", help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
     ),
     stiffness: float = shared.STIFFNESS,
     convention: NormalConvention = Option(
@@ -133,11 +124,7 @@ def infer(
         help="Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file"
         " (needs the extra 'cluster').",
     ),
-    shard: str | None = Option(
-        None,
-        metavar="I/N",
-        help="Process shard I of N: captures I, I+N, I+2N, ...",
-    ),
+    shard: str | None = Option(None, metavar="I/N", help="Process shard I of N: captures I, I+N, I+2N, ..."),
     as_json: bool = Option(False, "--json", help="Print a JSON list of the reports on stdout, and nothing else."),
     as_json_lines: bool = Option(
         False, "--jsonl", help="Print each report as one line of JSON on stdout when its capture ends."
@@ -195,7 +182,6 @@ def _show_all(
     *,
     summaries: bool,
 ) -> int:
-    """Print what becomes of each capture, and return the exit code."""
     from splinecli.pipeline.batch import worst_exit_code
 
     statuses: Counter[str] = Counter()

@@ -18,9 +18,7 @@ def integrate(
         ..., metavar="NORMALS", help="Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote."
     ),
     mask: Path | None = Option(
-        None,
-        metavar="FILE",
-        help=f"{shared.MASK_IMAGE.format('object')} [default: all pixels that have a normal]",
+        None, metavar="FILE", help=f"{shared.MASK_IMAGE.format('object')} [default: all pixels that have a normal]"
     ),
     camera_matrix: Path | None = Option(
         None,

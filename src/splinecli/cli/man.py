@@ -23,10 +23,7 @@ EXIT_STATUS = (
     ("2", "Usage: an option is wrong, or options contradict each other."),
     ("3", "Bad input data."),
     ("4", "Weights, a checkpoint or a configuration cannot be used."),
-    (
-        "5",
-        "An output cannot be written, or exists and neither --overwrite nor --update was given.",
-    ),
+    ("5", "An output cannot be written, or exists and neither --overwrite nor --update was given."),
     ("130", "Interrupted. No file is incomplete."),
 )
 FILES = (
@@ -75,14 +72,8 @@ FILES = (
         "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json. Both can write mesh.obj"
         " (with mesh.mtl and mesh.png) and mesh.stl.",
     ),
-    (
-        "OUT/NAME/page.html",
-        "With --html: all pictures, and the surface under a light that follows the pointer.",
-    ),
-    (
-        "OUT/NAME/report.json",
-        "Lights, method, weights, options, time, warnings and errors.",
-    ),
+    ("OUT/NAME/page.html", "With --html: all pictures, and the surface under a light that follows the pointer."),
+    ("OUT/NAME/report.json", "Lights, method, weights, options, time, warnings and errors."),
     ("OUT/index.html", "With several captures: links to all results."),
 )
 ENVIRONMENT = (
@@ -100,24 +91,15 @@ EXAMPLES = (
         "Also write albedo, preview, mesh and page.",
     ),
     ("splinecli info obj/", "Show what infer would read."),
-    (
-        "splinecli info obj/ --transfer srgb --plot lights.png",
-        "Check sRGB images, and plot the light directions.",
-    ),
+    ("splinecli info obj/ --transfer srgb --plot lights.png", "Check sRGB images, and plot the light directions."),
     ("splinecli calibrate chrome/ -o lights", "Measure light directions with a mirror ball."),
     (
         "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights",
         "Give the outline of the ball, and also measure light intensities.",
     ),
     ("splinecli integrate results/cat", "Make depth and a mesh from the results of infer."),
-    (
-        "splinecli integrate normals.png --mask mask.png --format obj -o surface",
-        "Make a mesh from any normal map.",
-    ),
-    (
-        "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
-        "Compare two methods.",
-    ),
+    ("splinecli integrate normals.png --mask mask.png --format obj -o surface", "Make a mesh from any normal map."),
+    ("splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20", "Compare two methods."),
     (
         "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10 --trials 20 --figures",
         "Compare all methods with two numbers of lights, and draw their maps.",
@@ -204,7 +186,6 @@ def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str
 
 
 def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
-    """Write the rows of a command's help, with a heading for each panel if there are several."""
     lines = []
     for title, rows in panels.items():
         if len(panels) > 1:

@@ -77,15 +77,10 @@ FLAT_FIELD = Option(
     help="Folder with images of an evenly white surface: one for all lights, or one for each light.",
 )
 WHITE_LEVEL = Option(
-    None,
-    metavar="N",
-    min=0,
-    help="Stored value from which a pixel counts as saturated. [default: found in the images]",
+    None, metavar="N", min=0, help="Stored value from which a pixel counts as saturated. [default: found in the images]"
 )
 AS_STORED = Option(
-    False,
-    "--as-stored",
-    help="Use the stored values: do not restore saturated pixels or estimate light intensities.",
+    False, "--as-stored", help="Use the stored values: do not restore saturated pixels or estimate light intensities."
 )
 SEED = Option(0, metavar="S", min=0, max=2**32 - 1, help="Seed of the random draws.")
 
@@ -98,10 +93,7 @@ WEIGHTS = Option(
     autocompletion=complete_weights,
 )
 STIFFNESS = Option(
-    2.0,
-    metavar="K",
-    min=0,
-    help="How easily the surface of integrate or --surface tears at edges. 0 never tears it.",
+    2.0, metavar="K", min=0, help="How easily the surface of integrate or --surface tears at edges. 0 never tears it."
 )
 DEVICE = Option(Device.auto, help="Device to compute on. auto is a CUDA GPU if there is one, else the CPU.")
 PRECISION = Option(Precision.auto, help="Number format. auto is bfloat16 if the hardware supports it, else float32.")
@@ -111,9 +103,7 @@ PRECISION = Option(Precision.auto, help="Number format. auto is bfloat16 if the 
 OVERWRITE = Option(False, "--overwrite", help="Replace earlier results.")
 UPDATE = Option(False, "--update", help="Compute changed captures again, and skip those that are done.")
 STRICT = Option(
-    False,
-    "--strict",
-    help="Fail (exit code 3) where a warning says that the lights or the images are probably wrong.",
+    False, "--strict", help="Fail (exit code 3) where a warning says that the lights or the images are probably wrong."
 )
 JSON = Option(False, "--json", help="Print one JSON document on stdout, and nothing else.")
 QUIET = Option(False, "--quiet", "-q", help="Print nothing but errors.")

@@ -47,10 +47,7 @@ def train(
         autocompletion=complete_weights,
     ),
     generator_weight: float | None = Option(
-        None,
-        metavar="W",
-        min=0,
-        help="Weight of generated pixels; each SET has weight 1. [default: 0; 1 without SET]",
+        None, metavar="W", min=0, help="Weight of generated pixels; each SET has weight 1. [default: 0; 1 without SET]"
     ),
     n_lights: str | None = Option(
         None, metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]"
@@ -113,7 +110,6 @@ def train(
 
 
 def _run(trainer: Trainer, messages: Messages) -> None:
-    """Train to the end and show the progress."""
     if trainer.single_scene_sets:
         names = ", ".join(trainer.single_scene_sets)
         messages.warn(f"{names}: the set has a single scene, so training and validation use the same pixels")

@@ -34,7 +34,6 @@ def usage_message(error: Any) -> str:
 
 
 def _bad_value(error: Any) -> str | None:
-    """Return the message for a value of an option that has the wrong type or is out of range."""
     details = getattr(error.__cause__, "errors", None)
     parameter = getattr(error, "param", None)
     if not callable(details) or not parameter:
@@ -66,7 +65,6 @@ def _range(parameter: Any) -> str:
 
 
 def _unknown_name(error: Any) -> str | None:
-    """Return the message for an unknown command or option, with similar names."""
     text = error.format_message()
     option = getattr(error, "option_name", None)
     if option and hasattr(error, "possibilities"):
@@ -78,7 +76,6 @@ def _unknown_name(error: Any) -> str | None:
 
 
 def _syntax(text: str) -> str:
-    """Return click's text in the words of the other messages."""
     for pattern, words in _SYNTAX:
         text = re.sub(pattern, words, text)
     return text

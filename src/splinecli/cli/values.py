@@ -73,8 +73,7 @@ def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False
         raise UsageError(f"--workers is {workers!r}; expected a number from 1, or auto")
     if address is not None and workers != "1":
         raise UsageError(
-            "--workers and --cluster contradict each other",
-            hint="Leave --workers out: the cluster has its workers",
+            "--workers and --cluster contradict each other", hint="Leave --workers out: the cluster has its workers"
         )
     if address is None and workers == "1":
         return None

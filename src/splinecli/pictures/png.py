@@ -45,5 +45,4 @@ def encode_png(
 
 
 def _chunk(content: bytes) -> bytes:
-    """Return a chunk of a name and its content."""
     return struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))

@@ -85,7 +85,6 @@ def infer_batch(
 
 
 def _one_by_one(members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo) -> Iterator[Outcome]:
-    """Yield the outcomes of captures that this process computes."""
     estimator: Estimator | None = None
 
     def method() -> Estimator:

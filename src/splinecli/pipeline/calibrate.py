@@ -133,10 +133,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
         radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
         warnings = [f"{target}: {warning}" for warning in of_curve]
         intensities = measure_light_intensities(
-            target_files,
-            lights.directions,
-            "ball" if options.gray_ball is not None else "card",
-            radiometry=radiometry,
+            target_files, lights.directions, "ball" if options.gray_ball is not None else "card", radiometry=radiometry
         )
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)

@@ -106,9 +106,7 @@ def _member(folder: Path) -> Member:
             return Member(folder, folder.name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
         raise UsageError(
-            "the folder does not exist",
-            path=folder,
-            hint="Write lists with commas, such as --maps albedo,confidence",
+            "the folder does not exist", path=folder, hint="Write lists with commas, such as --maps albedo,confidence"
         )
     kind = "film" if is_film(folder) else "folder"
     return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))

@@ -261,8 +261,7 @@ def _memory_limit(info: dict[str, Any]) -> float:
 
 def _scheduler_lost() -> SplinecliError:
     return SplinecliError(
-        "the connection to the Dask scheduler was lost",
-        hint="Run the same command again. It skips what is done",
+        "the connection to the Dask scheduler was lost", hint="Run the same command again. It skips what is done"
     )
 
 

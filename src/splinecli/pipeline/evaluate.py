@@ -14,12 +14,7 @@ from splinecli.capture.lights.found_lights import ESTIMATE
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, UsageError
-from splinecli.evaluation.capture_figures import (
-    CaptureFigure,
-    capture_figures,
-    file_stems,
-    has_observation_maps,
-)
+from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
 from splinecli.evaluation.files import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
@@ -99,8 +94,7 @@ class EvaluateOptions:
         check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.lights not in (None, ESTIMATE):
             raise UsageError(
-                f"--lights is {self.lights}; expected {ESTIMATE}",
-                hint="Without it, the captures' light files count",
+                f"--lights is {self.lights}; expected {ESTIMATE}", hint="Without it, the captures' light files count"
             )
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
             raise UsageError(
@@ -111,8 +105,7 @@ class EvaluateOptions:
             raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(
-                "--jobs contradicts --workers and --cluster",
-                hint="Leave it out: a worker scores one trial at a time",
+                "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"
             )
         for name in self.methods:
             check_method(name)
@@ -250,7 +243,6 @@ def _draw_figures(
     pixels: Sequence[tuple[int, int]],
     observer: Observer,
 ) -> tuple[list[CaptureFigure], list[str]]:
-    """Return the figures of the captures that were scored, and the problems of those without figures."""
     folders = {name: folder for folder, name in distinct_names(captures).items()}
     names = [name for name in folders if name in evaluation.captures]
     figures: list[CaptureFigure] = []

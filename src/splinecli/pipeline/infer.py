@@ -129,7 +129,6 @@ def make_method(options: InferOptions) -> Estimator:
 
 
 def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture]:
-    """Return the opened capture, and the capture under the chosen lights."""
     source = options.open(folder)
     name = source.files.name
     if options.auto_mask:

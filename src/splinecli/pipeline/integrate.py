@@ -22,13 +22,7 @@ from splinecli.pipeline.surface import check_pixel_size, make_surface, view_of_r
 from splinecli.results.files import ALBEDO_PICTURE, NORMALS, REPORT, UnfinishedError, read_report
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.surface.camera import ray_basis
-from splinecli.surface.surface_files import (
-    DEFAULT_FORMATS,
-    SURFACE_FILES,
-    SURFACE_REPORT,
-    encode_surface,
-    file_names,
-)
+from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, encode_surface, file_names
 from splinecli.system.exr import check_exr
 from splinecli.system.extras import import_extra
 from splinecli.system.files import check_free, read_json

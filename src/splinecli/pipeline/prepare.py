@@ -84,11 +84,7 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
 
 
 def _add_captures(
-    writer: PixelSetWriter,
-    captures: dict[str, Path],
-    options: PrepareOptions,
-    observer: Observer,
-    advance: Advance,
+    writer: PixelSetWriter, captures: dict[str, Path], options: PrepareOptions, observer: Observer, advance: Advance
 ) -> list[dict[str, Any]]:
     """Add the captures and return what became of those that were left out."""
     skipped: list[dict[str, Any]] = []
@@ -107,12 +103,7 @@ def _add_capture(writer: PixelSetWriter, name: str, folder: Path, options: Prepa
     """Add a capture, or return why it cannot be used. Raises OutputError if the set cannot be written."""
     try:
         add_capture(
-            writer,
-            name,
-            folder,
-            as_stored=options.as_stored,
-            white_level=options.white_level,
-            update=options.update,
+            writer, name, folder, as_stored=options.as_stored, white_level=options.white_level, update=options.update
         )
     except (InputError, CaptureChangedError) as error:
         return error

@@ -52,13 +52,7 @@ def make_surface(
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
-        normal_map,
-        mask,
-        camera_matrix,
-        stiffness=stiffness,
-        prior=prior,
-        prior_detail=prior_detail,
-        progress=progress,
+        normal_map, mask, camera_matrix, stiffness=stiffness, prior=prior, prior_detail=prior_detail, progress=progress
     )
     if n_triangles is None:
         mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
@@ -94,9 +88,7 @@ def make_surface(
 
 
 def view_of_report(
-    report: Mapping[str, Any],
-    camera_matrix: NDArray[np.floating] | None = None,
-    pixel_size_mm: float | None = None,
+    report: Mapping[str, Any], camera_matrix: NDArray[np.floating] | None = None, pixel_size_mm: float | None = None
 ) -> tuple[NDArray[np.float64] | None, float | None]:
     """Return camera matrix and pixel size in millimetres of the normal map that a report of `infer` describes.
 

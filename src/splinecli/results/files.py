@@ -156,10 +156,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not (isinstance(files, list) and all(isinstance(name, str) for name in files) and isinstance(sizes, dict)):
         raise ValueError("the report has no list of files, or no sizes")
     # The mask is made to be edited, and `integrate` may have replaced the surface.
-    changeable = (
-        FOUND_MASK,
-        *(file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()),
-    )
+    changeable = (FOUND_MASK, *(file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()))
     for name in files:
         path = folder / name
         if name in changeable:
