@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import encode_picture
-from splinecli.pictures.error_map import TITLE, TOP_DEG, bounding_box, colour_errors
+from splinecli.pictures.error_map import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 from splinecli.pictures.plotting import png_bytes
 from splinecli.pictures.png import Picture
 
@@ -56,7 +56,7 @@ def method_maps(
     truth = _resize(_colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale)
     normals = {name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()}
     shown_deg = {name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()}
-    errors = {name: _resize(colour_errors(shown_deg[name][box], TOP_DEG), scale) for name in normal_maps}
+    errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
     captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
 
     cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
@@ -90,10 +90,9 @@ def _draw_bar(figure: Figure, right: int, bottom: int, height: int, text: int) -
     inset = text // 2  # room for half a label at either end
     length = height - 2 * inset
     column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
-    figure.figimage(colour_errors(column, TOP_DEG), right - text, bottom + inset, origin="lower")
-    for third in range(4):
-        y, label = bottom + inset + third / 3 * (length - 1), f"{TOP_DEG * third / 3:g}{'+' * (third == 3)}"
-        _write(figure, right - 1.4 * text, y, label, text, ha="right")
+    figure.figimage(colour_errors(column), right - text, bottom + inset, origin="lower")
+    for value, label in TICKS.items():
+        _write(figure, right - 1.4 * text, bottom + inset + value / TOP_DEG * (length - 1), label, text, ha="right")
     size = _text_height(height, [TITLE], most=text)
     _write(figure, right - 4 * text, bottom + height / 2, TITLE, size, rotation=90)
 

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
 
-Picture = NDArray[np.uint8]
-"""An RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits."""
+Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits
 
 
-_HEAD = 33
-"""Bytes of the signature and of the header, which is the first chunk of a file."""
+_HEAD = 33  # bytes of the signature and of the header, which is the first chunk of a file
 
 
 def encode_png(

@@ -16,12 +16,8 @@ from splinecli.system.memory import is_out_of_memory
 
 INDEX = "index.html"
 
-THUMBNAIL = 256, 192
-"""Largest width and height of a small normal map in pixels: twice its size on the page, for sharp screens."""
-
-_LARGEST_SHOWN = 10**9
-"""Bytes of the largest normal map that is shown small: 33 megapixels of 16 bits. Others in the folder may be bombs."""
-
+THUMBNAIL = 256, 192  # largest width and height in pixels: twice its size on the page, for sharp screens
+_LARGEST_SHOWN = 10**9  # bytes of a normal map shown small: 33 megapixels of 16 bits; others may be bombs
 _OURS = b'<meta name="generator" content="splinecli">'
 _START = 1 << 16  # bytes of a page, which contain this mark
 

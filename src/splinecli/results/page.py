@@ -10,17 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import unit
-from splinecli.pictures.error_map import TOP_DEG, colour_errors
+from splinecli.pictures.error_map import TICKS, TOP_DEG, colour_errors
 from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture
 from splinecli.pictures.png import Picture, encode_png
 from splinecli.results.templates import render
 
-LARGEST_MAP = 8_000_000
-"""Largest number of pixels of the maps on a page. Larger maps are reduced, so that browsers can open the file."""
-
-LONGEST_SIDE = 8192
-"""Largest width or height of the maps on a page in pixels: most devices draw pictures up to this side."""
-
+LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
+LONGEST_SIDE = 8192  # pixels: most devices draw pictures up to this side
 QUICK_MAP, FIRST_MAP = 500_000, 100_000
 """A page with maps of more than QUICK_MAP pixels has maps of FIRST_MAP pixels, too, which are shown first."""
 
@@ -74,11 +70,11 @@ def result_page(
         maps["confidence"] = confidence_picture(reduced)
     if error_map_deg is not None:
         errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
-        error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan), TOP_DEG))
+        error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan)))
     first = _first_pictures(maps, normals, shown) if shown.size > QUICK_MAP else {}
     (height, width), size = shown.shape, _size(shown)
     is_reduced = shown.shape != mask.shape
-    stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None], TOP_DEG)[0]
+    stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None])[0]
     millimetres = (report.get("surface") or {}).get("pixel_size_mm")
     return render(
         "page.html",
@@ -101,7 +97,7 @@ def result_page(
         error_map=error_png,
         light_plot=None if light_plot is None else _png_url(light_plot),
         error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
-        error_ticks=[f"{TOP_DEG * third / 3:g}°" for third in range(4)],
+        error_ticks=[f"{value:g}°" for value in TICKS],
     )
 
 
