@@ -18,17 +18,11 @@ from splinecli.cli.failures import ParserError
 from splinecli.cli.panels import sort_into_panels
 from splinecli.system.memory import check_address_space, keep_freed_memory
 
-TERM_WIDTH = 30
-"""Columns of the names of options in the help; a longer name has a line of its own."""
-
-HINT_WIDTH = 72
-"""Columns of the help that a shell shows beside the name of an option. Typer breaks it at 80."""
-
+TERM_WIDTH = 30  # columns of the names of options in the help; a longer name has a line of its own
+HINT_WIDTH = 72  # columns of the help that a shell shows beside an option; Typer breaks it at 80
 ARGUMENTS = "Arguments"
 
-INFER = "infer"
-"""The command whose JSON is a list of documents."""
-
+INFER = "infer"  # the command whose JSON is a list of documents
 JSON, JSON_LINES = "--json", "--jsonl"
 
 _RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"

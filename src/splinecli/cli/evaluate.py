@@ -17,7 +17,6 @@ from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
 
 if TYPE_CHECKING:
     from splinecli.evaluation.outcome import Evaluation
-    from splinecli.pipeline.evaluate import EvaluateOutcome
 
 
 def evaluate(
@@ -125,16 +124,6 @@ def evaluate(
     )
     talk = Messages(quiet=quiet)
     outcome = evaluate_captures(datasets, options, talk)
-    _report(outcome, talk)
-    if as_json:
-        print(json.dumps(outcome.document, indent=2))
-    elif not quiet:
-        for evaluation in outcome.evaluations:
-            _print_table(evaluation)
-    return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
-
-
-def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
     for entry in outcome.document["skipped"]:
         talk.error(f"{entry['capture']} was skipped: {entry['reason']}")
     for problem in outcome.figure_problems:
@@ -143,6 +132,12 @@ def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
         talk.warn(warning)
     for note in outcome.document["notes"]:
         talk.say(f"splinecli: note: {note}")
+    if as_json:
+        print(json.dumps(outcome.document, indent=2))
+    elif not quiet:
+        for evaluation in outcome.evaluations:
+            _print_table(evaluation)
+    return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
 
 
 def _print_table(evaluation: Evaluation) -> None:

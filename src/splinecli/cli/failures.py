@@ -11,8 +11,7 @@ from splinecli.system.memory import is_out_of_memory
 USAGE = 2
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
-ParserError: type[Exception] = typer.BadParameter.__mro__[1]
-"""What the parser raises for arguments that it cannot use."""
+ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for arguments that it cannot use
 
 
 def explain(error: Exception) -> tuple[str, int]:

@@ -90,8 +90,7 @@ EXAMPLES = {
     "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o official.safetensors": "Convert the authors' weights,"
     " then use --weights official.safetensors.",
 }
-EXAMPLE_WIDTH = 64
-"""Columns of an example. With its indent it fits a terminal of 80 columns."""
+EXAMPLE_WIDTH = 64  # columns; with its indent an example fits a terminal of 80 columns
 
 
 def man_pages() -> dict[str, str]:

@@ -53,8 +53,7 @@ PANELS = {
 }
 """Command -> title of a panel -> its options, in the order of the help."""
 
-OTHERS = "Options"
-"""Title of the options that no panel names, such as --help."""
+OTHERS = "Options"  # title of the options that no panel names, such as --help
 
 
 def sort_into_panels(command: str, options: list[str]) -> dict[str, list[str]]:
