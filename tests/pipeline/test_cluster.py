@@ -5,6 +5,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,7 +51,7 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Work]
     (tmp_path / "probe").touch()
 
     def make(do: Callable[..., Any]) -> Work:
-        return Work.of_this_process(str(tmp_path), worker_tasks.get_ready, do, tmp_path / "probe")
+        return Work(partial(do, str(tmp_path)), str(tmp_path / "probe"))
 
     return make
 

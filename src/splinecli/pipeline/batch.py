@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,11 +69,12 @@ def infer_batch(
         if not cluster.workers:
             cluster = replace(cluster, workers=choose_workers(members, options))
         cluster = cluster.on_cores(len(members))
-    outcomes = (
-        enumerate(_one_by_one(members, options, observer, redo))
-        if cluster is None
-        else _on_workers(members, options, observer, redo, cluster)
-    )
+    outcomes: Iterable[tuple[int, Outcome]]
+    if cluster is None:
+        method = cache(partial(make_method, options))
+        outcomes = enumerate(run_member(member, options, redo, method, observer) for member in members)
+    else:
+        outcomes = _on_workers(members, options, observer, redo, cluster)
     for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)
@@ -84,18 +86,6 @@ def infer_batch(
             write_text(output / INDEX, index_page(shown, output))
 
 
-def _one_by_one(members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo) -> Iterator[Outcome]:
-    estimator: Estimator | None = None
-
-    def method() -> Estimator:
-        nonlocal estimator
-        estimator = estimator or make_method(options)
-        return estimator
-
-    for member in members:
-        yield run_member(member, options, redo, method, observer)
-
-
 def _on_workers(
     members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
 ) -> Iterator[tuple[int, Outcome]]:
@@ -104,13 +94,13 @@ def _on_workers(
 
     # On any device: the machine of the command may have none of the workers' GPUs.
     weights = make_method(replace(options, device="cpu") if cluster.address else options).weights
-    settings = _Settings(options, redo, None if weights is None else weights["sha256"])
+    infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
     items = (
         Item((number, member), str(member.folder), expected_bytes(member, options))
         for number, member in enumerate(members)
     )
     with (
-        distributor(settings, _prepare, _infer, Path(options.output), cluster, observer) as workers,
+        distributor(infer, Path(options.output), cluster, observer) as workers,
         observer.progress("captures", len(members), unit="captures") as advance,
     ):
         began, n_failed, n_pixels = time.monotonic(), 0, 0
@@ -132,15 +122,6 @@ def _on_workers(
             yield number, outcome
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """What all captures of a batch share, and the checksum of the weights on the machine of the command."""
-
-    options: InferOptions
-    redo: Redo
-    weights_sha256: str | None
-
-
 class _Warnings(Observer):
     """Keeps warnings, which go back with the report."""
 
@@ -151,17 +132,14 @@ class _Warnings(Observer):
         self.found.append(message)
 
 
-def _prepare(settings: _Settings) -> None:
-    """Check on a worker the files that the options name, and the weights."""
-    settings.options.check_files()
-    _method(settings)
-
-
-def _infer(settings: _Settings, number: int, member: Member) -> tuple[Outcome, list[str]]:
+def _infer(
+    options: InferOptions, redo: Redo, sha256: str | None, number: int, member: Member
+) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return what became of it and the warnings."""
     from splinecli.pipeline.distribution import SAME_STORAGE, this_worker
 
-    observer = _Warnings()
+    options.check_files()
+    estimator, observer = _method(options, options.method_options, sha256), _Warnings()
     if member.missing is None and not os.path.lexists(member.folder):
         here = this_worker()
         member = replace(
@@ -170,29 +148,22 @@ def _infer(settings: _Settings, number: int, member: Member) -> tuple[Outcome, l
                 f"the folder does not exist on the worker {here}", path=member.folder, hint=SAME_STORAGE
             ),
         )
-    outcome = run_member(member, settings.options, settings.redo, lambda: _method(settings), observer)
+    outcome = run_member(member, options, redo, lambda: estimator, observer)
     return outcome, observer.found
 
 
-_made: dict[tuple[str, MethodOptions, str | None], Estimator] = {}
-"""The estimator of this worker; loading it takes a second."""
-
-
-def _method(settings: _Settings) -> Estimator:
-    options, sha256 = settings.options, settings.weights_sha256
-    key = (options.method, options.method_options, sha256)
-    if key not in _made:
-        estimator = make_method(options)
-        found = None if estimator.weights is None else estimator.weights["sha256"]
-        if found != sha256:
-            raise ModelError(
-                f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
-                path=options.weights,
-                hint="Use the same file, and the same version of splinecli, everywhere",
-            )
-        _made.clear()
-        _made[key] = estimator
-    return _made[key]
+@lru_cache(maxsize=1)
+def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
+    """Return the estimator of this worker; loading it takes a second. Options are equal on any device, `method` not."""
+    estimator = make_method(options)
+    found = None if estimator.weights is None else estimator.weights["sha256"]
+    if found != sha256:
+        raise ModelError(
+            f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
+            path=options.weights,
+            hint="Use the same file, and the same version of splinecli, everywhere",
+        )
+    return estimator
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:

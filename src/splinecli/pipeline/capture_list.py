@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,7 +80,13 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
     chosen = folders if shard is None else shard.choose(folders)
     # Also of the other shards, because their results go to the same place.
     members = {folder: _member(folder) for folder in folders}
-    _check_names({folder: member.name for folder, member in members.items() if member.missing is None})
+    seen: dict[str, Path] = {}
+    for folder, member in members.items():
+        if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
+            raise UsageError(
+                f"{other} and {folder} have the same name, so their results would overwrite each other",
+                hint="Run them one by one with different -o",
+            )
     return [members[folder] for folder in chosen]
 
 
@@ -110,14 +116,3 @@ def _member(folder: Path) -> Member:
         )
     kind = "film" if is_film(folder) else "folder"
     return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
-
-
-def _check_names(names: Mapping[Path, str]) -> None:
-    seen: dict[str, Path] = {}
-    for folder, name in names.items():
-        other = seen.setdefault(name, folder)
-        if other is not folder:
-            raise UsageError(
-                f"{other} and {folder} have the same name, so their results would overwrite each other",
-                hint="Run them one by one with different -o",
-            )

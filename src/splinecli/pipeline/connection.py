@@ -22,9 +22,7 @@ from splinecli.system.files import read_json
 if TYPE_CHECKING:
     from distributed import Client
 
-RETRIES = 2
-"""How often an item is repeated whose worker of this machine was lost. A running cluster has a setting of its own."""
-
+RETRIES = 2  # of an item whose worker of this machine was lost; a running cluster has a setting of its own
 _CONNECT_SECONDS = 5.0
 _ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0

@@ -18,11 +18,8 @@ from splinecli.pipeline.observer import SILENT, Observer
 if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator
 
-AUTOMATIC_FROM = 100_000
-"""Pixels of the smallest capture for which a network is distilled unless the user asks for it."""
-
-GAIN = 2.0
-"""Above that size, learning must be this many times as fast as the network on every pixel. A GPU may not need it."""
+AUTOMATIC_FROM = 100_000  # pixels: smaller captures are distilled only where the user asks for it
+GAIN = 2.0  # above that size, learning must be this many times as fast as the network; a GPU may not need it
 
 
 def distil_for(

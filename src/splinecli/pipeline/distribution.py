@@ -10,7 +10,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from itertools import count
@@ -24,7 +24,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.observer import Observer
 from splinecli.system.extras import import_extra
-from splinecli.system.files import UNFINISHED, refusals_as_output_errors
+from splinecli.system.files import UNFINISHED, made_folder, refusals_as_output_errors
 from splinecli.system.memory import available_memory, keep_freed_memory
 
 if TYPE_CHECKING:
@@ -37,9 +37,7 @@ _LOOK_SECONDS = 0.5  # between two looks at which workers there are
 _NO_WORKER_SECONDS = 60.0  # after which a cluster of this machine counts as lost
 _PROBE_SECONDS = 3.0  # a network drive may show a new file a little later
 
-_ONE_AT_A_TIME = Lock()
-"""A worker process does one item at a time, whatever its number of threads: the working folder and
-PyTorch's threads belong to the process."""
+_ONE_AT_A_TIME = Lock()  # item of a worker: the working folder and PyTorch's threads belong to the process
 
 
 class LostError(SplinecliError):
@@ -55,35 +53,28 @@ class Item:
     memory: float = 0.0
 
 
+def _versions() -> dict[str, str]:
+    return {"splinecli": __version__, "distributed": metadata.version("distributed")}
+
+
 @dataclass(frozen=True)
 class Work:
     """What all items of a command share. It travels with each item.
 
     Args:
-        settings: of the command.
-        prepare: called with the settings before each item. It raises what is wrong with the worker.
-        do: called with the settings and the arguments of an item. It returns the result.
-        folder: the working folder of the command, which its relative paths start from.
+        do: called with the arguments of an item. It returns the result, or raises what is wrong with the worker.
         probe: a file in the output folder. Workers that do not see it have another storage.
+        folder: the working folder of the command, which its relative paths start from.
         versions: of the packages that must be the same.
     """
 
-    settings: Any
-    prepare: Callable[[Any], object]
     do: Callable[..., Any]
-    folder: str
     probe: str
-    versions: dict[str, str]
-
-    @classmethod
-    def of_this_process(
-        cls, settings: Any, prepare: Callable[[Any], object], do: Callable[..., Any], probe: Path
-    ) -> Work:
-        """Return the work of a command under the folder of this process."""
-        return cls(settings, prepare, do, str(Path.cwd()), str(probe), _versions())
+    folder: str = field(default_factory=os.getcwd)
+    versions: dict[str, str] = field(default_factory=_versions)
 
     def enter(self) -> None:
-        """Make this worker ready. Raises UsageError or InputError if it does not fit, and what `prepare` raises."""
+        """Make this worker ready. Raises UsageError or InputError if it does not fit."""
         for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
             if found != expected:
                 raise UsageError(f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS)
@@ -99,7 +90,6 @@ class Work:
                 raise InputError("the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE)
             time.sleep(0.1)
         keep_freed_memory()
-        self.prepare(self.settings)
 
 
 def this_worker() -> str:
@@ -112,7 +102,7 @@ def _do(work: Work, *args: Any) -> Any:
     try:
         with _ONE_AT_A_TIME:
             work.enter()
-            return work.do(work.settings, *args)
+            return work.do(*args)
     except SplinecliError as error:
         problem = f"{error.problem} (on the worker {this_worker()})"
         raise type(error)(problem, path=error.path, line=error.line, hint=error.hint) from None
@@ -265,22 +255,14 @@ def _scheduler_lost() -> SplinecliError:
     )
 
 
-def _versions() -> dict[str, str]:
-    return {"splinecli": __version__, "distributed": metadata.version("distributed")}
-
-
 @contextmanager
 def distributor(
-    settings: Any,
-    prepare: Callable[[Any], object],
-    do: Callable[..., Any],
-    output: Path,
-    options: ClusterOptions,
-    observer: Observer,
+    do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers; see Work for the first three arguments.
+    """Yield a Distributor with a connection to its workers.
 
     Args:
+        do: see Work.
         output: the output folder, by which workers show that they have the same storage. It is made as needed.
 
     Raises:
@@ -288,16 +270,13 @@ def distributor(
         OutputError: the folder cannot be made.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
-    with refusals_as_output_errors(output):
-        made = [place for place in (output, *output.parents) if not place.exists()]
-        output.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-    try:
-        with connected(options) as client:
-            work = Work.of_this_process(settings, prepare, do, probe.absolute())
-            yield Distributor(client, work, options, observer)
-    finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
-            for place in made:
-                place.rmdir()
+    with ExitStack() as stack:
+        with refusals_as_output_errors(output):
+            stack.enter_context(made_folder(output))
+            probe.touch()
+        try:
+            with connected(options) as client:
+                yield Distributor(client, Work(do, str(probe.absolute())), options, observer)
+        finally:
+            with suppress(OSError):
+                probe.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from splinecli.capture import open_capture
@@ -61,7 +62,7 @@ class OnWorkers:
             tuple(self.protocols),
         )
         lost: LostError | None = None
-        with distributor(settings, _scorer, _score, self.output, self.cluster, self.observer) as workers:
+        with distributor(partial(_score, settings), self.output, self.cluster, self.observer) as workers:
             for item, result in workers.run(_items(draws)):
                 if isinstance(result, LostError):
                     lost = result
@@ -83,7 +84,7 @@ _scorers: dict[str, DrawScorer] = {}
 """That of the command that this worker serves."""
 
 
-def _scorer(settings: _Settings) -> DrawScorer:
+def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
     if settings.command not in _scorers:
         estimators = [make_estimator(name, settings.method_options) for name in settings.methods]
         for estimator, expected in zip(estimators, settings.fingerprints, strict=True):
@@ -95,8 +96,4 @@ def _scorer(settings: _Settings) -> DrawScorer:
                 )
         _scorers.clear()
         _scorers[settings.command] = DrawScorer(estimators, settings.protocols)
-    return _scorers[settings.command]
-
-
-def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
-    return _scorer(settings).score(draw)
+    return _scorers[settings.command].score(draw)

@@ -109,11 +109,6 @@ class InferOptions(Reading):
         """The part of the options that concerns the method."""
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
-    @property
-    def scales_surface(self) -> bool:
-        """Whether the pixel size also scales a surface."""
-        return self.surface
-
     def check_files(self) -> None:
         """See Reading. Raise UsageError, too, if a package that the options need is not installed."""
         super().check_files()

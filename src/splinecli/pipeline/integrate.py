@@ -28,11 +28,9 @@ from splinecli.system.extras import import_extra
 from splinecli.system.files import check_free, read_json
 from splinecli.system.publishing import held_folder, new_files
 
-SCHEMA = 2
-"""The version of the fields of surface.json. It rises when a field changes its meaning."""
+SCHEMA = 2  # rises when a field of the report changes its meaning
 
-INPUT_FORMATS = ("npy", "tiff", "png", "png8")
-"""The formats in which `integrate` looks for a normal map in a folder, exact ones first."""
+INPUT_FORMATS = ("npy", "tiff", "png", "png8")  # of the normal map in a folder, exact ones first
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,10 +86,23 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
 def _add_captures(
     writer: PixelSetWriter, captures: dict[str, Path], options: PrepareOptions, observer: Observer, advance: Advance
 ) -> list[dict[str, Any]]:
-    """Add the captures and return what became of those that were left out."""
+    """Add the captures and return those that were left out. Raises OutputError if the set cannot be written."""
     skipped: list[dict[str, Any]] = []
     for name, folder in captures.items():
-        error = _add_capture(writer, name, folder, options)
+        error: SplinecliError | None = None
+        try:
+            add_capture(
+                writer,
+                name,
+                folder,
+                as_stored=options.as_stored,
+                white_level=options.white_level,
+                update=options.update,
+            )
+        except (InputError, CaptureChangedError) as refused:
+            error = refused
+        except OSError as refused:
+            error = InputError(f"cannot be read ({refused.strerror or refused})", path=refused.filename or folder)
         if error is None:
             observer.say(writer.describe(name))
         else:
@@ -97,19 +110,6 @@ def _add_captures(
             skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
         advance(1)
     return skipped
-
-
-def _add_capture(writer: PixelSetWriter, name: str, folder: Path, options: PrepareOptions) -> SplinecliError | None:
-    """Add a capture, or return why it cannot be used. Raises OutputError if the set cannot be written."""
-    try:
-        add_capture(
-            writer, name, folder, as_stored=options.as_stored, white_level=options.white_level, update=options.update
-        )
-    except (InputError, CaptureChangedError) as error:
-        return error
-    except OSError as error:
-        return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
-    return None
 
 
 def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Observer, advance: Advance) -> None:

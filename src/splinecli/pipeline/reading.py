@@ -64,6 +64,7 @@ class Reading:
     flat_field: str | None = None
     white_level: float | None = None
     strict: bool = False
+    surface = False  # is made of the capture, too, in the unit of pixel_size; a field of InferOptions
 
     def __post_init__(self) -> None:
         if self.finds_lights:
@@ -104,18 +105,13 @@ class Reading:
         return None if self.finds_lights else self.lights
 
     @property
-    def scales_surface(self) -> bool:
-        """Whether the pixel size also scales a surface."""
-        return False
-
-    @property
     def lamps(self) -> LampOptions:
         """The part of the options that concerns near lamps. Raises UsageError."""
         return LampOptions(
             positions=self.light_positions,
             distance=self.light_distance,
             pixel_size=self.pixel_size,
-            scales_surface=self.scales_surface,
+            scales_surface=self.surface,
             object_width=self.object_width,
             camera_matrix=self.camera_matrix,
         )

@@ -9,9 +9,7 @@ from pathlib import Path
 
 from splinecli.errors import SplinecliError
 
-LARGEST_IMAGE = 400_000_000
-"""Pixels of the largest image that is read."""
-
+LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
 _LIBRARIES, _BUFFER = 1.5e9, 64 * 2**20  # bytes
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of malloc.h
 _LARGEST_KEPT, _MOST_KEPT = 2**27, 2**29  # bytes

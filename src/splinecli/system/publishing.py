@@ -9,7 +9,7 @@ anything, and no link in it is followed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,6 +20,7 @@ from splinecli.system.files import (
     UNFINISHED,
     check_writable,
     create_hidden,
+    made_folder,
     refusals_as_output_errors,
     sync,
     sync_names,
@@ -48,23 +49,17 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
         OutputError: the folder cannot be made or written.
     """
     check_writable(folder)
-    made: list[Path] = []
-    try:
-        with ExitStack() as stack:
-            with refusals_as_output_errors(folder):
-                made = [place for place in (folder, *folder.parents) if not place.exists()]
-                stack.enter_context(locked(folder, wait=wait))
-                sync_names(folder, *made)
-                left = [path for path in folder.glob(f".*{UNFINISHED}") if is_plain(path)]
-                for path in left:
-                    path.unlink()
-                if left:
-                    warn(f"{folder}: {UNDONE}")
-            yield
-    finally:
-        with suppress(OSError):
-            for place in made:
-                place.rmdir()
+    with ExitStack() as stack:
+        with refusals_as_output_errors(folder):
+            made = stack.enter_context(made_folder(folder))
+            stack.enter_context(locked(folder, wait=wait))
+            sync_names(folder, *made)
+            left = [path for path in folder.glob(f".*{UNFINISHED}") if is_plain(path)]
+            for path in left:
+                path.unlink()
+            if left:
+                warn(f"{folder}: {UNDONE}")
+        yield
 
 
 class NewFiles:
