@@ -235,9 +235,8 @@ def test_no_scheduler(address, tmp_path, monkeypatch):
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     """The command sees the folder, so it is not missing for it."""
     monkeypatch.chdir(tmp_path)
-    settings = batch._Settings(InferOptions(method="ls"), "nothing", None)
     member = Member(tmp_path / "unseen", "unseen")
-    outcome, _ = client.submit(batch._infer, settings, 0, member, pure=False).result()
+    outcome, _ = client.submit(batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
 

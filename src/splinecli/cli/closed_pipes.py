@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from typing import Any, TextIO
 
 
@@ -26,11 +25,6 @@ class UntilClosed:
         except BrokenPipeError:
             self._mute()
             return len(text)
-
-    def writelines(self, lines: Iterable[str]) -> None:
-        """Write several texts."""
-        for line in lines:
-            self.write(line)
 
     def flush(self) -> None:
         """Write what is buffered."""

@@ -10,8 +10,16 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.records import record_from
-from splinecli.cli.values import Device, Precision, listed, parse_cluster, parse_light_count, parse_pixel, parse_skip
+from splinecli.cli.values import (
+    Device,
+    Precision,
+    listed,
+    parse_cluster,
+    parse_light_count,
+    parse_pixel,
+    parse_skip,
+    record_from,
+)
 from splinecli.errors import InputError
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
 

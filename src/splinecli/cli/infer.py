@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -13,7 +13,6 @@ from splinecli.capture.capture_warnings import PROBABLY_WRONG
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.documents import printed_documents
-from splinecli.cli.records import record_from
 from splinecli.cli.values import (
     Device,
     FirstLight,
@@ -24,6 +23,7 @@ from splinecli.cli.values import (
     listed,
     parse_cluster,
     parse_indices,
+    record_from,
     split_commas,
 )
 from splinecli.errors import UsageError, printable
@@ -183,6 +183,7 @@ def _show_all(
     summaries: bool,
 ) -> int:
     from splinecli.pipeline.batch import worst_exit_code
+    from splinecli.pipeline.member import Status
 
     statuses: Counter[str] = Counter()
     codes: set[int] = set()
@@ -195,7 +196,11 @@ def _show_all(
         if outcome.status in ("done", "skipped"):
             rows.append(row_of(outcome.report))
     if statuses.total() > 1:
-        _show_table(rows, statuses, output, messages)
+        if rows:
+            columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
+            messages.table(list(zip(*columns, strict=True)))
+        text = ", ".join(f"{statuses[name]} {_WORDS.get(name, name)}" for name in get_args(Status) if statuses[name])
+        messages.say(f"{statuses.total()} captures: {text}; see {output / INDEX}")
     return worst_exit_code(codes)
 
 
@@ -210,16 +215,6 @@ def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: b
         if outcome.trace:
             print_lines(outcome.trace)
         messages.error(outcome.report["error"])
-
-
-def _show_table(rows: Sequence[Row], statuses: Counter[str], output: Path, messages: Messages) -> None:
-    from splinecli.pipeline.member import Status
-
-    if rows:
-        columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
-        messages.table(list(zip(*columns, strict=True)))
-    text = ", ".join(f"{statuses[name]} {_WORDS.get(name, name)}" for name in get_args(Status) if statuses[name])
-    messages.say(f"{statuses.total()} captures: {text}; see {output / INDEX}")
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:

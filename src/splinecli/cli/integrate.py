@@ -8,8 +8,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.records import record_from
-from splinecli.cli.values import NormalConvention, complete_list, split_commas
+from splinecli.cli.values import NormalConvention, complete_list, record_from, split_commas
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 
 

@@ -118,7 +118,7 @@ def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
         lines.append(f".SH {title}")
         for term, meaning in rows.items():
             lines += [".TP", f"\\fB{_escape(term)}\\fR", _escape(meaning)]
-    return _page_text([*lines, *_examples(""), *_see_also(commands)])
+    return _page_text([*lines, *_examples("")], commands)
 
 
 def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any]) -> str:
@@ -136,7 +136,7 @@ def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any
     # Commands that this page mentions.
     text = " ".join([command.help, *(parameter.help or "" for parameter in command.params)])
     related = [other for other in commands if other != name and re.search(rf"\b{other}\b", text)]
-    return _page_text([*lines, *_see_also(["", *related])])
+    return _page_text(lines, ["", *related])
 
 
 def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str]:
@@ -186,12 +186,8 @@ def _wrap(command_line: str) -> str:
     return " \\\n    ".join(lines).replace("\0", " ")
 
 
-def _see_also(names: Iterable[str]) -> list[str]:
-    return [".SH SEE ALSO", *(f"{_reference(name)}," for name in names)]
-
-
-def _page_text(lines: list[str]) -> str:
-    return "\n".join(lines).rstrip(",") + "\n"
+def _page_text(lines: list[str], related: Iterable[str]) -> str:
+    return "\n".join([*lines, ".SH SEE ALSO", ",\n".join(map(_reference, related))]) + "\n"
 
 
 def _page_name(command: str) -> str:

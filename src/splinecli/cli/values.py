@@ -1,19 +1,24 @@
-"""The values of options: those that are allowed, their completion, and their parsing."""
+"""The values of options: those that are allowed, their completion, their parsing, and the records that they fill."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
-from enum import StrEnum
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from enum import Enum, StrEnum
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from splinecli.calibration.circle import Circle
     from splinecli.pipeline.connection import ClusterOptions
 
+    Record = TypeVar("Record", bound=DataclassInstance)
 
 _MOST_DIGITS = 18  # of a number of images
 
@@ -128,3 +133,31 @@ def parse_light_count(text: str) -> int | None:
         return int(text)
     except ValueError:
         raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
+
+
+def record_from(record: type[Record], arguments: Mapping[str, Any], **values: Any) -> Record:
+    """Build a record of options from the arguments of a command that have the names of its fields.
+
+    Args:
+        record: a frozen dataclass.
+        arguments: of the command, such as its `locals()`. A choice becomes its value, a list a tuple, and a path text
+            if the field holds no path.
+        values: of fields that need more than this, in place of the arguments.
+
+    Raises:
+        UsageError: the record refuses a value.
+    """
+    given = {
+        field.name: _of_field(arguments[field.name], str(field.type))
+        for field in fields(record)
+        if field.name in arguments
+    }
+    return record(**given | values)
+
+
+def _of_field(value: Any, kind: str) -> Any:
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, list):
+        return tuple(value)
+    return str(value) if isinstance(value, Path) and "Path" not in kind else value

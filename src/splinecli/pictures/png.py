@@ -39,8 +39,5 @@ def encode_png(
     # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
     chunks = [b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()]
     chunks += [b"cICP\x01\x01\x00\x01"] if film else []
-    return file[:_HEAD] + b"".join(map(_chunk, chunks)) + file[_HEAD:]
-
-
-def _chunk(content: bytes) -> bytes:
-    return struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))
+    whole = [struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks]
+    return file[:_HEAD] + b"".join(whole) + file[_HEAD:]

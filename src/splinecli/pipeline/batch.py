@@ -8,12 +8,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splinecli.errors import InputError, ModelError, SplinecliError
 from splinecli.methods import Estimator, MethodOptions
 from splinecli.pipeline.capture_list import Member, Shard, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
+from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Outcome, Redo, failed, run_member
@@ -21,9 +22,6 @@ from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.results.index import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
 from splinecli.system.files import check_writable, write_text
 from splinecli.system.publishing import held_folder
-
-if TYPE_CHECKING:
-    from splinecli.pipeline.connection import ClusterOptions
 
 
 def infer_batch(
@@ -90,8 +88,6 @@ def _on_workers(
     members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and the outcome of each capture as it ends on another process."""
-    from splinecli.pipeline.distribution import Item, LostError, distributor
-
     # On any device: the machine of the command may have none of the workers' GPUs.
     weights = make_method(replace(options, device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
@@ -136,8 +132,6 @@ def _infer(
     options: InferOptions, redo: Redo, sha256: str | None, number: int, member: Member
 ) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return what became of it and the warnings."""
-    from splinecli.pipeline.distribution import SAME_STORAGE, this_worker
-
     options.check_files()
     estimator, observer = _method(options, options.method_options, sha256), _Warnings()
     if member.missing is None and not os.path.lexists(member.folder):

@@ -6,24 +6,25 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.calibration.balls import CalibratedLights, calibrate_ball, combine_balls, find_ball_files
+from splinecli.calibration.circle import Circle
+from splinecli.calibration.gray import measure_light_intensities
+from splinecli.calibration.lamp_positions import LampPositions, triangulate_lamps
+from splinecli.calibration.report import calibration_report, summary_lines
 from splinecli.capture.lights.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import UsageError
 from splinecli.maths.transfer import AUTOMATIC, TransferCurve, parse_transfer
+from splinecli.pictures.calibration import calibration_picture
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.system.files import check_free
 from splinecli.system.publishing import held_folder, new_files
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from splinecli.calibration.balls import CalibratedLights
-    from splinecli.calibration.circle import Circle
-    from splinecli.calibration.lamp_positions import LampPositions
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
@@ -106,11 +107,6 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
 
 def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, Any]:
     """Do the work of calibrate_lights in the folder of results, which the caller holds."""
-    from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
-    from splinecli.calibration.gray import measure_light_intensities
-    from splinecli.calibration.lamp_positions import triangulate_lamps
-    from splinecli.calibration.report import calibration_report, summary_lines
-
     target = options.gray_ball or options.gray_card
     # A wrong path must not come to light after all images are read.
     target_files = None if target is None else find_ball_files(target)
@@ -157,8 +153,6 @@ def _write(
     lamps: LampPositions | None,
     report: dict[str, Any],
 ) -> None:
-    from splinecli.pictures.calibration import calibration_picture
-
     known = lamps if lamps is not None and lamps.known else None
     texts = {
         DIRECTIONS: rows_text(lights.directions),

@@ -158,14 +158,12 @@ def _start_resource_tracker() -> None:
     """Start the process in which Python counts semaphores, without its warning: SIGTERM may end this process first."""
     if os.name == "nt":  # where there is no such process
         return
-    before = os.environ.get("PYTHONWARNINGS")
+    before = os.environ.get("PYTHONWARNINGS", "")
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
         resource_tracker.ensure_running()
     finally:
-        del os.environ["PYTHONWARNINGS"]
-        if before is not None:
-            os.environ["PYTHONWARNINGS"] = before
+        os.environ["PYTHONWARNINGS"] = before
 
 
 def _address(text: str) -> str:

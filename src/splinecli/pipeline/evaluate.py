@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,9 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import Elsewhere, evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
+from splinecli.networks.weights import untrained_warning
 from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.evaluate_on_workers import score_on_workers
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.system.devices import count_available_cores
 from splinecli.system.files import check_writable
@@ -177,13 +180,14 @@ def evaluate_captures(
     check_skip_first(protocols[0], list(distinct_names(captures).values()))
     read_draws_file(protocols[0])
     _check_counts(captures, protocols)
-    estimators = _make_estimators(options)
+    estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
+    if options.method_options.weights is not None and not any(estimator.weights for estimator in estimators):
+        names = ", ".join(estimator.name for estimator in estimators)
+        raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
     jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
     elsewhere: Elsewhere | None = None
     if (cluster := options.cluster and options.cluster.on_cores()) is not None:
-        from splinecli.pipeline.evaluate_on_workers import OnWorkers
-
-        elsewhere = OnWorkers(estimators, options.method_options, protocols, cluster, output, observer)
+        elsewhere = partial(score_on_workers, estimators, options.method_options, protocols, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(
@@ -202,14 +206,6 @@ def evaluate_captures(
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
         document = write_results(output, evaluations, plots, figures)
     return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
-
-
-def _make_estimators(options: EvaluateOptions) -> list[Estimator]:
-    estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
-    if options.method_options.weights is not None and not any(e.weights for e in estimators):
-        names = ", ".join(e.name for e in estimators)
-        raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
-    return estimators
 
 
 def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> None:
@@ -261,7 +257,5 @@ def _untrained(evaluations: Sequence[Evaluation]) -> list[str]:
     used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
     if not used:
         return []
-    from splinecli.networks.weights import untrained_warning
-
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
     return [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]

@@ -28,9 +28,16 @@ class _Settings:
     protocols: tuple[Protocol, ...]
 
 
-@dataclass(frozen=True)
-class OnWorkers:
-    """Scores draws on workers. Only the process of the command writes the store of trials.
+def score_on_workers(
+    estimators: Sequence[Estimator],
+    method_options: MethodOptions,
+    protocols: Sequence[Protocol],
+    cluster: ClusterOptions,
+    output: Path,
+    observer: Observer,
+    draws: Sequence[DrawTask],
+) -> Iterator[tuple[DrawTask, DrawScores]]:
+    """Yield the draws with their scores as they end. Only the process of the command writes the store of trials.
 
     Args:
         estimators, method_options: the methods.
@@ -38,38 +45,28 @@ class OnWorkers:
         cluster: where draws are scored.
         output: a folder that all workers see.
         observer: receives messages.
+        draws: what is scored.
+
+    Raises:
+        LostError: the workers of a draw were lost. All others are scored.
+        SplinecliError: what a trial or Distributor.run raises.
     """
-
-    estimators: Sequence[Estimator]
-    method_options: MethodOptions
-    protocols: Sequence[Protocol]
-    cluster: ClusterOptions
-    output: Path
-    observer: Observer
-
-    def __call__(self, draws: Sequence[DrawTask]) -> Iterator[tuple[DrawTask, DrawScores]]:
-        """Yield the draws with their scores as they end.
-
-        Raises:
-            LostError: the workers of a draw were lost. All others are scored.
-            SplinecliError: what a trial or Distributor.run raises.
-        """
-        settings = _Settings(
-            uuid.uuid4().hex,
-            tuple(estimator.name for estimator in self.estimators),
-            self.method_options,
-            tuple(estimator.fingerprint for estimator in self.estimators),
-            tuple(self.protocols),
-        )
-        lost: LostError | None = None
-        with distributor(partial(_score, settings), self.output, self.cluster, self.observer) as workers:
-            for item, result in workers.run(_items(draws)):
-                if isinstance(result, LostError):
-                    lost = result
-                else:
-                    yield item.args[0], result
-        if lost is not None:
-            raise lost
+    settings = _Settings(
+        uuid.uuid4().hex,
+        tuple(estimator.name for estimator in estimators),
+        method_options,
+        tuple(estimator.fingerprint for estimator in estimators),
+        tuple(protocols),
+    )
+    lost: LostError | None = None
+    with distributor(partial(_score, settings), output, cluster, observer) as workers:
+        for item, result in workers.run(_items(draws)):
+            if isinstance(result, LostError):
+                lost = result
+            else:
+                yield item.args[0], result
+    if lost is not None:
+        raise lost
 
 
 def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:

@@ -15,7 +15,7 @@ from splinecli.capture.capture_size import BYTES_OF_SURFACE
 from splinecli.capture.formats.depth_files import read_depth
 from splinecli.capture.formats.image_size import ExpectedSize, check_memory
 from splinecli.capture.lights.lamp_files import read_camera_matrix
-from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import check_pixel_size, make_surface, view_of_report
@@ -82,8 +82,7 @@ class IntegrateOptions:
         if self.prior_detail is not None and self.prior is None:
             raise UsageError("--prior-detail needs --prior")
         for name in self.formats:
-            if name not in SURFACE_FILES:
-                raise UsageError(f"no format named {name!r}; expected one of {', '.join(SURFACE_FILES)}")
+            check_one_of("format", name, SURFACE_FILES)
 
     @property
     def folder(self) -> Path:

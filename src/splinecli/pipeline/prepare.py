@@ -11,6 +11,7 @@ from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.observer import SILENT, Advance, Observer
+from splinecli.pipeline.prepare_on_workers import render_on_workers
 from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
 from splinecli.pixel_sets.rendered import ScenePlan, add_scene
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
@@ -116,7 +117,6 @@ def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Obser
     plan = options.scenes
     cluster = None if options.cluster is None else options.cluster.on_cores(len(plan.names))
     if cluster is not None:
-        from splinecli.pipeline.prepare_on_workers import render_on_workers
 
         def show(position: int) -> None:
             for name in plan.entry_names(position).values():

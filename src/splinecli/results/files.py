@@ -25,6 +25,7 @@ from splinecli.pictures.maps import (
 )
 from splinecli.pictures.png import encode_png
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.system.exr import encode_exr
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
 
@@ -180,8 +181,6 @@ def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], conventi
     elif form == "npy":
         np.save(file, estimate.normal_map, allow_pickle=False)
     elif form == "exr":
-        from splinecli.system.exr import encode_exr
-
         signs = np.array((1, 1 if convention == "opengl" else -1, 1), np.float32)
         colours = (estimate.normal_map * signs + 1) / 2 * estimate.capture.mask[..., None]
         file.write(encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"}))
@@ -203,8 +202,6 @@ def albedo_files(albedo: NDArray[np.float32], mask: NDArray[np.bool_], *, exr: b
     """Yield a linear albedo map (H, W, 3) as a float32 NPY file, as a picture and, with exr, as a float16 EXR file."""
     yield ALBEDO, albedo
     if exr:
-        from splinecli.system.exr import encode_exr
-
         largest = np.finfo(np.float16).max
         yield ALBEDO_EXR, encode_exr(albedo.clip(0, largest).astype(np.float16), {"colours": "linear RGB"})
     yield ALBEDO_PICTURE, encode_png(albedo_picture(albedo, mask))

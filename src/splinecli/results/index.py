@@ -9,6 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import numpy as np
+
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.facts import stored_size
+from splinecli.capture.formats.image_size import image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
 from splinecli.results.templates import render
@@ -97,11 +102,6 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
 def _thumbnail(path: Path) -> str | None:
     """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None where it cannot be read."""
     import cv2
-    import numpy as np
-
-    from splinecli.capture.formats.decoding import decode_image
-    from splinecli.capture.formats.facts import stored_size
-    from splinecli.capture.formats.image_size import image_bytes
 
     try:
         if image_bytes(*stored_size(path)) > _LARGEST_SHOWN:
