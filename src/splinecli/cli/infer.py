@@ -34,8 +34,7 @@ from splinecli.results.index import HEADER, INDEX, Row, row_of
 if TYPE_CHECKING:
     from splinecli.pipeline.member import Outcome, Redo
 
-_WORDS = {"skipped": "already done", "changed": "changed but kept"}
-"""How the last line names the outcomes that have other words there."""
+_WORDS = {"skipped": "already done", "changed": "changed but kept"}  # of the last line, for these outcomes
 
 
 def infer(

@@ -16,8 +16,7 @@ from splinecli.system.devices import choose_device, count_available_cores
 from splinecli.system.memory import available_memory
 
 BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
-REFINED_PIXELS, REFINED_BYTES = 736**2, 1100
-"""The most pixels that are refined at once: a tile with its margin. Bytes of each."""
+REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each
 
 INDIRECT_BYTES = 4  # of each pixel of the capture, for its indirect light
 _WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed

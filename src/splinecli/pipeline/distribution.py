@@ -147,18 +147,19 @@ class Distributor:
                 following = following or next(source, None)
                 if following is None:
                     break
-                largest = max(map(_memory_limit, workers.values()))
+                limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
+                largest = max(float(limit or math.inf) for limit in limits)
+                # The workers of a cluster have limits of Dask. Those of this machine share its memory.
+                used = 0.0 if self.options.address else sum(item.memory for item in self.running.values())
                 if following.memory > largest:
-                    yield (
-                        following,
-                        LostError(
-                            f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
-                            f" {largest / 1e9:.1f} GB",
-                            path=following.name,
-                            hint="Start fewer workers on each machine, with more memory each",
-                        ),
+                    error = LostError(
+                        f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
+                        f" {largest / 1e9:.1f} GB",
+                        path=following.name,
+                        hint="Start fewer workers on each machine, with more memory each",
                     )
-                elif self._has_room(following, free_memory):
+                    yield following, error
+                elif not used or used + following.memory <= free_memory:
                     self._submit(following, workers)
                 else:
                     break
@@ -191,11 +192,6 @@ class Distributor:
                 hint="Start the workers of machines with a GPU with 'dask worker ADDRESS --resources GPU=1'",
             )
         return with_gpu
-
-    def _has_room(self, item: Item, free_memory: float) -> bool:
-        """Return whether this machine's memory holds one more item. The workers of a cluster have limits of Dask."""
-        used = sum(other.memory for other in self.running.values())
-        return bool(self.options.address) or not used or used + item.memory <= free_memory
 
     def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
         needed = {"GPU": 1.0} if self.options.gpu else {}
@@ -243,10 +239,6 @@ class Distributor:
 
 def _resources(info: dict[str, Any]) -> dict[str, float]:
     return info.get("resources") or {}
-
-
-def _memory_limit(info: dict[str, Any]) -> float:
-    return float(_resources(info).get("MEMORY") or info.get("memory_limit") or math.inf)
 
 
 def _scheduler_lost() -> SplinecliError:

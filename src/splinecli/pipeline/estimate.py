@@ -19,8 +19,7 @@ from splinecli.results.clock import Clock
 if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator
 
-_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}
-"""What the clock calls the later stages of an estimation."""
+_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # as the clock calls them
 
 
 def estimate_capture(

@@ -255,7 +255,5 @@ def _draw_figures(
 def _untrained(evaluations: Sequence[Evaluation]) -> list[str]:
     """Return warnings about shipped weights that were used with numbers of lights they were not trained for."""
     used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
-    if not used:
-        return []
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
     return [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]

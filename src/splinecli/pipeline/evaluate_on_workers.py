@@ -77,8 +77,7 @@ def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
         yield Item((draw,), draw.name, memory)
 
 
-_scorers: dict[str, DrawScorer] = {}
-"""That of the command that this worker serves."""
+_scorers: dict[str, DrawScorer] = {}  # that of the command that this worker serves
 
 
 def _score(settings: _Settings, draw: DrawTask) -> DrawScores:

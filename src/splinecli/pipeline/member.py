@@ -20,8 +20,7 @@ from splinecli.pipeline.observer import Observer
 from splinecli.system.locks import RefusedFolderError
 from splinecli.system.memory import is_out_of_memory
 
-Redo = Literal["nothing", "changed", "all"]
-"""What to do with captures that have results: keep them all, redo what changed, or redo everything."""
+Redo = Literal["nothing", "changed", "all"]  # of the captures that have results
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
 

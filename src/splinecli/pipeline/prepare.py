@@ -76,12 +76,21 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         with observer.progress("preparing", len(captures) + len(options.scenes.names)) as advance:
             skipped = _add_captures(writer, captures, options, observer, advance)
             _add_scenes(writer, options, observer, advance)
-        if not len(writer):
-            return _summary(PixelSet(options.output, ()), skipped)
-        # Before the set counts as finished, so that a finished set has its own overview.
-        write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
-        pixel_set = writer.finish()
-    return _summary(pixel_set, skipped)
+        pixel_set = PixelSet(options.output, ())
+        if len(writer):
+            # Before the set counts as finished, so that a finished set has its own overview.
+            write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
+            pixel_set = writer.finish()
+    return {
+        "set": str(pixel_set.folder),
+        "entries": len(pixel_set.entries),
+        "scenes": len({entry.scene for entry in pixel_set.entries}),
+        "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
+        "bytes": sum((pixel_set.folder / name).stat().st_size for name in pixel_set.file_names),
+        "manifest": str(pixel_set.folder / MANIFEST),
+        "contact_sheet": str(pixel_set.folder / CONTACT_SHEET) if pixel_set.entries else None,
+        "skipped": skipped,
+    }
 
 
 def _add_captures(
@@ -136,16 +145,3 @@ def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Obser
         for name in add_scene(writer, plan, position, reach):
             observer.say(writer.describe(name))
         reach(1.0)
-
-
-def _summary(pixel_set: PixelSet, skipped: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "set": str(pixel_set.folder),
-        "entries": len(pixel_set.entries),
-        "scenes": len({entry.scene for entry in pixel_set.entries}),
-        "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
-        "bytes": sum((pixel_set.folder / name).stat().st_size for name in pixel_set.file_names),
-        "manifest": str(pixel_set.folder / MANIFEST),
-        "contact_sheet": str(pixel_set.folder / CONTACT_SHEET) if pixel_set.entries else None,
-        "skipped": skipped,
-    }

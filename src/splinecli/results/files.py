@@ -78,8 +78,7 @@ OWN_FILES = (
 """All files that `infer` and `integrate` may write into a capture's folder of results, but LIGHT_FILES."""
 
 
-Files = Iterator[tuple[str, Content]]
-"""Names and contents of files. Each content is made when it is asked for."""
+Files = Iterator[tuple[str, Content]]  # names and contents, each made when it is asked for
 
 
 class UnfinishedError(ValueError):

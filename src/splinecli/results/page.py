@@ -17,15 +17,9 @@ from splinecli.results.templates import render
 
 LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
 LONGEST_SIDE = 8192  # pixels: most devices draw pictures up to this side
-QUICK_MAP, FIRST_MAP = 500_000, 100_000
-"""A page with maps of more than QUICK_MAP pixels has maps of FIRST_MAP pixels, too, which are shown first."""
+QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page begins with maps of the second
 
-LOW_BITS = 5
-"""Bits of a normal's component below the 8 bits of a picture.
-
-13 bits keep a normal within 0.01 degrees, where 8 bits would show bands in a highlight. More bits would be noise,
-which PNG cannot compress, and would make the file twice as large.
-"""
+LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
 
 _LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # stands for a component of 1
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"

@@ -66,10 +66,9 @@ def count_available_cores() -> int:
     It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its control group, which
     containers and job schedulers set (Linux).
     """
-    limits = [float(os.cpu_count() or 1)]
+    limits = [os.cpu_count() or 1, *cgroup_quotas()]
     if hasattr(os, "sched_getaffinity"):
         limits.append(len(os.sched_getaffinity(0)))
-    limits += cgroup_quotas()
     return max(1, int(min(limits)))
 
 

@@ -27,8 +27,7 @@ from splinecli.system.files import (
 )
 from splinecli.system.locks import RefusedFolderError, locked
 
-Content = bytes | str | NDArray[Any]
-"""The content of a file; see NewFiles.write."""
+Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
 
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
