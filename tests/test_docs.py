@@ -78,7 +78,7 @@ def test_commands_have_options_that_exist(page, command):
     else:
         if words[0] == "COMMAND":
             return
-        known = group.commands[words[0]].params
+        known = [*group.commands[words[0]].params, *(group.commands["infer"].params if "--" in words else ())]
     options = {option for parameter in known for option in (*parameter.opts, *parameter.secondary_opts)}
     options |= {"--help", "-h", "--install-completion", "--show-completion", "--version"}
     for word in words:

@@ -128,7 +128,7 @@ def _estimate(
             found = estimator.estimate(light.observations, light.directions, progress=progress)
         normals[rows] = light.in_frame_of_capture(found)
 
-    light_of = partial(_light_on, capture)
+    light_of = partial(light_on, capture)
     for rows in parts_of_rows(capture.n_pixels, tile_pixels):
         estimate(rows, light_of(rows), progress)
     refiner = refiner_of(estimator)
@@ -136,7 +136,7 @@ def _estimate(
         with begin("removing indirect light") as advance:
             indirect = find_indirect_light(capture.mask, capture.observations, light_of, normals)
             if indirect is not None:
-                light_of = partial(_light_on, capture, without=indirect)
+                light_of = partial(light_on, capture, without=indirect)
                 for rows in parts_of_rows(capture.n_pixels, tile_pixels):
                     changed = rows[indirect.counts_at(capture.observations[rows], rows)]
                     if len(changed):
@@ -150,7 +150,7 @@ def _estimate(
     return normals, errors, judged
 
 
-def _light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:
+def light_on(capture: Capture, rows: Rows, without: IndirectLight | None = None) -> LampLight:
     """Return the observations and the light directions of some of a capture's pixels."""
     observations = capture.observations[rows]
     if without is not None:

@@ -1,6 +1,7 @@
 """--crop and --scale: what is read is a part of the whole capture, and so are the results."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 from splinecli.capture import open_capture
 from splinecli.capture.window import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.info import InfoOptions, describe_capture
@@ -106,10 +108,43 @@ def test_windows_that_do_not_fit_are_refused() -> None:
         open_capture(MEDALLION, window=parse_window("0,0,3,3", None)).read()
 
 
-def test_near_lamps_need_the_whole_image() -> None:
-    options = InferOptions(scale="1/2", light_distance=400.0, pixel_size=0.1)
-    with pytest.raises(SplinecliError, match="distant lights"):
+@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
+@pytest.mark.parametrize("perspective", [False, True])
+def test_near_lamps_light_a_part_as_they_light_the_whole(
+    crop: str | None, scale: str | None, perspective: bool, tmp_path: Path
+) -> None:
+    matrix = tmp_path / "camera.txt"
+    matrix.write_text("300 0 52\n0 300 61\n0 0 1\n")
+    lights = []
+    for options in ((None, None), (crop, scale)):
+        record = InferOptions(
+            crop=options[0],
+            scale=options[1],
+            light_distance=40.0,
+            pixel_size=0.1,
+            camera_matrix=str(matrix) if perspective else None,
+        )
+        capture = record.open(MEDALLION).read(as_stored=True)
+        assert capture.lamps is not None
+        places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
+        points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
+        lit = LampLight.of(capture.observations, replace(capture.lamps, points=points))
+        values = np.concatenate((lit.directions.reshape(len(points), -1), lit.observations), axis=1)
+        image = np.zeros((*capture.mask.shape, values.shape[1]))
+        image[capture.mask] = values
+        lights.append(image)
+    whole, part = lights
+    np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
+
+
+def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
+    options = InferOptions(crop="31,22,50,47", light_distance=400.0, object_width=10.0)
+    with pytest.raises(SplinecliError, match="--object-width needs the whole object in the image"):
         options.open(MEDALLION)
+    narrow = InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION).read()
+    wide = InferOptions(light_distance=400.0, object_width=10.0).open(MEDALLION).read()
+    assert narrow.lamps is not None and wide.lamps is not None
+    assert narrow.lamps.pixel_size == pytest.approx(3 * wide.lamps.pixel_size, rel=0.03)
 
 
 def test_a_mask_of_the_part_goes_back_into_the_whole() -> None:

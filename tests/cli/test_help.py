@@ -17,7 +17,7 @@ from splinecli.results.index import INDEX
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-COMMANDS = ["infer", "info", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]
+COMMANDS = ["infer", "watch", "info", "calibrate", "integrate", "evaluate", "prepare", "train", "import-weights"]
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])

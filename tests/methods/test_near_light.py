@@ -10,6 +10,7 @@ import splinecli
 from scenes import spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.window import Window
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator, near_light
@@ -116,6 +117,25 @@ def test_a_perspective_camera() -> None:
     assert error_deg(estimate) < 0.3
     orthographic = replace(lamps, camera_matrix=None)
     assert error_deg(estimate_normals(replace(capture, lamps=orthographic), make_estimator("iw12"))) > 1
+
+
+@pytest.mark.parametrize(("kind", "box", "limit_deg"), [("dome", None, 0.3), ("plane", (41, 3, 37, 50), 0.001)])
+def test_a_part_of_the_images(kind: str, box: tuple[int, int, int, int] | None, limit_deg: float) -> None:
+    """Every second row and column, and a box that lies off the middle of the images."""
+    capture = near(kind, 4.0, side=2 * SIDE)
+    window = Window(box, 2, capture.mask.shape)
+    left, top, *_ = box or (0, 0)
+    assert capture.lamps is not None and capture.ground_truth is not None
+    mask = window.of(capture.mask)
+    rows = (window.whole(mask) & capture.mask)[capture.mask]
+    part = replace(
+        capture,
+        observations=capture.observations[rows],
+        mask=mask,
+        ground_truth=window.of(capture.ground_truth),
+        lamps=capture.lamps.within(left, top, 2, None),
+    )
+    assert error_deg(estimate_normals(part, make_estimator("iw12"))) < limit_deg
 
 
 def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPatch) -> None:

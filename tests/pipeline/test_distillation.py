@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from scenes import cap_directions, spiral_lights
 from splinecli.capture import Capture
-from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.errors import UsageError
 from splinecli.methods import distilled
 from splinecli.methods.least_squares import LeastSquares
@@ -47,9 +46,9 @@ class Teacher:
         return LeastSquares().estimate(observations, light_directions), errors
 
 
-def capture(count: int, lamps: NearLamps | None = None) -> Capture:
+def capture(count: int) -> Capture:
     observations: NDArray[Any] = cap_directions(count, 40) @ LIGHTS.T
-    return Capture("matte", observations, LIGHTS, tuple(range(6)), np.ones((1, count), bool), lamps=lamps)
+    return Capture("matte", observations, LIGHTS, tuple(range(6)), np.ones((1, count), bool))
 
 
 def test_small_captures_and_exact_ones_are_not_distilled() -> None:
@@ -92,10 +91,8 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.Monke
 
 
 def test_refused() -> None:
-    lamps = NearLamps.of(400 * LIGHTS, 1.0, (1, 3000), equal=True)
     for few, estimator, problem in (
         (capture(3000), LeastSquares(), "method ls gives no confidence and cannot be distilled"),
-        (capture(3000, lamps), Teacher(), "matte: captures under near lamps cannot be distilled"),
         (capture(200), Teacher(), "matte: 200 pixels are too few to distil"),
     ):
         with pytest.raises(UsageError, match=problem):

@@ -69,7 +69,7 @@ def open_capture(
     Raises:
         InputError: the folder contains no capture (see find_capture_files), a light file is wrong, or the window is not
             inside the images.
-        UsageError: the white level is not a number above 0, or the lamps are near and not the whole images are read.
+        UsageError: the white level is not a number above 0, or the object's width is given and a part is read.
     """
     check_white_level(white_level)
     equal = intensities is not None and str(intensities) == EQUAL
@@ -87,8 +87,8 @@ def open_capture(
                 hint="Leave it out, or use --light-distance with a file of directions",
             )
         overrides, form = replace(overrides, lights=near.positions), "positions"
-    if near is not None and near.used and not window.is_whole:
-        raise UsageError("--crop and --scale are for distant lights; under near lamps, the whole image has to be read")
+    if near is not None and near.object_width is not None and window.box is not None:
+        raise UsageError("--object-width needs the whole object in the image", hint="Give --pixel-size beside --crop")
     files = find_capture_files(folder, overrides)
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)

@@ -192,7 +192,7 @@ class CaptureSource:
         if self.lamps is None:
             return None
         equal = not self.intensities_measured
-        return self.lamps.over(self.light_directions, mask, equal=equal, frame=self.light_frame, step=step)
+        return self.lamps.over(self.light_directions, mask, self.window, equal=equal, frame=self.light_frame, step=step)
 
     def near_lamps(self, mask: NDArray[np.bool_]) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about them.

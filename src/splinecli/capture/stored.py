@@ -116,5 +116,5 @@ class StoredCapture:
         if lamps is None:
             return self.capture.light_directions
         places = np.flatnonzero(self.capture.mask)[rows]
-        directions, strengths = lamps.light_at(lamps.plane_points(*np.divmod(places, lamps.shape[1])))
+        directions, strengths = lamps.light_at(lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1])))
         return np.asarray(directions * strengths[..., None], np.float64)

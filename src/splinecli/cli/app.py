@@ -18,6 +18,7 @@ from splinecli.cli.info import info
 from splinecli.cli.integrate import integrate
 from splinecli.cli.prepare import prepare
 from splinecli.cli.train import train
+from splinecli.cli.watch import watch
 
 app = typer.Typer(
     name="splinecli",
@@ -46,7 +47,7 @@ def _splinecli(
     pass
 
 
-for _command in (infer, info, calibrate, integrate, evaluate, prepare, train, import_weights):
+for _command in (infer, watch, info, calibrate, integrate, evaluate, prepare, train, import_weights):
     # By default, Typer refuses a path without permission. One such capture would then end a batch.
     for _parameter in inspect.signature(_command).parameters.values():
         if isinstance(_parameter.default, ParameterInfo):

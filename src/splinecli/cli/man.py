@@ -72,6 +72,7 @@ EXAMPLES = {
     "splinecli infer captures/* -o results --overwrite": "Process a folder of captures.",
     "splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html": "Also write albedo, preview, mesh and"
     " page.",
+    "splinecli watch parts/ -- --lights l.txt --jsonl": "Compute each part that arrives.",
     "splinecli info obj/": "Show what infer would read.",
     "splinecli info obj/ --transfer srgb --plot lights.png": "Check sRGB images, and plot the light directions.",
     "splinecli calibrate chrome/ -o lights": "Measure light directions with a mirror ball.",

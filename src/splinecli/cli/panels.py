@@ -12,6 +12,7 @@ PANELS = {
         "Speed": "distil device precision",
         "Processes and machines": "workers cluster shard",
     },
+    "watch": {"Captures": "marker settle"},
     "info": {
         "Input": "mask crop scale ground-truth transfer ambient flat-field white-level",
         "Lights": "lights first-light light-frame lights-format intensities light-positions light-distance pixel-size"

@@ -73,8 +73,7 @@ class StatedLights:
         """Return what the arguments of splinecli.estimate_normals say."""
         lamps = capture.lamps
         if lamps is not None:
-            shape = (sample.mask.shape[0], sample.mask.shape[1])
-            lamps = replace(lamps, pixel_size=lamps.pixel_size * sample.step, shape=shape)
+            lamps = lamps.within(0, 0, sample.step, lamps.camera_matrix)
         return cls(
             names=[f"images[{index}]" for index in range(capture.n_lights)],
             directions=capture.light_directions,

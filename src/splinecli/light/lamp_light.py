@@ -24,7 +24,7 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
             multiples of that of the mean plane.
     """
     if lamps.camera_matrix is None:
-        middle_row, middle_column = ((size - 1) / 2 for size in lamps.shape)
+        middle_row, middle_column = lamps.middle
         points = np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
     else:
         rays = np.stack((columns, rows, np.ones(len(rows))), axis=1) @ ray_basis(lamps.camera_matrix)
@@ -98,7 +98,7 @@ def _plane_distance(lamps: NearLamps) -> float:
 def _camera_position(lamps: NearLamps) -> Floats:
     """Return the camera's place (3,): the image's middle shows the origin, at the distance of the mean plane."""
     assert lamps.camera_matrix is not None
-    row, column = ((size - 1) / 2 for size in lamps.shape)
+    row, column = lamps.middle
     middle = np.array((column, row, 1.0)) @ ray_basis(lamps.camera_matrix)
     return np.asarray(-middle * _plane_distance(lamps))
 

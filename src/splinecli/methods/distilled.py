@@ -1,6 +1,7 @@
 """An estimator made for one capture: a perceptron that learned a network's normals on a sample of the pixels.
 
-One capture has one set of lights and a few materials, so most of its pixels say the same. The network estimates a
+One capture has one set of lights and a few materials, so most of its pixels say the same. Under near lamps, the lights
+change smoothly over the image. The network estimates a
 sample of them, the perceptron learns it and estimates the rest at some 80 times the speed. What the perceptron does
 not follow is mostly the network's noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network,
 arXiv 1503.02531).
@@ -17,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
+from splinecli.light.lamp_light import LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods.estimator import (
     UNKNOWN_ERROR,
@@ -106,7 +108,7 @@ class DistilledEstimator:
     def estimate(
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
-        """Estimate unit normals (P, 3) from observations (P, F) under the capture's lights (F, 3); see Estimator."""
+        """Estimate unit normals (P, 3) from observations (P, F) under the capture's lights; see Estimator."""
         return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     def estimate_with_error(
@@ -118,20 +120,24 @@ class DistilledEstimator:
         unlike = np.empty(len(observations), np.bool_)
         for start in range(0, len(observations), _TILE):
             rows = slice(start, start + _TILE)
-            normals[rows], errors[rows], unlike[rows] = self._apply(observations[rows])
+            lights = light_directions if light_directions.ndim == 2 else light_directions[rows]
+            normals[rows], errors[rows], unlike[rows] = self._apply(observations[rows], lights)
             if progress is not None:
                 progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
+            lights = light_directions if light_directions.ndim == 2 else light_directions[unlike]
             normals[unlike], errors[unlike] = self._teacher.estimate_with_error(
-                observations[unlike], light_directions, progress=progress
+                observations[unlike], lights, progress=progress
             )
         return normals, errors
 
     @torch.inference_mode()
-    def _apply(self, observations: Observations) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    def _apply(
+        self, observations: Observations, light_directions: Directions
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """Return the perceptron's normals and errors of some pixels, and which pixels are rare or unlike the sample."""
-        inputs = self._perceptron.inputs(torch.as_tensor(observations).to(self.device))
+        inputs = _inputs(self._perceptron, observations, light_directions, self.device)
         found = self._perceptron(inputs, bfloat16=self.precision == "bfloat16")
         normals, errors = (values.cpu().numpy() for values in found)
         dark = ~(observations > 0).any(axis=1)
@@ -142,8 +148,8 @@ class DistilledEstimator:
 
 def distil(
     teacher: ConfidentEstimator,
-    observations: Observations,
-    light_directions: NDArray[np.floating],
+    light_of: LightOf,
+    n_pixels: int,
     size: StudentSize,
     *,
     seed: int = 0,
@@ -154,26 +160,29 @@ def distil(
     The result is the same for the same seed.
 
     Args:
-        observations: (P, F), of all pixels of the capture.
-        light_directions: (F, 3), of distant lights.
+        light_of: gives the observations and the light directions of some pixels.
+        n_pixels: of the capture.
         progress: called with numbers of pixels; in all, twice the pixels of the sample.
 
     Raises:
         UsageError: too few pixels are lit for a sample of FEWEST_PIXELS.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    chosen = np.sort(rng.choice(len(observations), min(_CANDIDATES, len(observations)), replace=False))
-    candidates = observations[chosen]
-    candidates = candidates[(candidates > 0).any(axis=1)]
+    light = light_of(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
+    lit = (light.observations > 0).any(axis=1)
+    candidates = light.observations[lit]
+    directions = light.directions if light.directions.ndim == 2 else light.directions[lit]
     if len(candidates) // 2 < FEWEST_PIXELS:  # the sample is at most half of them
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
-    lights = torch.as_tensor(light_directions, dtype=torch.float32)
+    lights = torch.as_tensor(directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False), torch.enable_grad():
-        inputs = perceptron.inputs(torch.as_tensor(candidates).to(teacher.device))
-        rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / len(observations))
+        inputs = _inputs(perceptron, candidates, directions, teacher.device)
+        rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
-        taught = teacher.estimate_with_error(candidates[sample.rows.numpy()], light_directions, progress=progress)
+        rows = sample.rows.numpy()
+        seen = directions if directions.ndim == 2 else directions[rows]
+        taught = teacher.estimate_with_error(candidates[rows], seen, progress=progress)
         inputs = inputs[sample.rows.to(inputs.device)]
         normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
         held = round(_HELD_OUT * len(inputs))  # the first pixels are an even sample of all
@@ -205,15 +214,23 @@ def distil(
         p95_deg=float(np.quantile(angles, 0.95)),
         expected_deg=float(median_error_deg(errors[:held]).mean()),
     )
-    return DistilledEstimator(teacher, perceptron, sample, found, len(observations))
+    return DistilledEstimator(teacher, perceptron, sample, found, n_pixels)
 
 
-def seconds_of_learning(light_directions: NDArray[np.floating], size: StudentSize, device: str) -> float:
+def _inputs(
+    perceptron: Perceptron, observations: Observations, light_directions: Directions, device: str
+) -> torch.Tensor:
+    lights = torch.as_tensor(light_directions, dtype=torch.float32, device=device)
+    return perceptron.inputs(torch.as_tensor(observations).to(device), lights)
+
+
+def seconds_of_learning(light_directions: Directions, size: StudentSize, device: str) -> float:
     """Measure a few steps of learning, and return the time of all. The network's time on the sample comes on top."""
     generator = torch.Generator().manual_seed(0)
     lights = torch.as_tensor(light_directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(device)
-    inputs = perceptron.inputs(torch.rand(BATCH, len(lights), generator=generator).to(device))
+    n_inputs = len(perceptron.mean)
+    inputs = torch.rand(BATCH, n_inputs, generator=generator).to(device)
     for steps in (2, 10):  # the first steps take longer
         started = time.perf_counter()
         perceptron.learn(inputs, inputs[:, -3:], inputs[:, :2], steps=steps, generator=generator)

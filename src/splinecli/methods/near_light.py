@@ -28,9 +28,6 @@ METHOD = "iw12"
 PIXELS_ON_THE_WAY = 40_000
 """Larger captures are fitted on the way at about this size: fine detail hardly moves the surface."""
 
-SOLVES = 10
-"""Solves of the integration on the way. The first is least squares; the others let the surface tear at edges."""
-
 
 def find_surface(capture: Capture) -> Capture:
     """Return the capture with the points of its surface. One that has them, or distant lights, stays as it is."""

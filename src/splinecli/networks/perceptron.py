@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from splinecli.fits.weighted_least_squares import weighted_least_squares
 from splinecli.maths.observation_map import map_scale
 
 BATCH = 256
@@ -20,7 +21,7 @@ class Perceptron(nn.Module):
     """Corrects the least-squares normal of a pixel from its observations, in the capture's order of lights.
 
     Args:
-        light_directions: (F, 3), unit.
+        light_directions: (F, 3), unit; or (P, F, 3) of some pixels, where near lamps give each its own.
         width: units in each hidden layer.
         generator: draws the weights.
     """
@@ -31,8 +32,10 @@ class Perceptron(nn.Module):
 
     def __init__(self, light_directions: Tensor, width: int, generator: torch.Generator) -> None:
         super().__init__()
-        n_inputs = len(light_directions) + 3
-        self.register_buffer("solve", torch.linalg.pinv(light_directions.double()).T.float())
+        near = light_directions.ndim == 3
+        n_inputs = light_directions.shape[-2] + (6 if near else 3)
+        shared = light_directions.new_zeros(0, 3) if near else light_directions
+        self.register_buffer("solve", torch.linalg.pinv(shared.double()).T.float())
         self.register_buffer("mean", torch.zeros(n_inputs))
         self.register_buffer("spread", torch.ones(n_inputs))
         with torch.random.fork_rng(devices=[]):  # the layers draw weights that are replaced below
@@ -44,16 +47,22 @@ class Perceptron(nn.Module):
         nn.init.zeros_(self.last.weight)  # learning begins at least squares
         self.hidden = nn.Sequential(*(part for layer in hidden for part in (layer, nn.ReLU())))
 
-    def inputs(self, observations: Tensor) -> Tensor:
-        """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F + 3)."""
+    def inputs(self, observations: Tensor, light_directions: Tensor) -> Tensor:
+        """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F + 3).
+
+        Between them stands the mean direction (P, 3) of lights (P, F, 3), because it says where a pixel is.
+        """
         scaled = observations / map_scale(observations)
-        return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
+        if light_directions.ndim == 2:
+            return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
+        fitted, _ = weighted_least_squares(scaled, light_directions, torch.ones_like(scaled))
+        return torch.cat((scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1)
 
     def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
         """Return unit normals (P, 3) and the distributions of their errors (P, 2); see networks/error_head.py.
 
         Args:
-            inputs: (P, F + 3), see `inputs`.
+            inputs: (P, C), see `inputs`.
             bfloat16: whether the hidden layers compute in it. The rest is in float32.
         """
         scaled = (inputs - self.mean) / self.spread

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from splinecli.capture import Capture
 from splinecli.capture.capture_warnings import CaptureWarning, not_distilled
 from splinecli.errors import UsageError
+from splinecli.inference import light_on
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import ConfidentEstimator, tells_confidence
 from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize, student_sizes
@@ -27,20 +29,17 @@ def distil_for(
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
-    Near lamps give each pixel its own light directions, so their captures are never distilled.
-
     Args:
+        capture: under near lamps, with the points of its surface.
         wanted: whether to distil; None for the faster way.
 
     Raises:
-        UsageError: it is wanted, but the lamps are near, the method gives no confidence, or the capture is too small.
+        UsageError: it is wanted, but the method gives no confidence, or the capture is too small.
     """
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not tells_confidence(estimator):
         return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
-    if capture.lamps is not None:
-        return _refuse(wanted, f"{capture.name}: captures under near lamps cannot be distilled")
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
@@ -51,7 +50,7 @@ def distil_for(
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
-                distilled = distil(estimator, capture.observations, capture.light_directions, size, progress=advance)
+                distilled = distil(estimator, partial(light_on, capture), capture.n_pixels, size, progress=advance)
         except UsageError as error:  # most pixels are a dark background
             return _refuse(wanted, f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:
@@ -69,10 +68,10 @@ def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: StudentSiz
     """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
     from splinecli.methods.distilled import seconds_of_learning
 
-    rows = np.linspace(0, capture.n_pixels - 1, 1024).astype(np.intp)
+    light = light_on(capture, np.linspace(0, capture.n_pixels - 1, 1024).astype(np.intp))
     for _ in range(2):  # the first time, a GPU also loads its kernels
         started = time.perf_counter()
-        estimator.estimate(capture.observations[rows], capture.light_directions)
-        per_pixel = (time.perf_counter() - started) / len(rows)
-    learning = size.sample * per_pixel + seconds_of_learning(capture.light_directions, size, estimator.device)
+        estimator.estimate(light.observations, light.directions)
+        per_pixel = (time.perf_counter() - started) / len(light.observations)
+    learning = size.sample * per_pixel + seconds_of_learning(light.directions, size, estimator.device)
     return GAIN * learning < capture.n_pixels * per_pixel

@@ -12,6 +12,7 @@ from splinecli.capture.capture_warnings import ROUGH_LIGHTS, UNTRAINED_LIGHTS, C
 from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import Estimator
+from splinecli.methods.near_light import find_surface
 from splinecli.pipeline.distillation import distil_for
 from splinecli.pipeline.observer import SILENT, Advance, Observer
 from splinecli.results.clock import Clock
@@ -56,6 +57,8 @@ def estimate_capture(
         capture = refine_lights(capture)
         warnings = [warning for warning in warnings if warning.code != ROUGH_LIGHTS]
         warnings += capture.warnings[before:]
+    clock.begin("estimate")
+    capture = find_surface(capture)
     clock.begin("distil")
     distilled, found = distil_for(capture, estimator, distil, observer)
     with ExitStack() as stages:

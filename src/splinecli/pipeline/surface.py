@@ -101,15 +101,13 @@ def view_of_report(
     """
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])
-    if camera_matrix is None and lamps is not None and lamps["camera"] == "perspective":
-        camera_matrix = np.array(lamps["camera_matrix"], np.float64).reshape(3, 3)
+    matrix = None if camera_matrix is None else window.camera(camera_matrix)
+    if matrix is None and lamps is not None and lamps["camera"] == "perspective":
+        matrix = np.array(lamps["camera_matrix"], np.float64).reshape(3, 3)  # of what the window reads
     if pixel_size_mm is None and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
     check_pixel_size(pixel_size_mm)
-    return (
-        None if camera_matrix is None else window.camera(camera_matrix),
-        None if pixel_size_mm is None else pixel_size_mm * window.step,
-    )
+    return matrix, None if pixel_size_mm is None else pixel_size_mm * window.step
 
 
 def check_pixel_size(pixel_size: float | None) -> None:

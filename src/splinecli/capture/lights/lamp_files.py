@@ -16,6 +16,7 @@ from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.stamp import stamp_content
+from splinecli.capture.window import Window
 from splinecli.errors import InputError, UsageError
 
 PIXEL_SIZE = ("pixel_size.txt",)
@@ -113,31 +114,35 @@ class LampFiles:
         self,
         light_directions: NDArray[np.float64],
         mask: NDArray[np.bool_],
+        window: Window,
         *,
         equal: bool,
         frame: LightFrame = USUAL_FRAME,
         step: int = 1,
     ) -> NearLamps | None:
-        """Return the lamps in these directions (F, 3) over images with this mask (H, W); None without a scale.
+        """Return the lamps in these directions (F, 3) over what a window reads, with a mask; None without a scale.
 
         Args:
             equal: whether all lamps count as equally strong; see NearLamps.of.
             frame: that of the file of positions.
-            step: the mask has every step-th row and column of the images.
+            step: the mask has every step-th row and column of what the window reads.
         """
         if self.positions is not None:
             positions = read_light_positions(self.positions, len(light_directions), frame)
         else:
             assert self.distance is not None
             positions = light_directions * self.distance
-        pixel_size = None if self.pixel_size is None else step * self.pixel_size
+        pixel_size, camera_matrix = self.pixel_size, self.camera_matrix
         if self.object_width is not None:
             columns = np.flatnonzero(mask.any(axis=0))
-            pixel_size = self.object_width / float(columns[-1] - columns[0] + 1)
+            pixel_size = self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
         if pixel_size is None:
             return None
-        shape = mask.shape[0], mask.shape[1]
-        return NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=self.camera_matrix)
+        shape = tuple(step * size for size in mask.shape) if window.shape is None else window.shape
+        lamps = NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix)
+        left, top, *_ = window.box or (0, 0)
+        step *= window.step
+        return lamps.within(left, top, step, None if camera_matrix is None else window.camera(camera_matrix))
 
 
 def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:

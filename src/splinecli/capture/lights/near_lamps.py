@@ -26,7 +26,7 @@ class NearLamps:
     Args:
         positions: (F, 3), in any unit, in front of the object's mean plane (z > 0).
         pixel_size: the width of a pixel on the object's mean plane, in the unit of the positions.
-        shape: (H, W) of the images.
+        middle: row and column of the origin, in pixels of what was read.
         reference_distances: (F,), the distances from each lamp at which the observations' light intensities hold. See
             `of`.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
@@ -38,7 +38,7 @@ class NearLamps:
 
     positions: Floats
     pixel_size: float
-    shape: tuple[int, int]
+    middle: tuple[float, float]
     reference_distances: Floats
     camera_matrix: Floats | None = None
     points: NDArray[np.float32] | None = None
@@ -56,12 +56,12 @@ class NearLamps:
         cls,
         positions: Floats,
         pixel_size: float,
-        shape: tuple[int, int],
+        shape: tuple[int, ...],
         *,
         equal: bool,
         camera_matrix: Floats | None = None,
     ) -> NearLamps:
-        """Return lamps at positions (F, 3).
+        """Return lamps at positions (F, 3) over whole images of this shape (H, W).
 
         Args:
             equal: whether the light intensities are unknown, so that all lamps count as equally strong. Otherwise each
@@ -69,7 +69,17 @@ class NearLamps:
         """
         distances = np.linalg.norm(positions, axis=1)
         reference = np.full_like(distances, distances.mean()) if equal else distances
-        return cls(positions, pixel_size, shape, reference, camera_matrix)
+        return cls(positions, pixel_size, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), reference, camera_matrix)
+
+    def within(self, left: float, top: float, step: int, camera_matrix: Floats | None) -> NearLamps:
+        """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
+        row, column = self.middle
+        return replace(
+            self,
+            pixel_size=step * self.pixel_size,
+            middle=((row - top) / step, (column - left) / step),
+            camera_matrix=camera_matrix,
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the lamps as JSON values: their distances from the origin, and the scale."""
@@ -101,7 +111,7 @@ class NearLamps:
 
     def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Floats:
         """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the image."""
-        middle_row, middle_column = ((size - 1) / 2 for size in self.shape)
+        middle_row, middle_column = self.middle
         across, up = columns - middle_column, middle_row - rows
         return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
 

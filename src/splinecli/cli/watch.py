@@ -1,0 +1,57 @@
+"""`splinecli watch`: run `infer` on each capture that arrives in a folder."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer import Argument, Option
+
+from splinecli.cli.console import Messages
+from splinecli.errors import UsageError
+
+_LOOK_SECONDS = 1.0  # time between two looks at the folder
+
+
+def watch(
+    context: typer.Context,
+    folder: Path = Argument(..., metavar="FOLDER", help="Folder in which captures arrive, a subfolder for each."),
+    options: list[str] = Argument(None, metavar="-- OPTIONS", help="Options of infer, after two dashes."),
+    marker: str | None = Option(
+        None, metavar="NAME", help="File that appears in a capture when it is complete. [default: see --settle]"
+    ),
+    settle: float = Option(
+        5.0, metavar="SECONDS", min=0, help="A capture is complete when nothing in it changed for so long."
+    ),
+) -> None:
+    """Run infer on each capture that arrives in FOLDER, once it is complete.
+
+    A capture is a subfolder of FOLDER. It is computed as by infer with OPTIONS, and captures that are already done are
+    skipped, so the command can be stopped and started again at any time. A capture that fails does not stop it. It is
+    tried again when its files change. Ctrl-C or SIGTERM ends the command, with exit code 130.
+    """
+    from splinecli.pipeline.arrivals import Arrivals
+
+    infer: Any = context.parent.command.get_command(context.parent, "infer")  # type: ignore[union-attr]
+    given = infer.make_context("infer", [str(folder), *(options or [])], parent=context.parent).params
+    output = given["output"].expanduser()
+    if given["as_json"]:
+        raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
+    if output.absolute() == folder.absolute():
+        raise UsageError("the results would lie among the captures", path=output, hint="Give another -o OUT")
+    arrivals = Arrivals(folder, marker=marker, seconds=settle, without=output)
+    messages = Messages(quiet=given["quiet"])
+    messages.say(f"{folder}: waiting for captures; Ctrl-C ends")
+    while True:
+        ready = arrivals.take()
+        if ready:
+            infer.main(
+                [*map(str, ready), *(options or [])],
+                prog_name="splinecli infer",
+                standalone_mode=False,
+                parent=context.parent,
+            )
+        else:
+            time.sleep(_LOOK_SECONDS)

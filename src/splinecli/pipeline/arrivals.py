@@ -1,0 +1,96 @@
+"""Captures that arrive in a folder one after the other, each when it is complete."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from splinecli.capture.layouts.image_lists import natural_key
+from splinecli.errors import InputError
+
+Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
+
+
+@dataclass
+class _Seen:
+    """What a folder held, since when it has not changed, and whether it was returned like this."""
+
+    stamp: Stamp
+    since: float
+    returned: bool = False
+
+
+class Arrivals:
+    """The captures in a folder that are complete and were not returned before.
+
+    A capture is complete when it contains a file of a certain name, or when nothing in it has changed for some time.
+    Folders whose names begin with a dot are left out. One that changes after it was returned is returned again.
+
+    Args:
+        folder: the captures are its subfolders.
+        marker: the name of the file; None to wait for `seconds` without a change.
+        seconds: see marker.
+        without: a folder that is no capture, such as that of the results.
+        clock: a clock that never goes back, in seconds.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        marker: str | None,
+        seconds: float,
+        without: Path,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.folder, self.marker, self.seconds = folder, marker, seconds
+        self._without = without.absolute()
+        self._clock = clock
+        self._seen: dict[Path, _Seen] = {}
+
+    def take(self) -> list[Path]:
+        """Return the captures that became complete since the last call, in natural order of their names.
+
+        Raises:
+            InputError: the folder cannot be read.
+        """
+        found = {path: _stamp(path) for path in self._subfolders()}
+        self._seen = {path: seen for path, seen in self._seen.items() if path in found}
+        ready = []
+        for path, stamp in found.items():
+            seen = self._seen.get(path)
+            if seen is None or seen.stamp != stamp:
+                seen = self._seen[path] = _Seen(stamp, self._clock())
+            if stamp[0] and not seen.returned and self._is_complete(path, seen):
+                seen.returned = True
+                ready.append(path)
+        return sorted(ready, key=natural_key)
+
+    def _is_complete(self, path: Path, seen: _Seen) -> bool:
+        if self.marker is not None:
+            return (path / self.marker).exists()
+        return self._clock() - seen.since >= self.seconds
+
+    def _subfolders(self) -> list[Path]:
+        try:
+            with os.scandir(self.folder) as entries:
+                folders = [Path(entry.path) for entry in entries if entry.is_dir() and entry.name[0] != "."]
+        except OSError as error:
+            raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
+        return [folder for folder in folders if folder.absolute() != self._without]
+
+
+def _stamp(folder: Path) -> Stamp:
+    """Return the stamp of all files below a folder. Those that vanish meanwhile do not count."""
+    count = size = newest = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            try:
+                status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
+            except OSError:
+                continue
+            count, size, newest = count + 1, size + status.st_size, max(newest, status.st_mtime_ns)
+    return count, size, newest

@@ -1,0 +1,60 @@
+"""`splinecli watch`: captures that arrive are computed once, and a signal ends it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from splinecli.cli import watch
+
+
+def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_capture, monkeypatch) -> None:
+    """Something happens at each look at the folder; then Ctrl-C."""
+    parts = Path("parts")
+    parts.mkdir()
+    (parts / "bad").mkdir()
+    (parts / "bad/done").touch()
+
+    def copy_first() -> None:
+        shutil.copytree(capture, parts / "first")
+
+    def look(steps: list) -> None:
+        def sleep(seconds: float) -> None:
+            if not steps:
+                raise KeyboardInterrupt
+            steps.pop(0)()
+
+        monkeypatch.setattr(watch.time, "sleep", sleep)
+
+    look([copy_first, lambda: (parts / "first/done").touch()])
+    command = ("watch", parts, "--marker", "done", "--", "--method", "ls", "--jsonl", "-o", "out")
+    result = run(*command)
+    assert result.code == 130
+    failed, done = map(json.loads, result.out.splitlines())
+    assert (failed["capture"], failed["exit_code"]) == ("bad", 3)
+    assert (done["capture"], done["method"]) == ("first", "ls")
+    before = Path("out/first/report.json").stat()
+    look([])
+    assert "out/first: already done, skipped" in run(*command).err
+    assert Path("out/first/report.json").stat() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (("--json",), "--json prints one list at the end, and watch has none"),
+        (("-o", "sphere"), "the results would lie among the captures"),
+        (("--methd", "ls"), "no option --methd"),
+    ],
+)
+def test_wrong_options_are_refused(run, capture, options: tuple[str, ...], problem: str) -> None:
+    result = run("watch", capture, "--settle", 0, "--", *options)
+    assert result.code == 2
+    assert problem in result.err
+
+
+def test_no_folder(run, capture) -> None:
+    result = run("watch", "nowhere")
+    assert result.code == 3
+    assert "nowhere: the folder cannot be read" in result.err

@@ -1,0 +1,67 @@
+"""Captures that arrive in a folder: when each is complete, and that it is returned once."""
+
+from pathlib import Path
+
+import pytest
+
+from splinecli.errors import InputError
+from splinecli.pipeline.arrivals import Arrivals
+
+
+class Clock:
+    seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+def put(path: Path, content: str = "image") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+
+
+def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path) -> None:
+    clock = Clock()
+    arrivals = Arrivals(tmp_path, marker=None, seconds=5, without=tmp_path / "out", clock=clock)
+    for name in ("part10/1.png", "part9/images/1.png", "out/part1/normals.png", ".hidden/1.png", "loose.png"):
+        put(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    assert arrivals.take() == []
+    clock.seconds = 4
+    put(tmp_path / "part9/images/2.png")
+    assert arrivals.take() == []
+    clock.seconds = 6
+    assert arrivals.take() == [tmp_path / "part10"]
+    clock.seconds = 9
+    assert arrivals.take() == [tmp_path / "part9"]
+    assert arrivals.take() == []
+    put(tmp_path / "part10/1.png", "a longer image")
+    assert arrivals.take() == []
+    clock.seconds = 20
+    assert arrivals.take() == [tmp_path / "part10"]
+
+
+def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
+    put(tmp_path / "part10/1.png")
+    put(tmp_path / "part9/1.png")
+    assert arrivals.take() == [tmp_path / "part9", tmp_path / "part10"]
+    (tmp_path / "part9/1.png").unlink()
+    (tmp_path / "part9").rmdir()
+    assert arrivals.take() == []
+    put(tmp_path / "part9/1.png")
+    assert arrivals.take() == [tmp_path / "part9"]
+
+
+def test_a_marker_needs_no_time(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path, marker="done", seconds=5, without=tmp_path / "out", clock=Clock())
+    put(tmp_path / "part/1.png")
+    assert arrivals.take() == []
+    put(tmp_path / "part/done", "")
+    assert arrivals.take() == [tmp_path / "part"]
+    assert arrivals.take() == []
+
+
+def test_a_folder_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the folder cannot be read"):
+        Arrivals(tmp_path / "nowhere", marker=None, seconds=0, without=tmp_path).take()
