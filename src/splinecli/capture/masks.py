@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import read_boundary, read_mask
+from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.errors import InputError
 
@@ -30,7 +31,7 @@ def _read_boundaries(files: CaptureFiles, shape: tuple[int, ...]) -> NDArray[np.
     """Return the union of the masks of CyclesPS."""
     union = np.zeros(shape, np.bool_)
     for path in files.boundaries:
-        union |= read_boundary(path, ExpectedSize(shape, files.images[0].name, "a mask"))
+        union |= decode_image(path, ExpectedSize(shape, files.images[0].name, "a mask")).max(axis=2) > 0
     if not union.any():
         names = " and ".join(path.name for path in files.boundaries)
         raise InputError(f"the mask is empty: every pixel of {names} is zero", path=files.boundaries[0].parent)

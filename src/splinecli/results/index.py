@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 
 from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.facts import stored_size
+from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
@@ -104,7 +104,7 @@ def _thumbnail(path: Path) -> str | None:
     import cv2
 
     try:
-        if image_bytes(*stored_size(path)) > _LARGEST_SHOWN:
+        if image_bytes(*read_facts(path).size) > _LARGEST_SHOWN:
             return None
         picture = decode_image(path)
     except InputError:

@@ -31,11 +31,8 @@ def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
     sampled = [decode_transfer(stored, curve) for curve in curves]
     if not curves or any(np.abs(one - sampled[0]).max() > _SAME for one in sampled):
         return None
-    named: tuple[TransferCurve, ...] = (1.0, SRGB)
-    for curve in named:
-        if np.abs(decode_transfer(stored, curve) - sampled[0]).max() < _SAME:
-            return name, curve
-    return name, curves[0]
+    named = (curve for curve in (1.0, SRGB) if np.abs(decode_transfer(stored, curve) - sampled[0]).max() < _SAME)
+    return name, next(named, curves[0])
 
 
 def _tags(profile: bytes) -> dict[bytes, bytes]:

@@ -15,13 +15,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error
 from splinecli.capture.formats.facts import PILLOW_KINDS, PNG, facts_in, open_image, open_with_pillow
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
 from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.formats.raw import decode_raw
 from splinecli.capture.formats.tiff import decode_tiff
 from splinecli.errors import InputError
-from splinecli.system.memory import is_out_of_memory
 
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -36,11 +36,8 @@ def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[An
 
     The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
     and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
-    EXIF orientation is ignored, because all images of a capture share one pixel grid.
-
-    Args:
-        path: the file.
-        expected: the size that the image must have, if it is known. It is compared with the file's header.
+    EXIF orientation is ignored, because all images of a capture share one pixel grid. The header is compared with the
+    expected size.
 
     Raises:
         InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy; or the
@@ -51,19 +48,17 @@ def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[An
 
 def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
-    try:
-        with open_image(path) as (file, kind):
-            size = facts_in(file, kind, path).size
-            check_stored_size(*size, path, expected)
-            _check_length(path, os.fstat(file.fileno()).st_size, image_bytes(*size))
-            file.seek(0)
-            pixels = _decode(file, kind, path)
-    except InputError:
-        raise
-    except Exception as error:  # decoders raise a dozen types for damaged files
-        if is_out_of_memory(error):
-            raise
-        raise damaged(path) from error
+    with damage_as_input_error(path, DAMAGED, COPY_AGAIN), open_image(path) as (file, kind):
+        size = facts_in(file, kind, path).size
+        check_stored_size(*size, path, expected)
+        length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + _LONGEST_METADATA
+        if length > most:  # it is read as a whole
+            raise InputError(
+                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
+                path=path,
+            )
+        file.seek(0)
+        pixels = _decode(file, kind, path)
     if expected is not None:
         expected.check(pixels.shape, path)
     if pixels.ndim == 2:
@@ -83,16 +78,6 @@ def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple
     return pixels, None
 
 
-def _check_length(path: Path, length: int, n_bytes: int) -> None:
-    """Raise InputError for a file that is far longer than its image of so many bytes, because it is read as a whole."""
-    most = n_bytes + _LONGEST_METADATA
-    if length > most:
-        raise InputError(
-            f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
-            path=path,
-        )
-
-
 def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
     """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
     if kind == "RAW":
@@ -109,16 +94,11 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
     data = file.read()
     if kind != "TIFF":
         (_check_png if kind == "PNG" else _check_jpeg)(data, path)
-    return _decode_with_opencv(data, path)
+    return _decode_with_opencv(data)
 
 
-def damaged(path: Path) -> InputError:
-    """Return the error for a file that its decoder refuses."""
-    return InputError("the image is damaged and cannot be read", path=path, hint="Copy or export it again")
-
-
-def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
-    """Return pixels (H, W) or (H, W, C), in RGB or RGBA order."""
+def _decode_with_opencv(data: bytes) -> NDArray[Any]:
+    """Return pixels (H, W) or (H, W, C), in RGB or RGBA order. Raises ValueError or cv2.error for a damaged file."""
     import cv2
 
     with native_stderr() as messages:
@@ -128,19 +108,12 @@ def _decode_with_opencv(data: bytes, path: Path) -> NDArray[Any]:
         except cv2.error as error:
             if error.code == cv2.Error.StsNoMem:
                 raise MemoryError from None
-            pixels = None
+            raise
     if pixels is None or _DAMAGE.search("".join(messages)):
-        raise damaged(path)
-    return _rgb(pixels)
-
-
-def _rgb(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Return OpenCV's BGR or BGRA pixels in RGB or RGBA order; gray ones as they are."""
+        raise ValueError
     if pixels.ndim == 2 or pixels.shape[2] not in (3, 4):
         return pixels
     if pixels.dtype in (np.uint8, np.uint16, np.float32):
-        import cv2
-
         code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
         return np.asarray(cv2.cvtColor(pixels, code, dst=pixels))  # in place, and far faster than an index
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
@@ -161,11 +134,11 @@ def _check_png(data: bytes, path: Path) -> None:
         if end > len(data):
             break
         if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint="Copy or export it again")
+            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint=COPY_AGAIN)
         if data[body : body + 4] == b"IEND":
             return
         position = end
-    raise InputError("the PNG is truncated", path=path, hint="Copy or export it again")
+    raise InputError("the PNG is truncated", path=path, hint=COPY_AGAIN)
 
 
 def _check_jpeg(data: bytes, path: Path) -> None:
@@ -184,4 +157,4 @@ def _check_jpeg(data: bytes, path: Path) -> None:
             if following is None:
                 break
             position = following.start()
-    raise InputError("the JPEG is truncated", path=path, hint="Copy or export it again")
+    raise InputError("the JPEG is truncated", path=path, hint=COPY_AGAIN)

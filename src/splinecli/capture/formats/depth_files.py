@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.damage import damage_as_input_error
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
 from splinecli.capture.formats.native_stderr import native_stderr
-from splinecli.capture.formats.normal_arrays import read_guarded
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
 from splinecli.system.extras import import_extra
@@ -29,8 +29,13 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
         UsageError: the file is an EXR file, and OpenEXR is not installed.
     """
     check_file(path, "a depth map")
-    read = {".npy": _map_npy, ".exr": _read_exr}.get(path.suffix.lower(), decode_image)
-    stored = read_guarded(path, "the depth map is damaged and cannot be read", read, expected)
+    suffix = path.suffix.lower()
+    with damage_as_input_error(path, "the depth map is damaged and cannot be read"):
+        if suffix == ".npy":
+            stored: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+            check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
+        else:
+            stored = (_read_exr if suffix == ".exr" else decode_image)(path, expected)
     if stored.ndim == 3 and stored.shape[2] in (1, 3, 4):
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
@@ -45,13 +50,7 @@ def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
     return depth
 
 
-def _map_npy(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
-    stored: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    check_stored_size(stored.shape, stored.dtype.itemsize, path, expected)
-    return stored
-
-
-def _read_exr(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
+def _read_exr(path: Path, expected: ExpectedSize) -> NDArray[Any]:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
     with native_stderr():

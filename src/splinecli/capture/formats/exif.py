@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from splinecli.capture.formats.facts import ORIENTATION, ImageFacts
 from splinecli.capture.formats.raw import read_shot
@@ -14,14 +13,11 @@ from splinecli.errors import InputError
 UPRIGHT = 1
 """The orientation of images that are shown as they are stored."""
 
-SAME = 0.1
-"""Exposures within this share of each other count as one: shutters and ISO numbers are rounded."""
-
+_SAME = 0.1  # share within which two exposures count as one: shutters and ISO numbers are rounded
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 
 
-@dataclass(frozen=True)
-class Exposure:
+class Exposure(NamedTuple):
     """Exposure time in seconds, f-number and ISO sensitivity."""
 
     seconds: float
@@ -41,17 +37,15 @@ class Exposure:
 def find_exposure(facts: ImageFacts) -> Exposure | None:
     """Return the exposure of an image; None where a part of it is missing or the file is damaged."""
     try:
-        numbers: tuple[Any, ...]
         if facts.exif is None and facts.kind == "RAW":
-            numbers = read_shot(facts.path)
+            numbers: tuple[Any, ...] = read_shot(facts.path)
         else:
             numbers = tuple((facts.exif or {})[tag] for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
         # Some cameras give two ISO numbers.
         exposure = Exposure(*(float(n[0] if isinstance(n, tuple) else n) for n in numbers))
     except Exception:  # damaged tags cause a dozen types of errors
         return None
-    usable = all(0 < value < math.inf for value in (exposure.seconds, exposure.f_number, exposure.iso))
-    return exposure if usable else None
+    return exposure if all(0 < value < math.inf for value in exposure) else None
 
 
 def check_exposures(images: Sequence[ImageFacts]) -> None:
@@ -59,7 +53,7 @@ def check_exposures(images: Sequence[ImageFacts]) -> None:
     found = [(facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None]
     for facts, exposure in found[1:]:
         first, expected = found[0]
-        if abs(exposure.relative / expected.relative - 1) > SAME:
+        if abs(exposure.relative / expected.relative - 1) > _SAME:
             raise InputError(
                 f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
                 path=facts.path,

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from splinecli.capture.formats.colour_profile import LARGEST_PROFILE, profile_curve
-from splinecli.capture.formats.raw import is_raw, raw_size
+from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error
+from splinecli.capture.formats.raw import RAW_SUFFIXES, raw_size
 from splinecli.capture.formats.tiff import first_page
 from splinecli.capture.paths import check_file
 from splinecli.errors import InputError
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP"}
 """The first bytes of the files. Those of a PNG are the longest."""
 
 PILLOW_KINDS = ("BMP", "TGA")
@@ -43,9 +45,6 @@ _MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF an
 
 _MOST_PARTS = 10_000
 """Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
-
-_CODE_POINTS: dict[int, TransferCurve] = {1: BT709, 6: BT709, 14: BT709, 15: BT709, 8: 1.0, 13: SRGB}
-"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273)."""
 
 _RAW_WHITE = 65_535
 """The white level of developed RAW files; see decode_raw."""
@@ -66,12 +65,16 @@ class StatedCurve:
     unread: bool = False
 
 
+_FILM, _ENCODED = StatedCurve(BT709, "PNG of a film"), StatedCurve(SRGB, "PNG that says so")
+_CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: _ENCODED}
+"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which goes before all else."""
+
+
 @dataclass(frozen=True)
 class ImageFacts:
     """What the header of an image file states.
 
     Args:
-        path: the file.
         kind: "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them.
         stated_size: None for a RAW file, and for a damaged one.
         curve: that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
@@ -97,7 +100,7 @@ class ImageFacts:
         if self.kind == "RAW":
             return raw_size(self.path)
         if self.stated_size is None:
-            raise InputError(f"the {self.kind} is truncated", path=self.path, hint="Copy or export it again")
+            raise InputError(f"the {self.kind} is truncated", path=self.path, hint=COPY_AGAIN)
         return self.stated_size
 
 
@@ -110,39 +113,24 @@ def read_facts(path: Path) -> ImageFacts:
         return ImageFacts(path, damage=error)
 
 
-def stored_size(path: Path) -> StoredSize:
-    """Return the shape (H, W, C) that an image file states, and the bytes of each number. Raises InputError."""
-    return read_facts(path).size
-
-
 @contextmanager
 def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
     """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises InputError."""
     check_file(path, "an image")
     try:
         with path.open("rb") as file:
-            start = file.read(len(PNG))
+            start, suffix = file.read(len(PNG)), path.suffix.lower()
             file.seek(0)
-            if start and is_raw(path):
-                kind = "RAW"
-            elif start.startswith((PNG, JPEG)):
-                kind = "PNG" if start == PNG else "JPEG"
-            elif start.startswith(TIFF):
-                kind = "TIFF"
-            elif start.startswith(b"BM"):
-                kind = "BMP"
-            elif start and path.suffix.lower() == ".tga":  # its files begin with nothing that is only theirs
-                kind = "TGA"
-            else:
-                raise InputError("found neither PNG, TIFF, JPEG nor BMP" if start else "the file is empty", path=path)
+            if not start:
+                raise InputError("the file is empty", path=path)
+            otherwise = "TGA" if suffix == ".tga" else None  # its files begin with nothing that is only theirs
+            found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
+            kind = "RAW" if suffix in RAW_SUFFIXES else found
+            if kind is None:
+                raise InputError("found neither PNG, TIFF, JPEG nor BMP", path=path)
             yield file, kind
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-
-
-def is_image(content: bytes) -> bool:
-    """Return whether the content of a file begins as PNG, JPEG or TIFF."""
-    return content.startswith((PNG, JPEG, *TIFF))
 
 
 def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageFacts:
@@ -163,14 +151,9 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
     """Yield a picture of PILLOW_KINDS, whose pixels are not read yet. Raises InputError."""
     from PIL import Image
 
-    with warnings.catch_warnings():  # of large pictures, which are checked later
-        warnings.simplefilter("ignore")
-        try:
-            yield Image.open(file, formats=[kind])
-        except (InputError, MemoryError):
-            raise
-        except Exception:  # damaged files cause a dozen types of errors
-            raise InputError("the image is damaged and cannot be read", path=path) from None
+    with damage_as_input_error(path, DAMAGED), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of large pictures, which are checked later
+        yield Image.open(file, formats=[kind])
 
 
 def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
@@ -182,8 +165,6 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
     if next(iter(chunks), None) == b"IHDR" and len(header) >= 10:
         width, height = (int.from_bytes(header[place : place + 4], "big") for place in (0, 4))
         size = (height, width, {0: 1, 4: 2, 6: 4}.get(header[9], 3)), 2 if header[8] == 16 else 1
-    # 100000 times the exponent of the encoding: 1 means linear.
-    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (0, 100_000)
     profile = None
     if b"iCCP" in chunks:
         try:
@@ -191,23 +172,20 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageFacts:
             profile = zlib.decompressobj().decompress(compressed[1:], LARGEST_PROFILE)
         except zlib.error:
             profile = b""
+    # 100000 times the exponent of the encoding: 1 means linear.
+    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (0, 100_000)
+    curve = _curve(_ENCODED if encoded else StatedCurve(), profile)
+    if b"cICP" in chunks:
+        curve = _CODE_POINTS.get(int.from_bytes(chunks[b"cICP"][1:2], "big"), StatedCurve(unread=True))
     # One number for each channel. Alpha, if there is one, comes last.
     stated = chunks.get(b"sBIT", b"")
     bits = set(stated[: 3 if len(stated) > 2 else 1])
-    return ImageFacts(
-        path,
-        "PNG",
-        size,
-        _code_points(chunks[b"cICP"][1:2])
-        if b"cICP" in chunks
-        else _curve(StatedCurve(SRGB, "PNG that says so") if encoded else StatedCurve(), profile),
-        _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None,
-        _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))),
-    )
+    level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
+    return ImageFacts(path, "PNG", size, curve, level, _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))))
 
 
 def _png_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """Yield name and content of the chunks before a PNG's pixels, from a file positioned after the signature."""
+    """Yield name and content of the chunks before a PNG's pixels, with the file behind the signature."""
     for _ in range(_MOST_PARTS):
         if len(header := file.read(8)) < 8 or header[4:] in (b"IDAT", b"IEND"):
             return
@@ -232,13 +210,8 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageFacts:
     if parts:  # b"" counts as one that cannot be read
         short = sum(map(len, parts.values())) <= LARGEST_PROFILE
         profile = b"".join(parts[number] for number in sorted(parts)) if short else b""
-    return ImageFacts(
-        path,
-        "JPEG",
-        size,
-        _curve(StatedCurve(SRGB, "JPEG"), profile),
-        exif=_exif_tags(lambda tags: tags.load(exif)),
-    )
+    curve = _curve(StatedCurve(SRGB, "JPEG"), profile)
+    return ImageFacts(path, "JPEG", size, curve, exif=_exif_tags(lambda tags: tags.load(exif)))
 
 
 def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
@@ -307,15 +280,6 @@ def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
         return StatedCurve(stated.curve, stated.by, unread=True)
     name, curve = found
     return StatedCurve(curve, f'colour profile "{name}"')
-
-
-def _code_points(transfer: bytes) -> StatedCurve:
-    """Return the curve of a number of the transfer characteristics, which goes before all else in a PNG."""
-    number = int.from_bytes(transfer, "big")
-    if number not in _CODE_POINTS:
-        return StatedCurve(unread=True)
-    curve = _CODE_POINTS[number]
-    return StatedCurve(curve, "" if curve == 1 else "PNG of a film" if curve == BT709 else "PNG that says so")
 
 
 def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:

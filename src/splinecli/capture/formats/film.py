@@ -8,15 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.damage import damage_as_input_error
 from splinecli.capture.formats.image_size import check_stored_size
 from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.paths import check_file, is_folder
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 from splinecli.maths.transfer import BT709, decode_transfer
 
 if TYPE_CHECKING:
@@ -41,13 +43,8 @@ _MOST_CLIPPED = 0.01  # share of pixels that are overexposed
 _CONTAINERS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1a\x45\xdf\xa3"))
 
 
-class _Candidate(NamedTuple):
-    """A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels."""
-
-    number: int
-    thumbnail: NDArray[np.float32]
-    sharpness: float
-    clipped: float
+_Candidate = tuple[int, NDArray[np.float32], float, float]
+"""A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of clipped pixels."""
 
 
 def is_film(path: Path) -> bool:
@@ -61,25 +58,27 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     Raises:
         InputError: the film cannot be read, or its light does not move.
     """
-    candidates = _candidates(film)
-    light = np.array([frame.thumbnail.mean() for frame in candidates])
-    clipped = np.array([frame.clipped for frame in candidates])
+    numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
+    light = thumbnails.mean(axis=1)
+    # Under another light, sharpness is another: only the frames around are compared.
+    around = [
+        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]) for place in range(len(sharpness))
+    ]
     usable = (
-        _sharp(np.array([frame.sharpness for frame in candidates]))
+        (sharpness >= _BLURRED * np.array(around))
         & (light >= _DARK * np.median(light))
         & (light > 0)
         & (clipped <= max(_MOST_CLIPPED, float(np.median(clipped))))
     )
-    frames = [frame for frame, use in zip(candidates, usable, strict=True) if use]
-    chosen = _farthest([frame.thumbnail for frame in frames])
+    chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"found {len(chosen)} of {len(candidates)} frames that are sharp and differ in their light,"
+            f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their light,"
             f" expected at least {FEWEST_FRAMES}",
             path=film,
             hint="Film from a tripod while the lamp moves all around the object, with focus and exposure locked",
         )
-    return tuple(sorted(frames[place].number for place in chosen))
+    return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
 def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
@@ -91,8 +90,8 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
                 while place <= number and video.grab():
                     place += 1
             if place <= number:
-                raise _damaged(film)
-            yield np.ascontiguousarray(_picture(video, film)[..., ::-1])
+                raise ValueError
+            yield np.ascontiguousarray(_picture(video)[..., ::-1])
 
 
 def _candidates(film: Path) -> list[_Candidate]:
@@ -106,12 +105,12 @@ def _candidates(film: Path) -> list[_Candidate]:
         with native_stderr():
             while video.grab():
                 if number % step == 0:
-                    found.append(_candidate(number, _picture(video, film)))
+                    found.append(_candidate(number, _picture(video)))
                 if len(found) >= _CANDIDATES:
                     found, step = found[::2], 2 * step
                 number += 1
-    if not found:
-        raise _damaged(film)
+        if not found:
+            raise ValueError
     if number < _LEAST_READ * stated:
         raise InputError(
             f"the film breaks off: {number} of {stated:.0f} frames can be read", path=film, hint="Copy it again"
@@ -133,23 +132,14 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     clipped = float((small.max(axis=2) >= _CLIPPED).mean())
     stored = np.asarray(reduced(small, _THUMBNAIL) / 255, np.float32)
     linear = np.asarray(decode_transfer(stored, BT709).mean(axis=2), np.float32)
-    return _Candidate(number, linear.ravel(), sharpness, clipped)
+    return number, linear.ravel(), sharpness, clipped
 
 
-def _sharp(sharpness: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which frames are about as sharp as those around them. Under another light, sharpness is another."""
-    around = [
-        np.median(sharpness[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]) for place in range(len(sharpness))
-    ]
-    return np.asarray(sharpness >= _BLURRED * np.array(around))
-
-
-def _farthest(thumbnails: list[NDArray[np.float32]]) -> list[int]:
-    """Choose thumbnails one by one, each the farthest from those chosen. Their brightness does not count."""
-    if not thumbnails:
+def _farthest(thumbnails: NDArray[np.float32]) -> list[int]:
+    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Their brightness does not count."""
+    if not len(thumbnails):
         return []
-    vectors = np.stack(thumbnails)
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    vectors = unit(thumbnails)
     distance = np.linalg.norm(vectors - vectors.mean(axis=0), axis=1)
     chosen = [int(distance.argmax())]
     distance = np.linalg.norm(vectors - vectors[chosen[0]], axis=1)
@@ -161,40 +151,31 @@ def _farthest(thumbnails: list[NDArray[np.float32]]) -> list[int]:
 
 @contextmanager
 def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
-    """Yield an opened film. Raises InputError."""
+    """Yield an opened film. What is raised for a damaged one becomes an InputError."""
     import cv2
 
     check_file(film, "a film")
-    try:
+    problem = "the film is damaged, or in a form that cannot be read"
+    with damage_as_input_error(film, problem, "Copy it again, or convert it to MP4 with H.264"):
         with film.open("rb") as file:
             start = file.read(16)
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=film) from None
-    if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
-        raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
-    with native_stderr():
-        video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
-    try:
-        if not video.isOpened():
-            raise _damaged(film)
-        size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
-        check_stored_size(size, 1, film)
-        yield video
-    finally:
-        video.release()
+        if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
+            raise InputError("found no film", path=film, hint="MP4, MOV, AVI, MKV and WebM files count as films")
+        with native_stderr():
+            video = cv2.VideoCapture(str(film.absolute()), cv2.CAP_FFMPEG)
+        try:
+            if not video.isOpened():
+                raise ValueError
+            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), 3)
+            check_stored_size(size, 1, film)
+            yield video
+        finally:
+            video.release()
 
 
-def _picture(video: cv2.VideoCapture, film: Path) -> NDArray[np.uint8]:
-    """Return the frame that was grabbed, (H, W, 3) in BGR order. Raises InputError."""
+def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
+    """Return the frame that was grabbed, (H, W, 3) in BGR order. Raises ValueError."""
     done, picture = video.retrieve()
     if not done or picture is None or picture.ndim != 3:
-        raise _damaged(film)
+        raise ValueError
     return np.asarray(picture, np.uint8)
-
-
-def _damaged(film: Path) -> InputError:
-    return InputError(
-        "the film is damaged, or in a form that cannot be read",
-        path=film,
-        hint="Copy it again, or convert it to MP4 with H.264",
-    )

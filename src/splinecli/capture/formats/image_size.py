@@ -15,12 +15,9 @@ from splinecli.system.memory import LARGEST_IMAGE, available_memory
 
 @dataclass(frozen=True)
 class ExpectedSize:
-    """The size that an image must have.
+    """The size (H, W) or (H, W, C) that an image must have.
 
-    Args:
-        shape: (H, W) or (H, W, C).
-        like: where it comes from, such as the name of the first image.
-        what: what the image is, with its article.
+    Messages say `like` what, such as the name of the first image, and `what` the image is, with its article.
     """
 
     shape: tuple[int, ...]
@@ -39,14 +36,7 @@ class ExpectedSize:
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError where an image is not of the expected size, or too large to be read.
-
-    Args:
-        shape: what the file says, (H, W) or (H, W, C).
-        item_bytes: bytes of each number.
-        path: the file.
-        expected: the size that the image must have, if it is known.
-    """
+    """Raise InputError where an image (H, W) or (H, W, C) is not of the expected size, or too large to be read."""
     if expected is not None:
         expected.check(shape, path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
@@ -60,20 +50,21 @@ def check_stored_size(
     check_memory(n_bytes, takes, path)
 
 
+def check_vectors(shape: tuple[int, ...], path: Path) -> None:
+    """Raise InputError where an array is not H x W x 3."""
+    if len(shape) != 3 or shape[2] != 3:
+        raise InputError(
+            f"found an array of {' x '.join(map(str, shape))}, expected a normal map, H x W x 3", path=path
+        )
+
+
 def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
     """Return the bytes that an image takes in memory, as stored and in float32."""
     return math.prod(shape) * (item_bytes + 4)
 
 
 def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = None) -> None:
-    """Raise InputError where less memory is available.
-
-    Args:
-        n_bytes: the memory that is needed.
-        takes: subject and verb of the message, such as "found an image, which takes".
-        path: the file or folder that needs it.
-        hint: the remedy.
-    """
+    """Raise InputError where less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
         raise InputError(

@@ -20,10 +20,6 @@ def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[n
     The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1. Floating-point values
     are kept. Alpha is dropped, and an EXIF orientation is ignored.
 
-    Args:
-        path: the file.
-        expected: the size that the image must have, if it is known.
-
     Raises:
         InputError: see decode_image; also for floating-point values that are negative or not finite.
     """
@@ -54,16 +50,6 @@ def to_linear(stored: NDArray[Any], path: Path) -> NDArray[np.float32]:
     return values
 
 
-def read_boundary(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.bool_]:
-    """Return a mask (H, W) of CyclesPS: true where any channel is above zero; it may be empty.
-
-    Raises:
-        InputError: the image cannot be read.
-    """
-    above: NDArray[np.bool_] = decode_image(Path(path), expected).max(axis=2) > 0
-    return above
-
-
 def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.bool_]:
     """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
 
@@ -75,7 +61,7 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np
     """
     path = Path(path)
     stored, alpha = decode_with_alpha(path, expected)
-    opaque = None if alpha is None else cut_out(alpha)
+    opaque = cut_out(alpha)
     if opaque is not None:
         return opaque
     largest = to_linear(stored.max(keepdims=True), path).item()
@@ -89,10 +75,12 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np
     return mask
 
 
-def cut_out(alpha: NDArray[Any]) -> NDArray[np.bool_] | None:
+def cut_out(alpha: NDArray[Any] | None) -> NDArray[np.bool_] | None:
     """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one that does not.
 
     Opaque is what is above half of the largest alpha. A channel that is opaque everywhere or nowhere cuts nothing out.
     """
+    if alpha is None:
+        return None
     opaque: NDArray[np.bool_] = alpha > alpha.max() / 2
     return opaque if opaque.any() and not opaque.all() else None

@@ -16,12 +16,13 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
+from splinecli.capture.formats.damage import damage_as_input_error
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
 from splinecli.errors import InputError
 
 KEY = "Normal_gt"
 
-_HEADER_BYTES, _TAG_BYTES = 128, 8
+_TAG_BYTES = 8
 _COMPRESSED, _MATRIX = 15, 14  # types of elements
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _NUMERIC = range(6, 16)  # classes of arrays: double, single and whole numbers
@@ -33,10 +34,11 @@ _MOST_NUMBERS = 1 << 20  # of a matrix of a small file
 
 
 class _Variable(NamedTuple):
-    """A numeric variable of a file: its name, its shape, and the place and length of its element."""
+    """A numeric variable of a file: its name, its shape, and the place, length and byte order of its element."""
 
     name: str
     shape: tuple[int, ...]
+    order: str
     start: int
     length: int
     compressed: bool
@@ -52,76 +54,55 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> NDArray[Any]:
         KeyError, ValueError, struct.error, zlib.error: the file is damaged.
     """
     with path.open("rb") as file:
-        header = file.read(_HEADER_BYTES)
-        if header.startswith(b"MATLAB 7.3"):
-            raise _unsupported(path)
-        order = "<" if header[126:] == b"IM" else ">"
-        variable = _choose(list(_variables(file, order)), path)
+        variables = list(_variables(file, path))
+        variable = next((v for v in variables if v.name == KEY), None)
+        if variable is None:
+            maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
+            if len(maps) != 1:
+                found = ", ".join(maps) or "none"
+                raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
+            (variable,) = maps.values()
+        check_vectors(variable.shape, path)
         check_stored_size(variable.shape, 8, path, expected)
-        return _numbers(file, variable, order)
+        return _numbers(file, variable)
 
 
 def read_matrices(path: Path) -> dict[str, NDArray[Any]]:
     """Return the numeric matrices of a small file by name. Raises InputError."""
-    try:
-        with path.open("rb") as file:
-            header = file.read(_HEADER_BYTES)
-            if header.startswith(b"MATLAB 7.3"):
-                raise _unsupported(path)
-            order = "<" if header[126:] == b"IM" else ">"
-            return {
-                v.name: _numbers(file, v, order)
-                for v in list(_variables(file, order))
-                if len(v.shape) == 2 and 0 < math.prod(v.shape) <= _MOST_NUMBERS
-            }
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
-    except (KeyError, ValueError, StopIteration, RuntimeError, struct.error, zlib.error):
-        raise InputError("the .mat file is damaged", path=path, hint="Save it again") from None
+    with damage_as_input_error(path, "the .mat file is damaged", "Save it again"), path.open("rb") as file:
+        return {
+            v.name: _numbers(file, v)
+            for v in list(_variables(file, path))
+            if len(v.shape) == 2 and 0 < math.prod(v.shape) <= _MOST_NUMBERS
+        }
 
 
-def _numbers(file: BinaryIO, variable: _Variable, order: str) -> NDArray[Any]:
+def _numbers(file: BinaryIO, variable: _Variable) -> NDArray[Any]:
     most = 8 * math.prod(variable.shape) + _MOST_OVERHEAD
     content = _read(file, variable.start, variable.length, most, compressed=variable.compressed)
-    kind, numbers = next(islice(_parts(content, order), 3, None))
-    return np.frombuffer(numbers, order + _NUMBERS[kind]).reshape(variable.shape, order="F")
+    kind, numbers = next(islice(_parts(content, variable.order), 3, None))
+    return np.frombuffer(numbers, variable.order + _NUMBERS[kind]).reshape(variable.shape, order="F")
 
 
-def _unsupported(path: Path) -> InputError:
-    return InputError(
-        "found a MATLAB 7.3 file, which is not supported", path=path, hint="Save it with MATLAB's option -v7"
-    )
-
-
-def _choose(variables: list[_Variable], path: Path) -> _Variable:
-    """Return the variable that is the normal map. Raises InputError."""
-    maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
-    named = next((v for v in variables if v.name == KEY), None)
-    if named is None and len(maps) != 1:
-        found = ", ".join(maps) or "none"
-        raise InputError(f"found no {KEY}, and of other H x W x 3 arrays {found}, expected one", path=path)
-    chosen = named or next(iter(maps.values()))
-    if chosen.name not in maps:
-        size = " x ".join(map(str, chosen.shape))
-        raise InputError(f"found an array of {size}, expected a normal map, H x W x 3", path=path)
-    return chosen
-
-
-def _variables(file: BinaryIO, order: str) -> Iterator[_Variable]:
-    """Yield the numeric variables of a file that is positioned behind its header."""
+def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
+    """Yield the numeric variables of a file."""
+    header = file.read(128)
+    if header.startswith(b"MATLAB 7.3"):
+        hint = "Save it with MATLAB's option -v7"
+        raise InputError("found a MATLAB 7.3 file, which is not supported", path=path, hint=hint)
+    order = "<" if header[126:] == b"IM" else ">"
     for _ in range(_MOST_ELEMENTS):
         if len(tag := file.read(_TAG_BYTES)) < _TAG_BYTES:
             return
         kind, length = struct.unpack(order + "II", tag)
         start, compressed = file.tell(), kind == _COMPRESSED
         if kind in (_COMPRESSED, _MATRIX):
-            content = _read(file, start, min(length, _START_BYTES), _START_BYTES, compressed=compressed)
-            parts = _parts(content, order)
+            parts = _parts(_read(file, start, length, _START_BYTES, compressed=compressed), order)
             (flags, *_) = struct.unpack(order + "II", next(parts)[1])
             if flags & 0xFF in _NUMERIC and not flags & _COMPLEX:
                 shape, name = next(parts)[1], next(parts)[1]
                 sizes = struct.unpack(f"{order}{len(shape) // 4}I", shape)
-                yield _Variable(bytes(name).decode("latin-1"), sizes, start, length, compressed)
+                yield _Variable(bytes(name).decode("latin-1"), sizes, order, start, length, compressed)
         file.seek(start + length)
     raise ValueError("the file has too many elements")
 

@@ -14,26 +14,41 @@ Vectors are scaled to unit length. Zero and non-finite vectors are no normals.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.facts import stored_size
-from splinecli.capture.formats.image_size import ExpectedSize
+from splinecli.capture.formats.damage import damage_as_input_error
+from splinecli.capture.formats.decoding import decode_with_alpha
+from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
 from splinecli.capture.formats.images import cut_out, read_mask
-from splinecli.capture.formats.normal_arrays import PICTURE_SUFFIXES, StoredVectors, read_vectors
-from splinecli.capture.paths import StrPath
+from splinecli.capture.formats.matlab import read_mat
+from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
+from splinecli.capture.paths import StrPath, check_file
 from splinecli.errors import InputError
-from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture
+from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
 
-_GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", *PICTURE_SUFFIXES)
+_GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff")
 
 _CLEARLY_BETTER = 0.02  # share of the mask's pixels
 _LENGTH_TOLERANCE = 0.1  # of unit vectors that went through 8 bits, resizing or JPEG
 _FEWEST_UNIT = 0.6  # share in a picture of normals; in photographs a third has unit length by chance
 _LARGEST = 1e100  # values of damaged files may have an infinite square
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
+_LONGEST_NUMBER = 32  # characters of a number in a text, with what separates it from the next
+
+
+class _Stored(NamedTuple):
+    """Vectors (H, W, 3) as a file stores them, and the alpha channel (H, W) of a picture.
+
+    The values of a picture are colours, n = 2 v / full scale - 1.
+    """
+
+    values: NDArray[Any]
+    alpha: NDArray[Any] | None
+    is_picture: bool
 
 
 def read_normal_map(
@@ -54,13 +69,13 @@ def read_normal_map(
     expected = None
     if mask is not None:
         # Both headers are compared before either file is decoded.
-        shape = stored_size(mask)[0] if isinstance(mask, Path) else mask.shape
+        shape = read_facts(mask).size[0] if isinstance(mask, Path) else mask.shape
         expected = ExpectedSize(shape, "the mask", "a normal map")
-    stored = read_vectors(path, expected)
+    stored = _read_vectors(path, expected)
     if isinstance(mask, Path):
         mask = read_mask(mask, ExpectedSize(stored.values.shape, path.name, "a mask"))
     wanted = np.ones(stored.values.shape[:2], np.bool_) if mask is None else mask
-    opaque = None if stored.alpha is None else cut_out(stored.alpha)
+    opaque = cut_out(stored.alpha)
     if opaque is not None:
         wanted = wanted & opaque
     normals = _to_normals(stored, wanted, path, check_floats=True)
@@ -91,23 +106,66 @@ def read_ground_truth(
         raise InputError(
             f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png or .tif', path=path
         )
-    stored = read_vectors(path, ExpectedSize(shape, "the images", "a ground truth"), text=True)
-    upside_down = suffix == ".txt" and _is_upside_down(stored.values, mask)
-    if upside_down:
-        stored = stored._replace(values=stored.values[::-1])
-    return _to_normals(stored, mask, path), upside_down
+    if suffix != ".txt":
+        stored = _read_vectors(path, ExpectedSize(shape, "the images", "a ground truth"))
+        return _to_normals(stored, mask, path), False
+    values = _read_text(path, *shape)
+    filled = (values != 0).any(axis=2)
+    as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
+    upside_down = bool(turned - as_stored > _CLEARLY_BETTER * np.count_nonzero(mask))
+    return _to_normals(_Stored(values[::-1] if upside_down else values, None, False), mask, path), upside_down
+
+
+def _read_vectors(path: Path, expected: ExpectedSize | None) -> _Stored:
+    """Return the vectors of a file of normals. Its size is compared before its values are read. Raises InputError.
+
+    The suffix decides: .mat and .npy are arrays, all others are pictures. Unsigned integers in a .npy file are a
+    picture, too. In a .mat file they are not, because MATLAB stores all whole numbers as bytes, such as the normals of
+    a plane.
+    """
+    check_file(path, "a normal map")
+    suffix, alpha = path.suffix.lower(), None
+    if suffix == ".mat":
+        with damage_as_input_error(path, "the MATLAB file is damaged and cannot be read"):
+            values = read_mat(path, expected)
+    elif suffix == ".npy":
+        with damage_as_input_error(path, "the .npy file is damaged, or contains no array of numbers"):
+            # A map of the file, which reads the header alone. It refuses a file that is shorter than its header says.
+            array = np.lib.format.open_memmap(path, mode="r")
+            check_vectors(array.shape, path)
+            check_stored_size(array.shape, array.dtype.itemsize, path, expected)
+            values = np.array(array)
+    else:
+        values, alpha = decode_with_alpha(path, expected)
+        check_vectors(values.shape, path)
+    return _Stored(values, alpha, suffix != ".mat" and values.dtype.kind == "u")
+
+
+def _read_text(path: Path, height: int, width: int) -> NDArray[np.float64]:
+    """Return vectors (H, W, 3), one on each line. Raises InputError."""
+    most = 3 * height * width * _LONGEST_NUMBER + MOST_TEXT
+    check_length(path, most, "a normal map")
+    try:
+        rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
+    except (ValueError, OSError):
+        # This reader is slower, but it reads commas and names the line of an error.
+        rows = read_number_rows(path, most=most).as_array()
+    expected = (height * width, 3)
+    if rows.shape != expected:
+        raise InputError(
+            f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {expected[0]} rows of 3,"
+            f" one for each pixel of {height} x {width}",
+            path=path,
+        )
+    return rows.reshape(height, width, 3)
 
 
 def _to_normals(
-    stored: StoredVectors, mask: NDArray[np.bool_], path: Path, *, check_floats: bool = False
+    stored: _Stored, mask: NDArray[np.bool_], path: Path, *, check_floats: bool = False
 ) -> NDArray[np.float32]:
-    """Return unit vectors (H, W, 3), zero outside the mask (H, W).
+    """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values that are no normals.
 
-    Args:
-        check_floats: whether floating-point values must have about unit length, too, as colours must.
-
-    Raises:
-        InputError: the values are no normals, or there is none inside the mask.
+    With check_floats, floating-point values must have about unit length, too, as colours must.
     """
     values = stored.values
     if values.dtype.kind not in "fiu":
@@ -118,7 +176,11 @@ def _to_normals(
     rows, columns = np.nonzero(mask)
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK], columns[start : start + _BLOCK]
-        normals[block] = decode_picture(values[block]) if stored.is_picture else _unit_or_zero(values[block])
+        if stored.is_picture:
+            normals[block] = decode_picture(values[block])
+        else:
+            vectors = values[block].astype(np.float64)
+            normals[block] = unit(np.where((np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True), vectors, 0))
     if not normals.any():
         raise InputError("found no normal inside the mask, expected at least one", path=path)
     return normals
@@ -142,19 +204,3 @@ def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) ->
             path=path,
             hint="If the background is not black, give a mask",
         )
-
-
-def _is_upside_down(stored: NDArray[Any], mask: NDArray[np.bool_]) -> bool:
-    """Return whether vectors (H, W, 3) fill the mask clearly better when their rows are taken from the bottom up."""
-    filled = (stored != 0).any(axis=2)
-    as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
-    return bool(turned - as_stored > _CLEARLY_BETTER * np.count_nonzero(mask))
-
-
-def _unit_or_zero(stored: NDArray[Any]) -> NDArray[np.float64]:
-    """Return vectors (P, 3) at unit length; zero where they are zero or not finite."""
-    vectors = stored.astype(np.float64)
-    usable = (np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True)
-    length = np.linalg.norm(np.where(usable, vectors, 0), axis=1, keepdims=True)
-    scaled: NDArray[np.float64] = np.divide(vectors, length, out=np.zeros_like(vectors), where=usable & (length > 0))
-    return scaled

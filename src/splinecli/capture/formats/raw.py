@@ -23,16 +23,12 @@ RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2", ".rwl", ".pef",
     ".srw", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".x3f",
 )  # fmt: skip
-
-
-def is_raw(path: Path) -> bool:
-    """Return whether a file counts as RAW: by its name, because the content of many looks like TIFF."""
-    return path.suffix.lower() in RAW_SUFFIXES
+"""RAW files count by their names, because the content of many looks like TIFF."""
 
 
 def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
     """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises InputError."""
-    with _damage_as_input_error(path), native_stderr(), _import_rawpy(path).imread(str(path)) as raw:
+    with _libraw(path) as rawpy, native_stderr(), rawpy.imread(str(path)) as raw:
         return (raw.sizes.height, raw.sizes.width, 3), 2
 
 
@@ -42,15 +38,10 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
     They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is saturated. All files of a
     camera at one setting have the same scale. An orientation is ignored, as in all images.
 
-    Args:
-        content: the whole file.
-        path: its name, for messages.
-
     Raises:
         InputError: rawpy is not installed, or LibRaw cannot read the file.
     """
-    rawpy = _import_rawpy(path)
-    with _damage_as_input_error(path):
+    with _libraw(path) as rawpy:
         with native_stderr():  # not longer, because it stops progress bars, too
             raw = rawpy.imread(io.BytesIO(content))
             raw.unpack()
@@ -59,16 +50,14 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
                 output_color=rawpy.ColorSpace.raw,
                 output_bps=16,
                 gamma=(1, 1),
-                # White balance of the camera, or an automatic one, would differ between images. LibRaw's daylight
-                # balance is fixed, but brightens red and blue, which would reach full scale before saturation.
+                # Other white balances differ between images, or bring red and blue to full scale before saturation.
                 user_wb=[1, 1, 1, 1],
                 no_auto_bright=True,
                 user_sat=_full_scale(raw),  # the default is each image's own maximum, if that is near
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
-                # Other algorithms choose the direction of interpolation by the image, so differently under each light.
-                # For textured objects their normals have two to three times the error (AHD 1.4 degrees, LINEAR 0.5).
-                # For uniform objects their normals are better (0.2 and 0.4 degrees).
+                # Others interpolate differently under each light: normals of textured objects have two to three
+                # times the error (AHD 1.4 degrees, LINEAR 0.5), those of uniform objects half of it (0.2, 0.4).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
     # Some sensors have four colours. The fourth must not become an alpha channel.
@@ -78,9 +67,9 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
 def read_shot(path: Path) -> tuple[float, float, float]:
     """Return exposure time in seconds, f-number and ISO sensitivity, each zero where the file does not state it.
 
-    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. It raises LibRaw's errors.
+    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. Raises InputError.
     """
-    with native_stderr(), _import_rawpy(path).imread(io.BytesIO(path.read_bytes())) as raw:
+    with _libraw(path) as rawpy, native_stderr(), rawpy.imread(io.BytesIO(path.read_bytes())) as raw:
         return raw.other.shutter_speed, raw.other.aperture, raw.other.iso_speed
 
 
@@ -98,23 +87,15 @@ def _full_scale(raw: rawpy.RawPy) -> int:
 
 
 @contextmanager
-def _damage_as_input_error(path: Path) -> Iterator[None]:
-    rawpy = _import_rawpy(path)
+def _libraw(path: Path) -> Iterator[ModuleType]:
+    """Yield rawpy. What it raises for a damaged file becomes an InputError."""
+    otherwise = "export the photographs as 16-bit linear TIFF"
+    rawpy = import_extra("rawpy", "raw", error=InputError, path=path, otherwise=otherwise)
     try:
-        yield
+        yield rawpy
     except (rawpy.LibRawError, OSError):
         raise InputError(
             "the RAW file is damaged or of a camera that LibRaw does not know",
             path=path,
-            hint="Copy it again, or export the photographs as 16-bit linear TIFF",
+            hint=f"Copy it again, or {otherwise}",
         ) from None
-
-
-def _import_rawpy(path: Path) -> ModuleType:
-    return import_extra(
-        "rawpy",
-        "raw",
-        error=InputError,
-        path=path,
-        otherwise="export the photographs as 16-bit linear TIFF",
-    )

@@ -11,21 +11,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.facts import is_image
+from splinecli.capture.formats.facts import JPEG, PNG, TIFF
 from splinecli.capture.paths import check_file, is_substitution
 from splinecli.errors import InputError
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 _SEPARATORS_BESIDE_COMMAS = re.compile(r"[\s;]+")
-_NUMBER_WITH_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
+_NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _LINE_END = re.compile(r"\r\n|\r|\n")
+_BYTES_OF_LINE = 20  # at least, on average, in a file of the greatest length: each line takes time and memory
+_FROM_PIPES: dict[Path, bytes] = {}
 
 MOST_TEXT = 1_000_000
 """Bytes of the longest text file that is read, unless the images say how long it may be: 14,000 lights."""
-
-_BYTES_OF_LINE = 20  # at least, on average, in a file of the greatest length: each line takes time and memory
-
-_FROM_PIPES: dict[Path, bytes] = {}
 
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 """Hint for a line with decimal commas."""
@@ -33,13 +31,9 @@ DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 @dataclass(frozen=True)
 class NumberRows:
-    """The rows of numbers of a text file, which may differ in length.
+    """The rows of numbers of a text file, all finite; their lengths may differ.
 
-    Args:
-        path: the file.
-        rows: the numbers of each row, all finite.
-        lines: the one-based line of each row in the file.
-        texts: these lines as written, without comments.
+    `lines` has the one-based line of each row in the file, `texts` these lines as written, without comments.
     """
 
     path: Path
@@ -88,13 +82,10 @@ def has_decimal_commas(text: str) -> bool:
     return "." not in text and re.search(r"\d,\d", text) is not None and re.search(r"[\s;]", text) is not None
 
 
-def check_length(path: Path, most: int) -> None:
+def check_length(path: Path, most: int, expected: str = "a text file") -> None:
     """Raise InputError for a text file of more than `most` bytes, or for something that is no file."""
-    check_file(path, "a text file")
-    try:
-        length = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+    check_file(path, expected)
+    length = path.stat().st_size
     if length > most:
         raise _too_long(f"{length / 1e6:.1f} MB", most, path)
 
@@ -106,13 +97,10 @@ def _too_long(found: str, most: int, path: Path) -> InputError:
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
     """Return the bytes of a text file, or of a pipe in its place: the shell's `<(...)`, which can be read only once.
 
-    Args:
-        path: the file.
-        most: the largest number of bytes.
-        expected: what the file should be, for messages.
+    `expected` says in messages what the file should be.
 
     Raises:
-        InputError: the file is missing, longer, or no file.
+        InputError: the file is missing, no file, or has more than `most` bytes.
     """
     check_file(path, expected, pipe=True)
     try:
@@ -135,18 +123,15 @@ def read_lines(
 ) -> list[str]:
     """Return the lines of a UTF-8 file, with or without a byte order mark, or of UTF-16 with one. Raises InputError.
 
-    Args:
-        path: the file.
-        else_latin_1: whether a file that is not UTF-8 is read as Latin-1, which older programs on Windows write.
-        expected: what the file should be, for messages.
-        most: the largest number of bytes.
+    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older programs on Windows write. The other
+    arguments are those of read_text.
     """
     content = read_text(path, most=most, expected=expected)
     is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError:
-        if is_image(content):
+        if content.startswith((PNG, JPEG, *TIFF)):
             raise InputError(f"found an image, expected {expected}", path=path) from None
         if not else_latin_1:
             hint = "Save it as plain UTF-8 text"
@@ -161,15 +146,13 @@ def read_lines(
 def read_number_rows(path: Path, *, expected: str = "a text file", most: int = MOST_TEXT) -> NumberRows:
     """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines are skipped.
 
-    `expected` says in messages what the file should be, `most` how many bytes it may have.
+    The arguments are those of read_text.
 
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
-    content = [
-        (line, text.partition("#")[0].strip())
-        for line, text in enumerate(read_lines(path, expected=expected, most=most), start=1)
-    ]
+    stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
+    content = [(line, text.partition("#")[0].strip()) for line, text in stored]
     commas = uses_decimal_commas([text for _, text in content if text], 3)
     rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
     return NumberRows.from_words(path, [(line, text, words) for line, text, words in rows if words])
@@ -179,16 +162,18 @@ def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
     """Return the words of a line, with points for decimal commas."""
     separators = _SEPARATORS_BESIDE_COMMAS if decimal_commas else _SEPARATORS
     words = [word for word in separators.split(text) if word]
-    return [_with_point(word) for word in words] if decimal_commas else words
+    if not decimal_commas:
+        return words
+    return [word.replace(",", ".") if _NUMBER_WITH_COMMA.fullmatch(word) else word for word in words]
 
 
 def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
     """Return whether lines have decimal commas, such as "0,5 0,3 0,8": their last numbers stand apart without them."""
     tails = [_SEPARATORS_BESIDE_COMMAS.split(text)[-n_numbers:] for text in texts]
-    rows = [words for words in tails if len(words) == n_numbers and any(map(_is_number_with_comma, words))]
-    return any("," in word for words in rows for word in words) and all(
-        _is_number_with_comma(word) for words in rows for word in words
-    )
+    is_match = _NUMBER_WITH_COMMA.fullmatch
+    rows = [words for words in tails if len(words) == n_numbers and any(map(is_match, words))]
+    words = [word for row in rows for word in row]
+    return any("," in word for word in words) and all(map(is_match, words))
 
 
 def is_number(word: str) -> bool:
@@ -204,19 +189,10 @@ def _to_number(word: str) -> float | None:
         return None
 
 
-def _is_number_with_comma(word: str) -> bool:
-    return any(character.isdigit() for character in word) and bool(_NUMBER_WITH_COMMA.fullmatch(word))
-
-
-def _with_point(word: str) -> str:
-    return word.replace(",", ".") if _is_number_with_comma(word) else word
-
-
 def parse_number(word: str, path: Path, line: int) -> float:
     """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
     value = _to_number(word)
-    if value is None:
-        raise InputError(f'found "{word[:40]}", expected a number', path=path, line=line)
-    if not np.isfinite(value):
-        raise InputError(f'found "{word[:40]}", expected a finite number', path=path, line=line)
+    if value is None or not np.isfinite(value):
+        what = "a number" if value is None else "a finite number"
+        raise InputError(f'found "{word[:40]}", expected {what}', path=path, line=line)
     return value

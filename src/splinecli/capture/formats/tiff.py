@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture.formats.damage import COPY_AGAIN, damage_as_input_error
 from splinecli.errors import InputError
 from splinecli.system.memory import is_out_of_memory
 
@@ -46,15 +47,11 @@ def decode_tiff(file: BinaryIO, path: Path) -> NDArray[Any] | None:
                 hint="Export it as RGB",
             )
         pixels = _decode_page(page)
-    if pixels is None:
         if photometric == _WHITE_IS_ZERO:
-            raise _damaged(path)
-        return None
-    if photometric == _WHITE_IS_ZERO:
-        if pixels.dtype.kind == "u":
-            return np.asarray(np.iinfo(pixels.dtype).max - pixels)
-        if pixels.dtype == np.bool_:
-            return ~pixels
+            if pixels is None:
+                raise ValueError  # OpenCV would not invert the values
+            if pixels.dtype.kind in "ub":
+                return ~pixels
     return pixels
 
 
@@ -63,22 +60,20 @@ def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
     """Yield the first page of an open TIFF file. What tifffile raises for a damaged file becomes an InputError."""
     import tifffile
 
-    with _quiet_tifffile():
-        try:
-            _check_tags(file, path)
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True  # the error says what a user needs
+    try:
+        with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
+            _check_tags(file)
             file.seek(0)
             with tifffile.TiffFile(file, name=path.name) as pages:
                 yield pages.pages.first
-        except InputError:
-            raise
-        except Exception as error:  # struct, key, value and other errors
-            if is_out_of_memory(error):
-                raise
-            raise _damaged(path) from None
+    finally:
+        logger.disabled = before
 
 
-def _check_tags(file: BinaryIO, path: Path) -> None:
-    """Raise InputError for a tag with millions of values, because tifffile reads tags as a whole."""
+def _check_tags(file: BinaryIO) -> None:
+    """Raise ValueError for a tag with millions of values, because tifffile reads tags as a whole."""
     start = file.read(16)
     order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
     big = 43 in start[2:4]  # BigTIFF has wider numbers
@@ -90,11 +85,7 @@ def _check_tags(file: BinaryIO, path: Path) -> None:
         tag = int.from_bytes(entries[place : place + 2], order)
         values = int.from_bytes(entries[place + 4 : place + 4 + number], order)
         if values > (_MOST_PARTS if tag in _PLACES_OF_PARTS else _LONGEST_TAG):
-            raise _damaged(path)
-
-
-def _damaged(path: Path) -> InputError:
-    return InputError("the TIFF is damaged and cannot be read", path=path, hint="Copy or export it again")
+            raise ValueError
 
 
 def _decode_page(page: Any) -> NDArray[Any] | None:
@@ -113,30 +104,16 @@ def _decode_page(page: Any) -> NDArray[Any] | None:
 
 
 def _check_complete(page: Any, size: int, path: Path) -> None:
-    """Raise InputError where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels.
+    """Raise an error where a part of the pixels lies beyond the file's size in bytes, or is longer than its pixels.
 
     A compressed part that is longer than its pixels would be may expand to a thousand times their size. So may a tile
     that is far larger than the picture.
     """
     expanded = math.prod(page.chunks) * page.dtype.itemsize
     longest = 2 * expanded + _LONGEST_EMPTY_PART
-    if expanded > 2 * math.prod(page.shape) * page.dtype.itemsize + _LARGEST_EMPTY_PART or any(
-        count > longest for count in page.databytecounts
-    ):
-        raise _damaged(path)
+    if expanded > 2 * page.nbytes + _LARGEST_EMPTY_PART or max(page.databytecounts, default=0) > longest:
+        raise ValueError
     if any(
         count == 0 or offset + count > size for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
     ):
-        raise InputError("the TIFF is truncated", path=path, hint="Copy or export it again")
-
-
-@contextmanager
-def _quiet_tifffile() -> Iterator[None]:
-    """Keep tifffile from logging. The errors raised here say what a user needs."""
-    logger = logging.getLogger("tifffile")
-    before = logger.disabled
-    logger.disabled = True
-    try:
-        yield
-    finally:
-        logger.disabled = before
+        raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)

@@ -12,8 +12,7 @@ from splinecli.errors import InputError
 
 FILENAMES = "filenames.txt"
 LIGHT_DIRECTIONS = ("light_directions.txt", "lights.txt", "light_directions.npy", "lights.npy")
-NAMED_LIGHTS = (".lp", "lights.json")
-"""Endings of the names of light files that name the image of each light."""
+_NAMED_LIGHTS = (".lp", "lights.json")  # endings of the names of light files that name the image of each light
 LIGHT_POSITIONS = ("light_positions.txt",)
 LIGHT_FILES = "light_directions.txt, lights.txt, *.lp, lights.json or light_positions.txt"
 """The usual names of light files, for messages."""
@@ -26,25 +25,13 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
-NOT_PHOTOGRAPHS = frozenset(
-    {Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)}
-    # What splinecli writes, for an output folder that is also the capture's.
-    | {
-        "normals",
-        "normals_8bit",
-        "error_map",
-        "albedo",
-        "confidence",
-        "curvature",
-        "relief",
-        "preview",
-        "depth",
-        "mesh",
-        "found_mask",
-        "calibration",
-        "lights",
-    }
-)
+_WRITTEN = {
+    "normals", "normals_8bit", "error_map", "albedo", "confidence", "curvature", "relief", "preview", "depth", "mesh",
+    "found_mask", "calibration", "lights",
+}  # fmt: skip
+"""Stems of what splinecli writes, for an output folder that is also the capture's."""
+
+NOT_PHOTOGRAPHS = frozenset({Path(name).stem for name in (*MASK, *AMBIENT, *GROUND_TRUTH)} | _WRITTEN)
 """Lower-case stems of pictures in a capture's folder that are not images of the object under one light."""
 
 
@@ -110,7 +97,9 @@ def gather_files(
     images: tuple[Path, ...],
     lights: Path | None,
     overrides: Overrides,
+    *,
     ground_truth_names: Sequence[str] = GROUND_TRUTH,
+    others: tuple[Path, ...] = (),
 ) -> CaptureFiles:
     """Return the images and lights with the other files of the folder. Files named by the user replace those."""
     return CaptureFiles(
@@ -122,6 +111,7 @@ def gather_files(
         light_intensities=overrides.intensities or find_named(folder, LIGHT_INTENSITIES),
         mask=overrides.mask or find_named(folder, MASK),
         ground_truth=overrides.ground_truth or find_named(folder, ground_truth_names),
+        others=others,
     )
 
 
@@ -136,7 +126,7 @@ def find_lights(folder: Path) -> Path | None:
     plain = find_named(folder, LIGHT_DIRECTIONS)
     if plain is not None:
         return plain
-    named = [e for e in list_folder(folder) if e.name.lower().endswith(NAMED_LIGHTS) and is_found_file(e)]
+    named = [e for e in list_folder(folder) if e.name.lower().endswith(_NAMED_LIGHTS) and is_found_file(e)]
     if len(named) > 1:
         raise InputError(
             f"found {len(named)} light files: {', '.join(path.name for path in named)}",

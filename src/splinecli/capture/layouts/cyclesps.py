@@ -36,20 +36,26 @@ _NUMBERED = re.compile(r"\d{5}\.tif")
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
-    """Return the capture's files, or None for another layout.
-
-    Args:
-        folder: images_<kind> in an object's folder, or an object's folder with one such folder.
+    """Return the files of images_<kind> in an object's folder, or of an object's only one; None for another layout.
 
     Raises:
         InputError: the object has no folder of images or several; or no light.txt or no boundary masks, and none are
             named instead; or its images do not match its lights.
     """
-    images_folder = _images_folder(folder)
-    if images_folder is None:
-        if _is_object(folder):
-            raise _not_one_folder(folder)
+    captures = list_captures(folder)
+    if captures is None:
         return None
+    if not captures:
+        expected = f"{_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse"
+        raise InputError(f"found no folder of images, expected {expected}", path=folder)
+    images_folder, *more = captures
+    if more:
+        names = ", ".join(path.name for path in captures)
+        raise InputError(
+            f"found {len(captures)} folders of images ({names}), expected one",
+            path=folder,
+            hint=f"Give one of them, such as {images_folder}",
+        )
     holder = _parent(images_folder)
     lights = overrides.lights or find_named(holder, [_LIGHTS])
     if lights is None:
@@ -74,78 +80,37 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles | None:
 def capture_name(folder: Path) -> str | None:
     """Return <object>_<kind>, such as "Armadillo_specular"; None for another layout or several captures."""
     try:
-        images_folder = _images_folder(folder)
+        captures = list_captures(folder) if is_folder(folder) else None
     except InputError:  # reading the capture will raise it again
         return None
-    return None if images_folder is None else _name(images_folder)
+    return _name(captures[0]) if captures and len(captures) == 1 else None
 
 
-def list_captures(folder: Path) -> list[Path]:
-    """Return the folder if it is a folder of images, the folders of images of an object, or an empty list."""
-    if _is_images_folder(folder):
+def list_captures(folder: Path) -> list[Path] | None:
+    """Return the folder if it is a folder of images, or the folders of images of an object; None for another layout."""
+    is_images_folder = folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
+    if not (is_images_folder or _has_marks(folder)) or find_named(folder, LIGHT_DIRECTIONS) is not None:
+        return None  # a light file of its own makes it a plain folder
+    if is_images_folder:
         return [folder]
-    return _list_images_folders(folder) if _is_object(folder) else []
+    captures = [entry for entry in list_folder(folder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+    # Images beside light.txt are a plain folder, to be used with --lights light.txt.
+    no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
+    return None if not captures and list_images(folder, leave_out_stems=no_photographs) else captures
 
 
 def _name(images_folder: Path) -> str:
     return f"{folder_name(_parent(images_folder))}_{folder_name(images_folder).removeprefix(_PREFIX)}"
 
 
-def _images_folder(folder: Path) -> Path | None:
-    """Return the only folder of images; None for several, or for another layout."""
-    captures = list_captures(folder) if is_folder(folder) else []
-    return captures[0] if len(captures) == 1 else None
-
-
-def _is_images_folder(folder: Path) -> bool:
-    # A light file of its own makes it a plain folder.
-    return (
-        folder_name(folder).startswith(_PREFIX)
-        and _has_marks(_parent(folder))
-        and find_named(folder, LIGHT_DIRECTIONS) is None
-    )
-
-
-def _is_object(folder: Path) -> bool:
-    if not _has_marks(folder) or find_named(folder, LIGHT_DIRECTIONS) is not None:
-        return False
-    no_photographs = NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
-    return bool(
-        _list_images_folders(folder)
-        # Images beside light.txt are a plain folder, to be used with --lights light.txt.
-        or not list_images(folder, leave_out_stems=no_photographs, leave_out=())
-    )
-
-
 def _has_marks(folder: Path) -> bool:
-    marks = {
-        entry.name.lower() for entry in list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)
-    }
-    return len(marks) >= _ENOUGH_MARKS
-
-
-def _list_images_folders(holder: Path) -> list[Path]:
-    return [entry for entry in list_folder(holder) if entry.name.startswith(_PREFIX) and is_folder(entry)]
+    marked = [entry for entry in list_folder(folder) if entry.name.lower() in _MARKS and not is_folder(entry)]
+    return len({entry.name.lower() for entry in marked}) >= _ENOUGH_MARKS
 
 
 def _parent(folder: Path) -> Path:
     # "." and ".." are their own parents to pathlib.
     return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
-
-
-def _not_one_folder(holder: Path) -> InputError:
-    folders = _list_images_folders(holder)
-    if not folders:
-        return InputError(
-            f"found no folder of images, expected {_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse",
-            path=holder,
-        )
-    names = ", ".join(folder.name for folder in folders)
-    return InputError(
-        f"found {len(folders)} folders of images ({names}), expected one",
-        path=holder,
-        hint=f"Give one of them, such as {folders[0]}",
-    )
 
 
 def _find_boundaries(holder: Path) -> tuple[Path, ...]:

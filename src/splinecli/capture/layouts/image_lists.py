@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os.path
 import re
 import stat
 from collections.abc import Collection, Sequence
@@ -53,15 +54,14 @@ def list_folder(folder: Path) -> list[Path]:
     return sorted(entries, key=natural_key)
 
 
-def list_images(folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]) -> tuple[Path, ...]:
+def list_images(
+    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path] = ()
+) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
     Files that share a stem with a RAW file show the same photograph. A PNG or TIFF was developed from the RAW file and
-    replaces it. A JPEG is a copy that the camera made, and does not count.
-
-    Args:
-        leave_out_stems: lower-case names without suffix that have another meaning, such as "mask".
-        leave_out: files that have another meaning.
+    replaces it. A JPEG is a copy that the camera made, and does not count. What is left out has another meaning, by its
+    stem in lower case, such as "mask", or as a file that the user named.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -72,15 +72,13 @@ def list_images(folder: Path, *, leave_out_stems: Collection[str], leave_out: Co
         and is_found_file(entry)
         and resolve(entry) not in others
     ]
-    raw, developed = (
-        {image.stem.lower() for image in images if image.suffix.lower() in suffixes}
-        for suffixes in (RAW_SUFFIXES, _DEVELOPED)
-    )
+    names = [(image.stem.lower(), image.suffix.lower()) for image in images]
+    raw = {stem for stem, suffix in names if suffix in RAW_SUFFIXES}
+    developed = {stem for stem, suffix in names if suffix in _DEVELOPED}
     return tuple(
         image
-        for image in images
-        if image.stem.lower() not in raw
-        or image.suffix.lower() in (_DEVELOPED if image.stem.lower() in developed else RAW_SUFFIXES)
+        for image, (stem, suffix) in zip(images, names, strict=True)
+        if stem not in raw or suffix in (_DEVELOPED if stem in developed else RAW_SUFFIXES)
     )
 
 
@@ -107,23 +105,11 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
             continue
         image = path.parent / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise InputError(
-                f'the image "{name}" is outside of this folder',
-                path=path,
-                line=line,
-                hint="Copy the image into the folder, or set a link to it there, and name that",
-            )
-        try:
-            exists = find_mode(image) is not None
-        except InputError:  # the system refuses, for example because the name is too long
-            exists = False
-        if not exists:
-            raise InputError(
-                f'the image "{name}" does not exist',
-                path=path,
-                line=line,
-                hint="Correct the name or remove the line",
-            )
+            hint = "Copy the image into the folder, or set a link to it there, and name that"
+            raise InputError(f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint)
+        if not os.path.exists(image):  # noqa: PTH110 - Path.exists raises for a name that is too long
+            hint = "Correct the name or remove the line"
+            raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
         check_file(image, "an image")
         if image in images:
             raise InputError(f'the image "{name}" is also on line {images[image]}', path=path, line=line)

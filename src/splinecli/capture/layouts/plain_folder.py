@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 from splinecli.capture.layouts.capture_files import (
@@ -27,10 +26,6 @@ _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all
 _MOST_OTHERS = 0.25
 """Share of the images up to which names with these words are not those of the photographs."""
 
-_DILIGENT_LIGHTS = "light_directions.txt"
-# normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
-_DILIGENT_GROUND_TRUTH = (*GROUND_TRUTH, "normal.txt")
-
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles:
     """Return the capture's files, with the images in natural order or in the order of filenames.txt.
@@ -41,18 +36,15 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
         InputError: the folder contains no images, filenames.txt is wrong, or there is no light file and none is named.
     """
     filenames = find_named(folder, [FILENAMES])
-    is_diligent = filenames is not None and find_named(folder, [_DILIGENT_LIGHTS]) is not None
     if filenames is not None:
         images = read_image_list(filenames)
     else:
         images = list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
     check_not_empty(images, folder)
-    others: tuple[Path, ...] = ()
-    if filenames is None:
-        others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
-        if len(others) > _MOST_OTHERS * len(images):
-            others = ()
-        images = tuple(image for image in images if image not in others)
+    others = tuple(image for image in images if _OTHER_WORDS.intersection(_WORD.findall(image.stem.lower())))
+    if filenames is not None or len(others) > _MOST_OTHERS * len(images):
+        others = ()
+    images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         raise InputError(
@@ -61,6 +53,8 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
             hint="Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes the file from"
             " images of a mirror ball. Without one, --lights estimate finds the lights from the images, less exactly",
         )
-    layout, ground_truth = ("DiLiGenT", _DILIGENT_GROUND_TRUTH) if is_diligent else ("plain folder", GROUND_TRUTH)
-    files = gather_files(layout, folder, images, lights, overrides, ground_truth)
-    return replace(files, others=others)
+    layout, ground_truth = "plain folder", GROUND_TRUTH
+    if filenames is not None and find_named(folder, ["light_directions.txt"]) is not None:
+        # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
+        layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
+    return gather_files(layout, folder, images, lights, overrides, ground_truth_names=ground_truth, others=others)

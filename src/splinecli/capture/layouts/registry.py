@@ -21,9 +21,6 @@ from splinecli.capture.layouts.image_lists import NoImagesError, list_folder, li
 from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
 
-# The plain folder comes last, because it takes any folder with images.
-_LAYOUTS = (psbox.find, cyclesps.find, plain_folder.find)
-
 
 def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> CaptureFiles:
     """Return the files of the capture in the folder. The overrides replace those in the folder.
@@ -32,20 +29,18 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
         InputError: the folder is missing, is a file or contains no images; filenames.txt names an image that
             does not exist; there is no light file; or a file of the overrides does not exist.
     """
-    list_folder(Path(folder))  # raises where it is no folder
+    folder = Path(folder)
+    list_folder(folder)  # raises where it is no folder
     overrides.named()
-    for find in _LAYOUTS:
-        try:
-            files = find(Path(folder), overrides)
-        except NoImagesError as error:
-            captures = [capture for path in _subfolders(Path(folder)) for capture in _captures_below(path)]
-            if error.path != Path(folder) or not captures:
-                raise
-            hint = f"There are captures in {folder}, such as {captures[0]}: give these"
-            raise InputError(error.problem, path=Path(folder), hint=hint) from None
-        if files is not None:
-            return files
-    raise AssertionError("the plain folder takes every folder, or raises")  # pragma: no cover
+    try:
+        # The plain folder comes last, because it takes any folder with images.
+        return psbox.find(folder, overrides) or cyclesps.find(folder, overrides) or plain_folder.find(folder, overrides)
+    except NoImagesError as error:
+        captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
+        if error.path != folder or not captures:
+            raise
+        hint = f"There are captures in {folder}, such as {captures[0]}: give these"
+        raise InputError(error.problem, path=folder, hint=hint) from None
 
 
 def capture_name(folder: StrPath) -> str:
@@ -54,9 +49,8 @@ def capture_name(folder: StrPath) -> str:
     Raises:
         InputError: the system refuses to say what is there.
     """
-    if is_film(Path(folder)):
-        return Path(folder).stem
-    return cyclesps.capture_name(Path(folder)) or folder_name(Path(folder))
+    folder = Path(folder)
+    return folder.stem if is_film(folder) else cyclesps.capture_name(folder) or folder_name(folder)
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -89,7 +83,14 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
-    return [folder] if _looks_like_capture(folder) else cyclesps.list_captures(folder)
+    if find_lights(folder) is not None:
+        objects = folder / psbox.OBJECTS
+        is_psbox = is_folder(objects) and find_named(folder, psbox.LIGHT_DIRECTIONS) is not None
+        if find_named(folder, [FILENAMES]) is not None or list_images(
+            objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
+        ):
+            return [folder]
+    return cyclesps.list_captures(folder) or []
 
 
 def _captures_below(folder: Path) -> list[Path]:
@@ -100,14 +101,3 @@ def _captures_below(folder: Path) -> list[Path]:
         return _captures_in(folder)
     except InputError:
         return [folder]
-
-
-def _looks_like_capture(folder: Path) -> bool:
-    if find_lights(folder) is None:
-        return False
-    if find_named(folder, [FILENAMES]) is not None:
-        return True
-    objects = psbox.list_objects(folder)
-    if objects is not None:
-        return bool(objects)
-    return bool(list_images(folder, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=()))
