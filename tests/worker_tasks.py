@@ -7,10 +7,6 @@ from pathlib import Path
 from typing import Any
 
 
-def get_ready(folder: str) -> None:
-    (Path(folder) / f"ready-{os.getpid()}").touch()
-
-
 def double(folder: str, number: int) -> int:
     return 2 * number
 

@@ -42,11 +42,11 @@ def test_man_pages_are_typeset_without_warnings():
 
 
 def test_man_page_names_what_infer_writes():
-    named = " ".join(part for row in FILES for part in row)
+    named = " ".join([*FILES, *FILES.values()])
     assert [name for name in (*OWN_FILES, INDEX) if name not in named] == []
 
 
-@pytest.mark.parametrize("example", [example for example, _ in EXAMPLES])
+@pytest.mark.parametrize("example", EXAMPLES)
 def test_examples_of_the_man_pages_are_valid(example, run, tmp_path, monkeypatch):
     _, command, *args = shlex.split(example)
     typer.main.get_command(app).commands[command].make_context(command, list(args))
@@ -57,7 +57,7 @@ def test_examples_of_the_man_pages_are_valid(example, run, tmp_path, monkeypatch
 
 
 def test_every_command_has_an_example():
-    assert {shlex.split(example)[1] for example, _ in EXAMPLES} == set(COMMANDS)
+    assert {shlex.split(example)[1] for example in EXAMPLES} == set(COMMANDS)
 
 
 def test_help_and_ls_do_not_import_torch(capture):

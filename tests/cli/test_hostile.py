@@ -188,7 +188,6 @@ def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
         raise EOFError
 
     monkeypatch.setattr("splinecli.pipeline.info.describe_capture", fail)
-    monkeypatch.setattr("splinecli.cli.info.describe_capture", fail)
     assert run("info", capture).code == 1
 
 

@@ -16,17 +16,15 @@ import pytest
 import tifffile
 
 from cli.conftest import read_report
-from splinecli import inference
 from splinecli.capture import source
-from splinecli.diagnosis import checks
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.methods.least_squares import LeastSquares
-from splinecli.pipeline import distillation, surface
+from splinecli.pipeline import estimate, infer
 from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
-from splinecli.results import albedo, clock, files
+from splinecli.results import clock, files
 
 
 def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
@@ -245,11 +243,11 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
     monkeypatch.setattr(clock.time, "perf_counter", lambda: now)
     for module, name, seconds in (
         (source.CaptureSource, "read", 1),
-        (checks, "check_capture", 10),
-        (distillation, "distil_for", 100),
-        (inference, "estimate_normals", 1000),
-        (albedo, "albedo_map", 10_000),
-        (surface, "make_surface", 100_000),
+        (infer, "check_capture", 10),
+        (estimate, "distil_for", 100),
+        (estimate, "estimate_normals", 1000),
+        (infer, "albedo_map", 10_000),
+        (infer, "make_surface", 100_000),
         (files, "write_normals", 1_000_000),
     ):
         monkeypatch.setattr(module, name, takes(seconds, getattr(module, name)))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from kills import content
-from splinecli.capture import capture_size
 from splinecli.errors import InputError
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.pipeline.infer import infer_capture
@@ -114,7 +113,9 @@ def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> No
 def test_too_little_memory_for_the_results(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The images fit, the albedo does not. This is said before the normals are estimated."""
     before = content(folder / "out")
-    monkeypatch.setattr(capture_size, "results_bytes", lambda *_, albedo=False, surface=False: 10**15 * albedo)
+    monkeypatch.setattr(
+        "splinecli.pipeline.infer.results_bytes", lambda *_, albedo=False, surface=False: 10**15 * albedo
+    )
     options = InferOptions(method="ls", maps=("albedo",), output=str(folder / "out"))
     monkeypatch.setattr(LeastSquares, "estimate", None)
     with pytest.raises(InputError, match=r"the results of 3600 pixels take 1000000\.0 GB of memory") as caught:

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.errors import OutputError, UsageError
-from splinecli.pictures.error_map import colour_errors, error_map_picture
+from splinecli.errors import OutputError
+from splinecli.pictures.error_map import TOP_DEG, colour_errors, error_map_picture
 from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, preview_picture
 from splinecli.pictures.png import encode_png
 
@@ -52,7 +52,7 @@ WHITE = (255, 255, 255)
 
 def test_known_errors_have_known_colours() -> None:
     errors = np.array([[0, 15, 30, 180, np.nan]], np.float32)
-    colours = colour_errors(errors, 30).astype(int)
+    colours = colour_errors(errors).astype(int)
     wanted = np.array([[VIOLET, TEAL, YELLOW, YELLOW, WHITE]])
     assert np.abs(colours - wanted).max() <= 2  # OpenCV's table is rounded in its own way
     assert (colours[0, 4] == 255).all()
@@ -71,30 +71,23 @@ def test_a_small_map_is_enlarged_pixel_by_pixel() -> None:
 
 def test_a_large_map_keeps_its_pixels() -> None:
     errors = np.random.default_rng(0).uniform(0, 60, (400, 300)).astype(np.float32)
-    picture = error_map_picture(errors, top_deg=45)
+    picture = error_map_picture(errors)
     assert picture.shape[0] == 400
-    np.testing.assert_array_equal(picture[:, :300], colour_errors(errors, 45))
+    np.testing.assert_array_equal(picture[:, :300], colour_errors(errors))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (10, 2000), (2000, 10), (256, 256)])
-@pytest.mark.parametrize("top_deg", [0.05, 7, 30, 180])
-def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int], top_deg: float) -> None:
-    picture = error_map_picture(np.full(shape, np.nan, np.float32), top_deg=top_deg)
+def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int]) -> None:
+    picture = error_map_picture(np.full(shape, np.nan, np.float32))
     assert picture.shape[0] == max(shape[0], 256)
     coloured = np.ptp(picture.astype(int), axis=2) > 0  # the map is white and the text is gray
     rows, columns = np.flatnonzero(coloured.any(axis=1)), np.flatnonzero(coloured.any(axis=0))
     bar = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     assert len(bar) > 200
     assert bar.shape[1] >= 18
-    np.testing.assert_array_equal(bar[:, 0], colour_errors(np.linspace(top_deg, 0, len(bar))[:, None], top_deg)[:, 0])
+    np.testing.assert_array_equal(bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0])
     # Text: black ink right of the bar, and none cut at the picture's edges.
     right = picture[:, columns[-1] + 1 :]
     assert (right < 64).all(axis=2).sum() > 200
     assert (picture[[0, -1]] == 255).all()
     assert (picture[:, -1] == 255).all()
-
-
-@pytest.mark.parametrize("top_deg", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_scale_needs_an_end(top_deg: float) -> None:
-    with pytest.raises(UsageError, match="expected more than 0"):
-        error_map_picture(np.zeros((3, 3), np.float32), top_deg=top_deg)

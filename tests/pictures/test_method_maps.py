@@ -38,7 +38,7 @@ TILTED = (218, 128, 218)  # of (1, 0, 1) / sqrt 2
 
 
 def error_colour(error_deg: float) -> tuple[int, ...]:
-    return tuple(int(value) for value in colour_errors(np.array([[error_deg]]), TOP_DEG)[0, 0])
+    return tuple(int(value) for value in colour_errors(np.array([[error_deg]]))[0, 0])
 
 
 @pytest.mark.parametrize("n_methods", [1, 2, 9])

@@ -5,6 +5,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,7 +51,7 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Work]
     (tmp_path / "probe").touch()
 
     def make(do: Callable[..., Any]) -> Work:
-        return Work.of_this_process(str(tmp_path), worker_tasks.get_ready, do, tmp_path / "probe")
+        return Work(partial(do, str(tmp_path)), str(tmp_path / "probe"))
 
     return make
 
@@ -234,9 +235,8 @@ def test_no_scheduler(address, tmp_path, monkeypatch):
 def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
     """The command sees the folder, so it is not missing for it."""
     monkeypatch.chdir(tmp_path)
-    settings = batch._Settings(InferOptions(method="ls"), "nothing", None)
     member = Member(tmp_path / "unseen", "unseen")
-    outcome, _ = client.submit(batch._infer, settings, 0, member, pure=False).result()
+    outcome, _ = client.submit(batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False).result()
     expected = rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
 
@@ -289,7 +289,7 @@ def test_the_number_of_workers(tmp_path, monkeypatch):
     options = InferOptions(method="ls")
     assert 0 < expected_bytes(members[0], options) < 10**6
     assert expected_bytes(members[1], options) == 0
-    monkeypatch.setattr("splinecli.system.devices.count_available_cores", lambda: 4)
-    monkeypatch.setattr("splinecli.system.memory.available_memory", lambda: 1.7e9)
+    monkeypatch.setattr("splinecli.pipeline.capture_memory.count_available_cores", lambda: 4)
+    monkeypatch.setattr("splinecli.pipeline.capture_memory.available_memory", lambda: 1.7e9)
     assert choose_workers(members, options) == 3
     assert choose_workers(members[:2], options) == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -42,23 +41,15 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _splinecli(
     version: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     pass
 
 
-def _add(command: Callable[..., object]) -> None:
-    """Add a command whose paths are checked by the pipeline alone.
-
-    By default, Typer refuses a path without permission. One such capture would then end a batch.
-    """
-    for parameter in inspect.signature(command).parameters.values():
-        if isinstance(parameter.default, ParameterInfo):
-            parameter.default.readable = False
-    app.command(cls=Command)(command)
-
-
 for _command in (infer, watch, info, calibrate, integrate, evaluate, prepare, train, import_weights):
-    _add(_command)
+    # By default, Typer refuses a path without permission. One such capture would then end a batch.
+    for _parameter in inspect.signature(_command).parameters.values():
+        if isinstance(_parameter.default, ParameterInfo):
+            _parameter.default.readable = False
+    app.command(cls=Command)(_command)

@@ -4,27 +4,47 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from typer import Argument, Option
+
+from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.options import inputs, outputs
-from splinecli.cli.options.values import parse_circle
-from splinecli.cli.records import record_from
-from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
+from splinecli.cli.values import complete_curves, parse_circle, record_from
 
 
 def calibrate(
-    balls: list[Path] = inputs.BALLS,
-    circle: list[str] | None = inputs.CIRCLES,
-    mask: list[Path] | None = inputs.BALL_MASKS,
-    ball_diameter: float | None = inputs.BALL_DIAMETER,
-    camera_matrix: Path | None = inputs.BALL_CAMERA_MATRIX,
-    gray_ball: Path | None = inputs.GRAY_BALL,
-    gray_card: Path | None = inputs.GRAY_CARD,
-    transfer: str = inputs.GRAY_TRANSFER,
-    compare: Path | None = outputs.COMPARE,
-    output: Path = outputs.CALIBRATION_FOLDER,
-    overwrite: bool = outputs.OVERWRITE,
-    as_json: bool = outputs.JSON,
-    quiet: bool = outputs.QUIET,
+    balls: list[Path] = Argument(..., metavar="BALL", help="Folders of images of one mirror ball each."),
+    circle: list[str] | None = Option(
+        None, metavar="X,Y,R", help="Outline of the ball in pixels, y down. May be repeated, once for each BALL."
+    ),
+    mask: list[Path] | None = Option(
+        None, metavar="FILE", help=f"{shared.MASK_IMAGE.format('ball')} May be repeated, once for each BALL."
+    ),
+    ball_diameter: float | None = Option(
+        None,
+        metavar="D",
+        help="Diameter of each ball in any unit, such as millimeters: the unit of the lamps' positions."
+        " [default: pixels]",
+    ),
+    camera_matrix: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Text file of the 3 x 3 camera matrix in pixels. [default: focal length from EXIF, or a distant camera]",
+    ),
+    gray_ball: Path | None = Option(None, metavar="DIR", help="Images of a matte gray ball under the same lights."),
+    gray_card: Path | None = Option(None, metavar="DIR", help="Images of a matte gray card that faces the camera."),
+    transfer: str = Option(
+        "auto",
+        metavar="CURVE",
+        help="Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
+        autocompletion=complete_curves,
+    ),
+    compare: Path | None = Option(
+        None, metavar="FILE", help="Compare the result with the light directions in a text file."
+    ),
+    output: Path = Option(Path("calibration"), "--output", "-o", metavar="OUT", help="Folder of the results."),
+    overwrite: bool = shared.OVERWRITE,
+    as_json: bool = shared.JSON,
+    quiet: bool = shared.QUIET,
 ) -> None:
     """Measure light directions from images of mirror balls.
 
@@ -37,11 +57,12 @@ def calibrate(
     With two balls or more, or one ball at two places, lamps that are near and a known camera, it also writes
     light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
     """
+    given = locals()
+
+    from splinecli.pipeline.calibrate import DIRECTIONS, CalibrateOptions, calibrate_lights
+
     options = record_from(
-        CalibrateOptions,
-        locals(),
-        circles=tuple(parse_circle(text) for text in circle or ()),
-        masks=tuple(mask or ()),
+        CalibrateOptions, given, circles=tuple(parse_circle(text) for text in circle or ()), masks=tuple(mask or ())
     )
     report = calibrate_lights(options, Messages(quiet=quiet))
     print_report(report, str(output / DIRECTIONS), as_json=as_json, quiet=quiet)

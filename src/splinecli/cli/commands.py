@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable
+import textwrap
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -13,19 +13,16 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from splinecli.cli.choices import fill_in
-from splinecli.cli.failures import ParserError, batch_error_document, print_error_document
+from splinecli.cli.documents import error_document, printed_documents
+from splinecli.cli.failures import ParserError
 from splinecli.cli.panels import sort_into_panels
 from splinecli.system.memory import check_address_space, keep_freed_memory
 
-TERM_WIDTH = 30
-"""Columns of the names of options in the help; a longer name has a line of its own."""
-
+TERM_WIDTH = 30  # columns of the names of options in the help; a longer name has a line of its own
+HINT_WIDTH = 72  # columns of the help that a shell shows beside an option; Typer breaks it at 80
 ARGUMENTS = "Arguments"
 
-INFER = "infer"
-"""The command whose JSON is a list of documents."""
-
+INFER = "infer"  # the command whose JSON is a list of documents
 JSON, JSON_LINES = "--json", "--jsonl"
 
 _RANGE = r"(?:[-\d.]+<=?)?x(?:[<>]=?[-\d.]+)?"
@@ -39,17 +36,17 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error of the parser gets the context, which names the command in the message."""
-        wants_json = JSON in args and any(JSON in parameter.opts for parameter in self.params)
-        wants_lines = JSON_LINES in args and ctx.info_name == INFER
+        wants_json, wants_lines = JSON in args, JSON_LINES in args  # the parser takes them out of the list
         try:
             return super().parse_args(ctx, args)
-        except Exception as error:
+        except ParserError as error:
             if getattr(error, "ctx", self) is None:
                 error.ctx = ctx  # type: ignore[attr-defined]
-            if wants_json and isinstance(error, ParserError):
-                print_error_document(error, as_list=ctx.info_name == INFER)
-            elif wants_lines and isinstance(error, ParserError):
-                print(json.dumps(batch_error_document(error)))
+            if ctx.info_name == INFER:
+                with printed_documents(as_list=wants_json, as_lines=wants_lines and not wants_json):
+                    raise
+            if wants_json and any(JSON in parameter.opts for parameter in self.params):
+                print(json.dumps(error_document(error), indent=2))
             raise
 
     def invoke(self, ctx: Any) -> Any:
@@ -58,12 +55,22 @@ class Command(TyperCommand):
         try:
             check_address_space()
             keep_freed_memory()
-            return _without_end_of_file(super().invoke, ctx)
+            try:
+                return super().invoke(ctx)
+            except EOFError as error:  # click takes it for an interruption by the user
+                raise RuntimeError("unexpected end of a file") from error
         except Exception as error:
             # infer prints its list itself, with what it has done until then.
             if ctx.params.get("as_json") and ctx.info_name != INFER and not isinstance(error, typer.Exit | typer.Abort):
-                print_error_document(error, as_list=False)
+                print(json.dumps(error_document(error), indent=2))
             raise
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Return what a word may become, each with a line of help: shells take a second line for another word."""
+        items = super().shell_complete(ctx, incomplete)
+        for item in items:
+            item.help = textwrap.shorten(item.help or "", HINT_WIDTH, placeholder=" ...")
+        return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line, without the braces that Typer sets about arguments."""
@@ -77,14 +84,6 @@ class Command(TyperCommand):
             with formatter.section(title):
                 # All panels have their texts in one column.
                 formatter.write_dl([(term.ljust(longest), meaning) for term, meaning in rows], TERM_WIDTH)
-
-
-def _without_end_of_file(invoke: Callable[[Any], Any], ctx: Any) -> Any:
-    """Call `invoke(ctx)`. An EOFError becomes a defect, because click takes it for an interruption by the user."""
-    try:
-        return invoke(ctx)
-    except EOFError as error:
-        raise RuntimeError("unexpected end of a file") from error
 
 
 class Group(TyperGroup):
@@ -118,8 +117,7 @@ def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def _tidy(meaning: str) -> str:
-    """Return a help text with names filled in, and without the ranges of numbers that click adds ("[x>=1]")."""
-    meaning = fill_in(meaning)
+    """Return a help text without the ranges of numbers that click adds ("[x>=1]")."""
     meaning = re.sub(rf"\s*\[{_RANGE}\]$", "", meaning)
     return " ".join(re.sub(rf"; {_RANGE}\]$", "]", meaning).split())
 

@@ -12,8 +12,7 @@ from typing import Any
 from splinecli.errors import printable
 from splinecli.pipeline.observer import Advance, Observer
 
-LINE_SECONDS = 30.0
-"""Seconds between two lines of progress where stderr is not a terminal."""
+LINE_SECONDS = 30.0  # seconds between two lines of progress where stderr is not a terminal
 
 
 def print_report(report: dict[str, Any], *lines: str, as_json: bool, quiet: bool) -> None:

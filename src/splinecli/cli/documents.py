@@ -1,56 +1,44 @@
-"""The documents of `infer` on stdout: one for each capture, as soon as the capture ends."""
+"""The JSON documents of commands on stdout."""
 
 from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from splinecli.cli.failures import batch_error_document
+from splinecli.cli.failures import explain
 
 
-class Documents:
-    """Receives documents and prints none of them."""
-
-    def add(self, document: dict[str, Any]) -> None:
-        """Receive a document."""
-
-    def end(self) -> None:
-        """Receive no further documents."""
-
-
-class JsonLines(Documents):
-    """Prints each document in one line."""
-
-    def add(self, document: dict[str, Any]) -> None:
-        print(json.dumps(document), flush=True)
-
-
-class JsonList(Documents):
-    """Prints the documents as the items of one list."""
-
-    def __init__(self) -> None:
-        self._is_empty = True
-
-    def add(self, document: dict[str, Any]) -> None:
-        item = textwrap.indent(json.dumps(document, indent=2), "  ")
-        print("[\n" if self._is_empty else ",\n", item, sep="", end="", flush=True)
-        self._is_empty = False
-
-    def end(self) -> None:
-        print("[]" if self._is_empty else "\n]")
+def error_document(error: Exception) -> dict[str, Any]:
+    """Return {"error", "exit_code"}, which stand in place of a report."""
+    message, exit_code = explain(error)
+    return {"error": message, "exit_code": exit_code}
 
 
 @contextmanager
-def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Documents]:
-    """Yield the printer of documents. The last document is that of an error that ends the command."""
-    documents = JsonLines() if as_lines else JsonList() if as_list else Documents()
+def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Yield a function that prints a document of `infer`, which has one for each capture, as soon as that ends.
+
+    Each is a line, or an item of one list. The last is that of an error that ends the command.
+    """
+    is_empty = True
+
+    def add(document: dict[str, Any]) -> None:
+        nonlocal is_empty
+        if as_lines:
+            print(json.dumps(document), flush=True)
+        elif as_list:
+            item = textwrap.indent(json.dumps(document, indent=2), "  ")
+            print("[\n" if is_empty else ",\n", item, sep="", end="", flush=True)
+        is_empty = False
+
     try:
-        yield documents
+        yield add
     except Exception as error:
-        documents.add(batch_error_document(error))
+        add({"capture": None, **error_document(error)})
         raise
     finally:
-        documents.end()
+        if as_list and not as_lines:
+            print("[]" if is_empty else "\n]")

@@ -6,52 +6,104 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from typer import Argument, Option
+
+from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.options import computing, distribution, inputs, outputs
-from splinecli.cli.options.values import (
+from splinecli.cli.values import (
     Device,
     Precision,
+    listed,
     parse_cluster,
     parse_light_count,
     parse_pixel,
     parse_skip,
+    record_from,
 )
-from splinecli.cli.records import record_from
 from splinecli.errors import InputError
+from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
 
 if TYPE_CHECKING:
     from splinecli.evaluation.outcome import Evaluation
-    from splinecli.pipeline.evaluate import EvaluateOutcome
 
 
 def evaluate(
-    datasets: list[Path] = inputs.DATASETS,
-    method: list[str] | None = computing.METHODS,
-    weights: str | None = computing.WEIGHTS,
-    n_lights: list[str] | None = inputs.NUMBERS_OF_LIGHTS,
-    trials: int | None = inputs.TRIALS,
-    seed: int = inputs.SEED,
-    draws: Path | None = inputs.DRAWS,
-    light_noise_deg: list[float] | None = inputs.LIGHT_NOISE,
-    lights: str | None = inputs.ESTIMATED_LIGHTS,
-    refine_lights: bool = inputs.REFINE_LIGHTS,
-    light_error_deg: float | None = inputs.LIGHT_ERROR,
-    as_stored: bool = inputs.AS_STORED,
-    white_level: float | None = inputs.WHITE_LEVEL,
-    max_pixels: int | None = inputs.MAX_PIXELS,
-    skip_first: list[str] | None = inputs.SKIP_FIRST,
-    rotations: int | None = computing.ROTATIONS,
-    device: Device = computing.DEVICE,
-    precision: Precision = computing.PRECISION,
-    jobs: int | None = computing.JOBS,
-    workers: str = distribution.TRIAL_WORKERS,
-    cluster: str | None = distribution.TRIAL_CLUSTER,
-    figures: bool = outputs.FIGURES,
-    pixel: list[str] | None = outputs.FIGURE_PIXELS,
-    output: Path = outputs.EVALUATION_FOLDER,
-    overwrite: bool = outputs.OVERWRITE_TRIALS,
-    as_json: bool = outputs.JSON,
-    quiet: bool = outputs.QUIET,
+    datasets: list[Path] = Argument(
+        ..., metavar="DATASET", help="Folders of captures with ground truth, or the captures themselves."
+    ),
+    method: list[str] | None = Option(
+        None,
+        metavar="M",
+        help=f"Method to score: all, {listed(method_names())}. May be repeated. [default: spline-net]",
+        autocompletion=lambda: [*method_names(), "all"],
+    ),
+    weights: str | None = shared.WEIGHTS,
+    n_lights: list[str] | None = Option(
+        None, metavar="K|all", help="Number of lights in each draw. May be repeated. [default: 10]"
+    ),
+    trials: int | None = Option(None, metavar="T", min=1, help="Number of random draws. [default: 100]"),
+    seed: int = shared.SEED,
+    draws: Path | None = Option(
+        None, metavar="FILE", help="Draws of lights: each line has light indices, counted from 0."
+    ),
+    light_noise_deg: list[float] | None = Option(
+        None,
+        metavar="SIGMA",
+        min=0,
+        help="Tilt the lights at random, with this standard deviation in degrees. May be repeated. [default: 0]",
+    ),
+    lights: str | None = Option(
+        None,
+        metavar="estimate",
+        help="Estimate the lights of each draw from its images, and score them, too."
+        " [default: the captures' light files]",
+    ),
+    refine_lights: bool = shared.REFINE_LIGHTS,
+    light_error_deg: float | None = Option(
+        None, metavar="SIGMA", help="With --refine-lights: usual error of the directions in degrees. [default: 5]"
+    ),
+    as_stored: bool = shared.AS_STORED,
+    white_level: float | None = shared.WHITE_LEVEL,
+    max_pixels: int | None = Option(
+        None, metavar="N", min=1, help="Score N random pixels of each capture. [default: all]"
+    ),
+    skip_first: list[str] | None = Option(
+        None,
+        metavar="[CAPTURE=]N",
+        help="Leave out the first N images of one capture, or of all. May be repeated. [default: 0]",
+    ),
+    rotations: int | None = Option(
+        None,
+        metavar="R",
+        min=1,
+        help="Average the network's result over R views of each pixel: its lights rotated, for spline-net also"
+        " mirrored. [default: 1; cnn-ps: 10]",
+    ),
+    device: Device = shared.DEVICE,
+    precision: Precision = shared.PRECISION,
+    jobs: int | None = Option(
+        None, metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]"
+    ),
+    workers: str = Option(
+        "1",
+        metavar="N|auto",
+        help="Score trials in N processes of this machine, in place of --jobs threads (needs the extra 'cluster')."
+        " auto is the number of cores.",
+    ),
+    cluster: str | None = Option(
+        None,
+        metavar="ADDRESS|FILE",
+        help="Score trials on the workers of a running Dask cluster: the address of its scheduler, or its scheduler"
+        " file (needs the extra 'cluster').",
+    ),
+    figures: bool = Option(False, "--figures", help="Draw every method's maps for the first draw of each capture."),
+    pixel: list[str] | None = Option(
+        None, metavar="ROW,COLUMN", help="With --figures: show the observation maps of this pixel. May be repeated."
+    ),
+    output: Path = Option(Path("evaluation"), "--output", "-o", metavar="OUT", help="Folder of the results."),
+    overwrite: bool = Option(False, "--overwrite", help="Compute all trials again, also those stored in OUT."),
+    as_json: bool = shared.JSON,
+    quiet: bool = shared.QUIET,
 ) -> int:
     """Compare methods by their mean angular error over random draws of K lights.
 
@@ -63,7 +115,6 @@ def evaluate(
     """
     given = locals()
 
-    from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
     from splinecli.pipeline.evaluate import EvaluateOptions, evaluate_captures
 
     options = record_from(
@@ -72,7 +123,7 @@ def evaluate(
         methods=tuple(
             name for text in method or [DEFAULT_METHOD] for name in (method_names() if text == "all" else [text])
         ),
-        method_options=MethodOptions(weights, rotations, device=device.value, precision=precision.value),
+        method_options=record_from(MethodOptions, given),
         n_lights=tuple(parse_light_count(text) for text in n_lights or []),
         light_noise_deg=tuple(light_noise_deg or [0.0]),
         skip_first=dict(parse_skip(text) for text in skip_first or []),
@@ -81,17 +132,6 @@ def evaluate(
     )
     talk = Messages(quiet=quiet)
     outcome = evaluate_captures(datasets, options, talk)
-    _report(outcome, talk)
-    if as_json:
-        print(json.dumps(outcome.document, indent=2))
-    elif not quiet:
-        for evaluation in outcome.evaluations:
-            _print_table(evaluation)
-    return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
-
-
-def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
-    """Print what went wrong, warnings and notes on stderr."""
     for entry in outcome.document["skipped"]:
         talk.error(f"{entry['capture']} was skipped: {entry['reason']}")
     for problem in outcome.figure_problems:
@@ -100,6 +140,12 @@ def _report(outcome: EvaluateOutcome, talk: Messages) -> None:
         talk.warn(warning)
     for note in outcome.document["notes"]:
         talk.say(f"splinecli: note: {note}")
+    if as_json:
+        print(json.dumps(outcome.document, indent=2))
+    elif not quiet:
+        for evaluation in outcome.evaluations:
+            _print_table(evaluation)
+    return InputError.exit_code if outcome.document["skipped"] or outcome.figure_problems else 0
 
 
 def _print_table(evaluation: Evaluation) -> None:

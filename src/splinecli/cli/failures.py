@@ -1,21 +1,36 @@
-"""Errors as one message, an exit code, and the JSON document that stands in place of a report."""
+"""Errors as one message and an exit code.
+
+Typer and click name the errors of their parser, such as an unknown option or a word in place of a number, differently
+from version to version. Only attributes of these errors are relied on. One without a known attribute keeps its text.
+"""
 
 from __future__ import annotations
 
-import json
+import re
 from typing import Any
 
 import typer
 
-from splinecli.cli.usage_errors import usage_message
+from splinecli.capture.record import MIN_LIGHTS
+from splinecli.cli.values import listed
 from splinecli.errors import OutputError, SplinecliError
 from splinecli.system.memory import is_out_of_memory
 
 USAGE = 2
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
-ParserError: type[Exception] = typer.BadParameter.__mro__[1]
-"""What the parser raises for arguments that it cannot use."""
+ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for arguments that it cannot use
+_NUMBERS = {"int": "a whole number", "float": "a number"}
+_LIMITS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
+_SYNTAX = (
+    (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
+    (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
+    (r"^Missing argument '(.+)'\.?$", r"\1 is missing"),
+    (r"^Missing option '([^']+)'.*$", r"\1 is missing"),
+    (r"^Missing command\.?$", "a command is missing"),
+    (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
+)
+"""Click's texts as regular expressions, and the words that replace them."""
 
 
 def explain(error: Exception) -> tuple[str, int]:
@@ -23,7 +38,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, SplinecliError):
         return str(error), error.exit_code
     if isinstance(error, ParserError):
-        return usage_message(error), USAGE
+        return _usage_message(error), USAGE
     if is_out_of_memory(error):
         return NO_MEMORY, SplinecliError.exit_code
     if isinstance(error, OSError):
@@ -37,17 +52,60 @@ def is_defect(error: Exception) -> bool:
     return not isinstance(error, SplinecliError | ParserError | OSError) and not is_out_of_memory(error)
 
 
-def error_document(error: Exception) -> dict[str, Any]:
-    """Return {"error", "exit_code"}."""
-    message, exit_code = explain(error)
-    return {"error": message, "exit_code": exit_code}
+def _usage_message(error: Any) -> str:
+    """Return the message for a usage error of click: what was found, what was expected, and where help is."""
+    context = getattr(error, "ctx", None)
+    where = context.command_path if context else "splinecli"
+    text = _bad_value(error) or _unknown_name(error) or _syntax(error.format_message())
+    end = "" if text.endswith("?") else "."
+    return f"{text.rstrip('.')}{end} See '{where} --help'."
 
 
-def batch_error_document(error: Exception) -> dict[str, Any]:
-    """Return {"capture", "error", "exit_code"} for an error that ends infer's batch; it is no capture's."""
-    return {"capture": None, **error_document(error)}
+def _bad_value(error: Any) -> str | None:
+    details = getattr(error.__cause__, "errors", None)
+    parameter = getattr(error, "param", None)
+    if not callable(details) or not parameter:
+        return None
+    detail = details()[0]
+    option, value, limits = max(parameter.opts, key=len), detail["input"], detail.get("ctx", {})
+    kind = detail["type"].removesuffix("_parsing")
+    if kind in _NUMBERS:
+        return f"{option} is {value!r}; expected {_NUMBERS[kind]}{_range(parameter)}"
+    for limit, words in _LIMITS.items():
+        if limit in limits:
+            return f"{option} is {value}; expected {words} {limits[limit]:g}"
+    choices = re.search(r" is not one of (.+)$", detail["msg"])
+    if choices:
+        return f"{option} is {value!r}; expected one of {choices[1].replace(chr(39), '')}"
+    return None
 
 
-def print_error_document(error: Exception, *, as_list: bool) -> None:
-    """Print on stdout the document of an error that ends a command; the list of infer's documents with `as_list`."""
-    print(json.dumps([batch_error_document(error)] if as_list else error_document(error), indent=2))
+def _range(parameter: Any) -> str:
+    """Return the range of an option in words: " from 1", " from 0 to 1" or ""."""
+    smallest, largest = getattr(parameter, "min", None), getattr(parameter, "max", None)
+    if smallest is None and parameter.name == "n_lights":
+        # The number of lights is checked with the other values of infer, so that --json reports it.
+        smallest = MIN_LIGHTS
+    words = "" if smallest is None else f" from {smallest:g}"
+    return words if largest is None else f"{words} to {largest:.10g}"
+
+
+def _unknown_name(error: Any) -> str | None:
+    text = error.format_message()
+    option = getattr(error, "option_name", None)
+    if option and hasattr(error, "possibilities"):
+        return f"no option {option}.{_suggestion(sorted(error.possibilities or ()))}"
+    command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)
+    if command:
+        return f"no command {command[1]}.{_suggestion((command[2] or '').strip('?').split(', '))}"
+    return None
+
+
+def _syntax(text: str) -> str:
+    for pattern, words in _SYNTAX:
+        text = re.sub(pattern, words, text)
+    return text
+
+
+def _suggestion(names: list[str]) -> str:
+    return f" Did you mean {listed(names)}?" if any(names) else ""

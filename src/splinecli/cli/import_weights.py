@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splinecli.cli.options import outputs, training
+from typer import Argument, Option
+
+from splinecli.cli import shared
 from splinecli.errors import OutputError, printable
 
 
 def import_weights(
-    li_net: Path = training.OFFICIAL_LI_NET,
-    ne_net: Path = training.OFFICIAL_NE_NET,
-    output: Path = outputs.WEIGHT_FILE,
-    overwrite: bool = outputs.OVERWRITE_FILE,
-    quiet: bool = outputs.QUIET,
+    li_net: Path = Argument(..., metavar="G.ckpt", help="The authors' LI-Net, which they call the generator."),
+    ne_net: Path = Argument(..., metavar="D.ckpt", help="The authors' NE-Net, which they call the discriminator."),
+    output: Path = Option(..., "--output", "-o", metavar="FILE.safetensors", help="The weight file to write."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace an existing file."),
+    quiet: bool = shared.QUIET,
 ) -> None:
     """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
 

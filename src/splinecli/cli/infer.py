@@ -3,89 +3,132 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from splinecli.cli import choices
+from typer import Argument, Option
+
+from splinecli.capture.capture_warnings import PROBABLY_WRONG
+from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
-from splinecli.cli.documents import Documents, printed_documents
-from splinecli.cli.options import computing, distribution, inputs, outputs
-from splinecli.cli.options.values import (
+from splinecli.cli.documents import printed_documents
+from splinecli.cli.values import (
     Device,
     FirstLight,
     LightForm,
     NormalConvention,
     Precision,
+    complete_list,
+    listed,
     parse_cluster,
     parse_indices,
+    record_from,
     split_commas,
 )
-from splinecli.cli.records import record_from
 from splinecli.errors import UsageError, printable
+from splinecli.methods import method_names
+from splinecli.results.files import MAPS, NORMALS
+from splinecli.results.index import HEADER, INDEX, Row, row_of
 
 if TYPE_CHECKING:
     from splinecli.pipeline.member import Outcome, Redo
-    from splinecli.results.index import Row
 
-
-_WORDS = {
-    "done": "done",
-    "skipped": "already done",
-    "changed": "changed but kept",
-    "missing": "missing",
-    "failed": "failed",
-}
-"""How the last line counts the outcomes."""
+_WORDS = {"skipped": "already done", "changed": "changed but kept"}  # of the last line, for these outcomes
 
 
 def infer(
-    captures: list[Path] = inputs.CAPTURES,
-    lights: Path | None = inputs.LIGHTS,
-    first_light: FirstLight | None = inputs.FIRST_LIGHT,
-    intensities: Path | None = inputs.INTENSITIES,
-    refine_lights: bool = inputs.REFINE_LIGHTS,
-    light_positions: Path | None = inputs.LIGHT_POSITIONS,
-    light_distance: float | None = inputs.LIGHT_DISTANCE,
-    pixel_size: float | None = inputs.PIXEL_SIZE_OF_SURFACE,
-    object_width: float | None = inputs.OBJECT_WIDTH,
-    camera_matrix: Path | None = inputs.LAMP_CAMERA_MATRIX,
-    mask: Path | None = inputs.MASK,
-    auto_mask: bool = inputs.AUTO_MASK,
-    crop: str | None = inputs.CROP,
-    scale: str | None = inputs.SCALE,
-    ground_truth: Path | None = inputs.GROUND_TRUTH,
-    transfer: str = inputs.TRANSFER,
-    ambient: Path | None = inputs.AMBIENT,
-    flat_field: Path | None = inputs.FLAT_FIELD,
-    white_level: float | None = inputs.WHITE_LEVEL,
-    light_frame: str | None = inputs.LIGHT_FRAME,
-    lights_format: LightForm = inputs.LIGHTS_FORMAT,
-    as_stored: bool = inputs.AS_STORED,
-    output: Path = outputs.INFER_FOLDER,
-    method: str = computing.METHOD,
-    weights: str | None = computing.WEIGHTS,
-    n_lights: int | None = inputs.NUMBER_OF_LIGHTS,
-    seed: int = inputs.SEED,
-    light_indices: str | None = inputs.LIGHT_INDICES,
-    distil: bool | None = computing.DISTIL,
-    device: Device = computing.DEVICE,
-    precision: Precision = computing.PRECISION,
-    formats: str = outputs.NORMAL_FORMATS,
-    maps: str | None = outputs.MAPS,
-    html: bool = outputs.HTML,
-    surface: bool = outputs.SURFACE,
-    stiffness: float = computing.STIFFNESS,
-    convention: NormalConvention = outputs.CONVENTION,
-    overwrite: bool = outputs.OVERWRITE,
-    update: bool = outputs.UPDATE,
-    strict: bool = outputs.STRICT,
-    workers: str = distribution.WORKERS,
-    cluster: str | None = distribution.CLUSTER,
-    shard: str | None = distribution.SHARD,
-    as_json: bool = outputs.JSON_LIST,
-    as_json_lines: bool = outputs.JSON_LINES,
-    quiet: bool = outputs.QUIET,
+    captures: list[Path] = Argument(
+        ..., metavar="CAPTURE", help="Folders with the images of one object each, or films."
+    ),
+    lights: Path | None = shared.LIGHTS,
+    first_light: FirstLight | None = shared.FIRST_LIGHT,
+    intensities: Path | None = shared.INTENSITIES,
+    refine_lights: bool = shared.REFINE_LIGHTS,
+    light_positions: Path | None = shared.LIGHT_POSITIONS,
+    light_distance: float | None = shared.LIGHT_DISTANCE,
+    pixel_size: float | None = Option(
+        None, metavar="S", help=f"{shared.PIXEL_SIZE} With --surface: in millimetres, for a surface in millimetres."
+    ),
+    object_width: float | None = shared.OBJECT_WIDTH,
+    camera_matrix: Path | None = shared.CAMERA_MATRIX,
+    mask: Path | None = shared.MASK,
+    auto_mask: bool = Option(
+        False, "--auto-mask", help="If there is no mask, find the object in the images and write found_mask.png."
+    ),
+    crop: str | None = shared.CROP,
+    scale: str | None = shared.SCALE,
+    ground_truth: Path | None = shared.GROUND_TRUTH,
+    transfer: str = shared.TRANSFER,
+    ambient: Path | None = shared.AMBIENT,
+    flat_field: Path | None = shared.FLAT_FIELD,
+    white_level: float | None = shared.WHITE_LEVEL,
+    light_frame: str | None = shared.LIGHT_FRAME,
+    lights_format: LightForm = shared.LIGHTS_FORMAT,
+    as_stored: bool = shared.AS_STORED,
+    output: Path = Option(Path("out"), "--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/."),
+    method: str = Option(
+        "spline-net", metavar="METHOD", help=f"Method to use: {listed(method_names())}.", autocompletion=method_names
+    ),
+    weights: str | None = shared.WEIGHTS,
+    n_lights: int | None = Option(None, metavar="K", help="Use K lights drawn at random. [default: all]"),
+    seed: int = shared.SEED,
+    light_indices: str | None = Option(
+        None, metavar="I,J,...", help="Use these lights, counted from 0. Plots and warnings count from 1."
+    ),
+    distil: bool | None = Option(
+        None,
+        "--distil/--exact",
+        help="Let a small network learn the method on a sample of the pixels and estimate the rest, or use the method"
+        " on every pixel. [default: the faster one from 100,000 pixels, else --exact]",
+    ),
+    device: Device = shared.DEVICE,
+    precision: Precision = shared.PRECISION,
+    formats: str = Option(
+        "png,npy",
+        "--format",
+        metavar="LIST",
+        help=f"Files of the normal map: any of {listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are"
+        " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.",
+        autocompletion=complete_list(NORMALS),
+    ),
+    maps: str | None = Option(
+        None,
+        metavar="LIST",
+        help=f"Further maps to write: any of {listed(MAPS)}. preview is a shaded image.",
+        autocompletion=complete_list(MAPS),
+    ),
+    html: bool = Option(
+        False, "--html", help="Also write page.html: the maps, and a view of the surface under a light that you move."
+    ),
+    surface: bool = Option(
+        False, "--surface", help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
+    ),
+    stiffness: float = shared.STIFFNESS,
+    convention: NormalConvention = Option(
+        NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
+    ),
+    overwrite: bool = shared.OVERWRITE,
+    update: bool = shared.UPDATE,
+    strict: bool = shared.STRICT,
+    workers: str = Option(
+        "1",
+        metavar="N|auto",
+        help="Compute N captures side by side, in processes of this machine (needs the extra 'cluster'). auto chooses"
+        " by cores and memory.",
+    ),
+    cluster: str | None = Option(
+        None,
+        metavar="ADDRESS|FILE",
+        help="Compute on the workers of a running Dask cluster: the address of its scheduler, or its scheduler file"
+        " (needs the extra 'cluster').",
+    ),
+    shard: str | None = Option(None, metavar="I/N", help="Process shard I of N: captures I, I+N, I+2N, ..."),
+    as_json: bool = Option(False, "--json", help="Print a JSON list of the reports on stdout, and nothing else."),
+    as_json_lines: bool = Option(
+        False, "--jsonl", help="Print each report as one line of JSON on stdout when its capture ends."
+    ),
+    quiet: bool = shared.QUIET,
 ) -> int:
     """Estimate the normal map of each CAPTURE.
 
@@ -104,7 +147,7 @@ def infer(
     from splinecli.pipeline.capture_list import Shard
     from splinecli.pipeline.infer_options import InferOptions
 
-    with printed_documents(as_list=as_json, as_lines=as_json_lines) as documents:
+    with printed_documents(as_list=as_json, as_lines=as_json_lines) as document:
         if as_json and as_json_lines:
             raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
         if overwrite and update:
@@ -113,9 +156,9 @@ def infer(
             InferOptions,
             given,
             seed=seed if n_lights is not None else 0,
-            light_indices=None if light_indices is None else _indices(light_indices),
-            formats=tuple(split_commas(formats, "--format", choices.normal_formats())),
-            maps=() if maps is None else tuple(split_commas(maps, "--maps", choices.maps())),
+            light_indices=None if light_indices is None else parse_indices(light_indices, "--light-indices"),
+            formats=split_commas(formats, "--format", NORMALS),
+            maps=() if maps is None else split_commas(maps, "--maps", MAPS),
         )
         messages = Messages(quiet=quiet)
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"
@@ -127,38 +170,37 @@ def infer(
             shard=None if shard is None else Shard.parse(shard),
             cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
         )
-        return _show_all(batch, output, messages, documents, summaries=not (quiet or as_json or as_json_lines))
+        return _show_all(batch, output, messages, document, summaries=not (quiet or as_json or as_json_lines))
 
 
 def _show_all(
     outcomes: Iterable[Outcome],
     output: Path,
     messages: Messages,
-    documents: Documents,
+    document: Callable[[dict[str, Any]], None],
     *,
     summaries: bool,
 ) -> int:
-    """Print what becomes of each capture, and return the exit code."""
     from splinecli.pipeline.batch import worst_exit_code
-    from splinecli.results.index import row_of
+    from splinecli.pipeline.member import Status
 
     statuses: Counter[str] = Counter()
     codes: set[int] = set()
     rows: list[Row] = []
     for outcome in outcomes:
-        documents.add(outcome.report)
+        document(outcome.report)
         _show(outcome, output, messages, with_summary=summaries)
         statuses[outcome.status] += 1
         codes.add(outcome.exit_code)
         if outcome.status in ("done", "skipped"):
             rows.append(row_of(outcome.report))
     if statuses.total() > 1:
-        _show_table(rows, statuses, output, messages)
+        if rows:
+            columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
+            messages.table(list(zip(*columns, strict=True)))
+        text = ", ".join(f"{statuses[name]} {_WORDS.get(name, name)}" for name in get_args(Status) if statuses[name])
+        messages.say(f"{statuses.total()} captures: {text}; see {output / INDEX}")
     return worst_exit_code(codes)
-
-
-def _indices(text: str) -> tuple[int, ...]:
-    return tuple(parse_indices(text, "--light-indices"))
 
 
 def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: bool) -> None:
@@ -174,19 +216,7 @@ def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: b
         messages.error(outcome.report["error"])
 
 
-def _show_table(rows: Sequence[Row], statuses: Mapping[str, int], output: Path, messages: Messages) -> None:
-    from splinecli.results.index import HEADER, INDEX
-
-    if rows:
-        columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
-        messages.table(list(zip(*columns, strict=True)))
-    text = ", ".join(f"{statuses[status]} {words}" for status, words in _WORDS.items() if statuses[status])
-    messages.say(f"{sum(statuses.values())} captures: {text}; see {output / INDEX}")
-
-
 def _summary(report: dict[str, Any], output: Path) -> str:
-    from splinecli.capture.capture_warnings import PROBABLY_WRONG
-
     errors, expected = report["angular_error_deg"], report["expected_under_5"]
     scored = ""
     if errors is not None:

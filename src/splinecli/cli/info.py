@@ -4,42 +4,48 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from typer import Argument, Option
+
+from splinecli.capture.capture_warnings import PROBABLY_WRONG
+from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.options import inputs, outputs
-from splinecli.cli.options.values import FirstLight, LightForm
-from splinecli.cli.records import record_from
+from splinecli.cli.values import FirstLight, LightForm, record_from
 from splinecli.errors import InputError
-from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
-from splinecli.pipeline.reading import Reading
 
 
 def info(
-    capture: Path = inputs.CAPTURE,
-    lights: Path | None = inputs.LIGHTS,
-    first_light: FirstLight | None = inputs.FIRST_LIGHT,
-    intensities: Path | None = inputs.INTENSITIES,
-    light_positions: Path | None = inputs.LIGHT_POSITIONS,
-    light_distance: float | None = inputs.LIGHT_DISTANCE,
-    pixel_size: float | None = inputs.PIXEL_SIZE,
-    object_width: float | None = inputs.OBJECT_WIDTH,
-    camera_matrix: Path | None = inputs.LAMP_CAMERA_MATRIX,
-    mask: Path | None = inputs.MASK,
-    crop: str | None = inputs.CROP,
-    scale: str | None = inputs.SCALE,
-    ground_truth: Path | None = inputs.GROUND_TRUTH,
-    transfer: str = inputs.TRANSFER,
-    ambient: Path | None = inputs.AMBIENT,
-    flat_field: Path | None = inputs.FLAT_FIELD,
-    white_level: float | None = inputs.WHITE_LEVEL,
-    light_frame: str | None = inputs.LIGHT_FRAME,
-    lights_format: LightForm = inputs.LIGHTS_FORMAT,
-    check_lights: bool = inputs.CHECK_LIGHTS,
-    mended_lights: Path | None = outputs.MENDED_LIGHTS,
-    plot: Path | None = outputs.LIGHT_PLOT,
-    overwrite: bool = outputs.OVERWRITE_PLOT,
-    strict: bool = outputs.STRICT,
-    as_json: bool = outputs.JSON,
-    quiet: bool = outputs.QUIET,
+    capture: Path = Argument(..., metavar="CAPTURE", help="Folder with the images of one object, or a film."),
+    lights: Path | None = shared.LIGHTS,
+    first_light: FirstLight | None = shared.FIRST_LIGHT,
+    intensities: Path | None = shared.INTENSITIES,
+    light_positions: Path | None = shared.LIGHT_POSITIONS,
+    light_distance: float | None = shared.LIGHT_DISTANCE,
+    pixel_size: float | None = Option(None, metavar="S", help=shared.PIXEL_SIZE),
+    object_width: float | None = shared.OBJECT_WIDTH,
+    camera_matrix: Path | None = shared.CAMERA_MATRIX,
+    mask: Path | None = shared.MASK,
+    crop: str | None = shared.CROP,
+    scale: str | None = shared.SCALE,
+    ground_truth: Path | None = shared.GROUND_TRUTH,
+    transfer: str = shared.TRANSFER,
+    ambient: Path | None = shared.AMBIENT,
+    flat_field: Path | None = shared.FLAT_FIELD,
+    white_level: float | None = shared.WHITE_LEVEL,
+    light_frame: str | None = shared.LIGHT_FRAME,
+    lights_format: LightForm = shared.LIGHTS_FORMAT,
+    check_lights: bool = Option(
+        False, "--check-lights", help="List other readings of the light file, and how well the images fit each."
+    ),
+    mended_lights: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Write the light directions in the order and frame that fit the images best, if the light file does not.",
+    ),
+    plot: Path | None = Option(None, metavar="FILE", help="Also plot the light directions to a PNG file."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace an earlier plot or file of lights."),
+    strict: bool = shared.STRICT,
+    as_json: bool = shared.JSON,
+    quiet: bool = shared.QUIET,
 ) -> int:
     """Show what `infer` would read from CAPTURE, without running it.
 
@@ -49,7 +55,8 @@ def info(
     """
     given = locals()
 
-    from splinecli.capture.capture_warnings import PROBABLY_WRONG
+    from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
+    from splinecli.pipeline.reading import Reading
 
     options = record_from(InfoOptions, given, reading=record_from(Reading, given))
     messages = Messages(quiet=quiet)

@@ -4,31 +4,84 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from typer import Argument, Option
+
+from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.options import computing, inputs, outputs
-from splinecli.cli.options.values import NormalConvention, split_commas
-from splinecli.cli.records import record_from
-from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
-from splinecli.surface.surface_files import SURFACE_FILES
+from splinecli.cli.values import NormalConvention, complete_list, record_from, split_commas
+from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 
 
 def integrate(
-    normals: Path = inputs.NORMALS,
-    mask: Path | None = inputs.NORMALS_MASK,
-    camera_matrix: Path | None = inputs.CAMERA_MATRIX,
-    convention: NormalConvention | None = inputs.NORMALS_CONVENTION,
-    colours: Path | None = inputs.COLOURS,
-    stiffness: float = computing.STIFFNESS,
-    prior: Path | None = inputs.PRIOR,
-    prior_detail: float | None = computing.PRIOR_DETAIL,
-    largest_step: float | None = computing.LARGEST_STEP,
-    pixel_size: float | None = inputs.PIXEL_SIZE_MM,
-    output: Path | None = outputs.SURFACE_FOLDER,
-    formats: str = outputs.SURFACE_FORMATS,
-    decimate: int | None = outputs.DECIMATE,
-    overwrite: bool = outputs.OVERWRITE,
-    as_json: bool = outputs.JSON,
-    quiet: bool = outputs.QUIET,
+    normals: Path = Argument(
+        ..., metavar="NORMALS", help="Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote."
+    ),
+    mask: Path | None = Option(
+        None, metavar="FILE", help=f"{shared.MASK_IMAGE.format('object')} [default: all pixels that have a normal]"
+    ),
+    camera_matrix: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Text file of the 3 x 3 camera matrix in pixels, for a perspective camera. [default: as in report.json"
+        " beside the normal map, or orthographic]",
+    ),
+    convention: NormalConvention | None = Option(
+        None,
+        help="Green channel of a normal map of colours: opengl is y up, directx is y down. [default: as in report.json"
+        " beside it, or opengl]",
+    ),
+    colours: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Image of the object's colours, for the mesh."
+        " [default: albedo.png beside NORMALS, if NORMALS is a folder]",
+    ),
+    stiffness: float = shared.STIFFNESS,
+    prior: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Depth map of the same view from elsewhere, such as a scan: the surface has its shape in the large, and"
+        " the detail of the normals. .npy, .tif or .exr, with heights towards the camera in the unit of the result, or"
+        " with depths in millimetres for a perspective camera. NaN is unknown.",
+    ),
+    prior_detail: float | None = Option(
+        None,
+        metavar="PIXELS",
+        min=1,
+        help="With --prior: shapes narrower than this come from the normals. [default: 15 % of the object's size]",
+    ),
+    largest_step: float | None = Option(
+        None,
+        metavar="PIXELS",
+        min=0,
+        help="Leave out triangles whose corners differ by more than this height. [default: keep all]",
+    ),
+    pixel_size: float | None = Option(
+        None,
+        metavar="MM",
+        help="Width of a pixel of the photographs on the object in millimetres, for a surface in millimetres."
+        " [default: as in report.json beside the normal map, or in pixels]",
+    ),
+    output: Path | None = Option(
+        None, "--output", "-o", metavar="OUT", help="Folder of the results. [default: that of NORMALS]"
+    ),
+    formats: str = Option(
+        ",".join(DEFAULT_FORMATS),
+        "--format",
+        metavar="LIST",
+        help=f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or"
+        " as a 16-bit picture (png). exr needs the extra 'exr'.",
+        autocompletion=complete_list(SURFACE_FILES),
+    ),
+    decimate: int | None = Option(
+        None,
+        metavar="N",
+        help="Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB (needs the extra"
+        " 'mesh'). [default: all]",
+    ),
+    overwrite: bool = shared.OVERWRITE,
+    as_json: bool = shared.JSON,
+    quiet: bool = shared.QUIET,
 ) -> None:
     """Integrate a normal map to a depth map and a mesh.
 
@@ -39,10 +92,10 @@ def integrate(
     Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN outside the object,
     depth.png and surface.json.
     """
-    options = record_from(
-        IntegrateOptions,
-        locals(),
-        formats=tuple(split_commas(formats, "--format", list(SURFACE_FILES))),
-    )
+    given = locals()
+
+    from splinecli.pipeline.integrate import IntegrateOptions, integrate_normal_map, summary_line
+
+    options = record_from(IntegrateOptions, given, formats=split_commas(formats, "--format", SURFACE_FILES))
     report = integrate_normal_map(options, Messages(quiet=quiet))
     print_report(report, summary_line(options, report), as_json=as_json, quiet=quiet)

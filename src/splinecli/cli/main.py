@@ -10,12 +10,11 @@ import traceback
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import typer
 
 from splinecli.cli.app import app
-from splinecli.cli.closed_pipes import UntilClosed
 from splinecli.cli.console import print_lines
 from splinecli.cli.failures import explain, is_defect
 from splinecli.cli.signals import INTERRUPTED, TOLD
@@ -54,6 +53,43 @@ def fail(message: str, exit_code: int) -> int:
     """Print the message on stderr, in one line, and return the exit code."""
     print(f"splinecli: {printable(message)}", file=sys.stderr)
     return exit_code
+
+
+class UntilClosed:
+    """A text stream that drops all output once its pipe is closed.
+
+    With a plain stream, the next line that a command prints would raise an error and end the command's work.
+
+    Args:
+        stream: the stream to write to. All other attributes are this stream's.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text and return its length."""
+        try:
+            return self._stream.write(text)
+        except BrokenPipeError:
+            self._mute()
+            return len(text)
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._mute()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _mute(self) -> None:
+        """Send the stream to the null device, with what its buffer still has."""
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, self._stream.fileno())
+        os.close(null)
 
 
 def _repair_streams() -> None:

@@ -17,127 +17,81 @@ from splinecli import __version__
 from splinecli.cli.app import app
 from splinecli.cli.commands import help_panels
 
-EXIT_STATUS = (
-    ("0", "Done."),
-    ("1", "A defect of splinecli."),
-    ("2", "Usage: an option is wrong, or options contradict each other."),
-    ("3", "Bad input data."),
-    ("4", "Weights, a checkpoint or a configuration cannot be used."),
-    (
-        "5",
-        "An output cannot be written, or exists and neither --overwrite nor --update was given.",
-    ),
-    ("130", "Interrupted. No file is incomplete."),
-)
-FILES = (
-    (
-        "CAPTURE/*.png, *.tif, *.jpg, *.dng, *.nef, ...",
-        "Linear images, in natural order or in the order of filenames.txt. Camera RAW files need 'splinecli[raw]'.",
-    ),
-    ("CAPTURE/light_directions.txt", "A line x y z for each image: x right, y up, z to the camera."),
-    ("CAPTURE/*.lp, lights.json", "Instead: lights with the names of their images, from RTI or AliceVision."),
-    (
-        "CAPTURE/light_positions.txt, pixel_size.txt, camera_matrix.txt",
-        "Near lamps: positions from the middle of the image on the object, the width of a pixel in their unit, and the"
-        " camera matrix in pixels. Optional.",
-    ),
-    ("CAPTURE/light_intensities.txt", "A line r g b for each image. Optional."),
-    (
-        "CAPTURE/mask.png",
-        "White on the object (above half of its largest value). Optional: without it, every pixel belongs to the"
-        " object.",
-    ),
-    ("CAPTURE/ambient.png", "The object with the lamp off, subtracted from all images. Optional."),
-    ("CAPTURE/Normal_gt.mat", "True normals. Optional: with them, errors are reported."),
-    ("OUT/NAME/normals.png", "Normal map, 16-bit RGB, (n + 1) / 2."),
-    ("OUT/NAME/normals.npy", "Normal map, float32, H x W x 3, zero outside the mask."),
-    (
-        "OUT/NAME/normals_8bit.png, normals.tiff, normals.exr",
-        "With --format png8, tiff, exr: normal map in 8 bits, in float32, in float32 for renderers. exr also writes"
-        " albedo.exr and depth.exr, if there are these maps.",
-    ),
-    ("OUT/NAME/error_map.png", "If there are true normals: angular error with a color bar."),
-    ("OUT/NAME/found_mask.png", "With --auto-mask: the mask of the object."),
-    ("OUT/NAME/albedo.png, albedo.npy", "With --maps albedo: a picture, and linear values in float32."),
-    (
-        "OUT/NAME/confidence.png, confidence.npy",
-        "With --maps confidence: the probability that a normal has an error of at most 5 degrees.",
-    ),
-    ("OUT/NAME/preview.png", "With --maps preview: the surface in matte white under a raking light."),
-    ("OUT/NAME/gradient.npy", "With --maps gradient: the slopes dz/dx and dz/dy, H x W x 2."),
-    ("OUT/NAME/curvature.npy", "With --maps curvature: mean and Gaussian curvature in 1/pixel, H x W x 2."),
-    ("OUT/NAME/curvature.png", "With --maps curvature: the mean curvature; gray is flat, bumps are brighter."),
-    ("OUT/NAME/relief.npy", "With --maps relief: heights in pixels without the shape in the large, H x W."),
-    ("OUT/NAME/relief.png", "With --maps relief: gray is 0, white is 1 pixel towards the camera."),
-    ("OUT/frames/NAME", "The frames of a film, a capture of its own."),
-    (
-        "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png",
-        "With --surface, or from splinecli integrate OUT/NAME, which also writes surface.json. Both can write mesh.obj"
-        " (with mesh.mtl and mesh.png) and mesh.stl.",
-    ),
-    (
-        "OUT/NAME/page.html",
-        "With --html: all pictures, and the surface under a light that follows the pointer.",
-    ),
-    (
-        "OUT/NAME/report.json",
-        "Lights, method, weights, options, time, warnings and errors.",
-    ),
-    ("OUT/index.html", "With several captures: links to all results."),
-)
-ENVIRONMENT = (
-    ("COLUMNS", "Width of help texts and tables."),
-    ("NO_COLOR", "If set, the terminal output has no colors."),
-    ("OMP_NUM_THREADS", "Number of processor threads of the networks."),
-    ("CUDA_VISIBLE_DEVICES", "GPUs that --device auto and cuda may use."),
-)
-EXAMPLES = (
-    ("splinecli infer obj/ --lights l.txt", "Estimate the normals of one object from all its images."),
-    ("splinecli infer catPNG --n-lights 10 --seed 0 --json", "Use ten lights and print the report."),
-    ("splinecli infer captures/* -o results --overwrite", "Process a folder of captures."),
-    (
-        "splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html",
-        "Also write albedo, preview, mesh and page.",
-    ),
-    ("splinecli watch parts/ -- --lights l.txt --jsonl", "Compute each part that arrives."),
-    ("splinecli info obj/", "Show what infer would read."),
-    (
-        "splinecli info obj/ --transfer srgb --plot lights.png",
-        "Check sRGB images, and plot the light directions.",
-    ),
-    ("splinecli calibrate chrome/ -o lights", "Measure light directions with a mirror ball."),
-    (
-        "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights",
-        "Give the outline of the ball, and also measure light intensities.",
-    ),
-    ("splinecli integrate results/cat", "Make depth and a mesh from the results of infer."),
-    (
-        "splinecli integrate normals.png --mask mask.png --format obj -o surface",
-        "Make a mesh from any normal map.",
-    ),
-    (
-        "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20",
-        "Compare two methods.",
-    ),
-    (
-        "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10 --trials 20 --figures",
-        "Compare all methods with two numbers of lights, and draw their maps.",
-    ),
-    ("splinecli prepare --scenes 6 -o set", "Render six scenes in three materials."),
-    ("splinecli prepare PRPS PRPS_Diffuse -o cycles", "Make a pixel set from the CyclesPS data."),
-    ("splinecli train set --preset compact --steps 300 -o run", "Train briefly on a pixel set."),
-    (
-        "splinecli train -o runs/mine --minutes 90",
-        "Train new weights, then use --weights runs/mine/weights.safetensors.",
-    ),
-    ("splinecli train -o runs/mine --resume", "Continue after an interruption."),
-    (
-        "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o official.safetensors",
-        "Convert the authors' weights, then use --weights official.safetensors.",
-    ),
-)
-EXAMPLE_WIDTH = 64
-"""Columns of an example. With its indent it fits a terminal of 80 columns."""
+EXIT_STATUS = {
+    "0": "Done.",
+    "1": "A defect of splinecli.",
+    "2": "Usage: an option is wrong, or options contradict each other.",
+    "3": "Bad input data.",
+    "4": "Weights, a checkpoint or a configuration cannot be used.",
+    "5": "An output cannot be written, or exists and neither --overwrite nor --update was given.",
+    "130": "Interrupted. No file is incomplete.",
+}
+FILES = {
+    "CAPTURE/*.png, *.tif, *.jpg, *.dng, *.nef, ...": "Linear images, in natural order or in the order of"
+    " filenames.txt. Camera RAW files need 'splinecli[raw]'.",
+    "CAPTURE/light_directions.txt": "A line x y z for each image: x right, y up, z to the camera.",
+    "CAPTURE/*.lp, lights.json": "Instead: lights with the names of their images, from RTI or AliceVision.",
+    "CAPTURE/light_positions.txt, pixel_size.txt, camera_matrix.txt": "Near lamps: positions from the middle of the"
+    " image on the object, the width of a pixel in their unit, and the camera matrix in pixels. Optional.",
+    "CAPTURE/light_intensities.txt": "A line r g b for each image. Optional.",
+    "CAPTURE/mask.png": "White on the object (above half of its largest value). Optional: without it, every pixel"
+    " belongs to the object.",
+    "CAPTURE/ambient.png": "The object with the lamp off, subtracted from all images. Optional.",
+    "CAPTURE/Normal_gt.mat": "True normals. Optional: with them, errors are reported.",
+    "OUT/NAME/normals.png": "Normal map, 16-bit RGB, (n + 1) / 2.",
+    "OUT/NAME/normals.npy": "Normal map, float32, H x W x 3, zero outside the mask.",
+    "OUT/NAME/normals_8bit.png, normals.tiff, normals.exr": "With --format png8, tiff, exr: normal map in 8 bits, in"
+    " float32, in float32 for renderers. exr also writes albedo.exr and depth.exr, if there are these maps.",
+    "OUT/NAME/error_map.png": "If there are true normals: angular error with a color bar.",
+    "OUT/NAME/found_mask.png": "With --auto-mask: the mask of the object.",
+    "OUT/NAME/albedo.png, albedo.npy": "With --maps albedo: a picture, and linear values in float32.",
+    "OUT/NAME/confidence.png, confidence.npy": "With --maps confidence: the probability that a normal has an error of"
+    " at most 5 degrees.",
+    "OUT/NAME/preview.png": "With --maps preview: the surface in matte white under a raking light.",
+    "OUT/NAME/gradient.npy": "With --maps gradient: the slopes dz/dx and dz/dy, H x W x 2.",
+    "OUT/NAME/curvature.npy": "With --maps curvature: mean and Gaussian curvature in 1/pixel, H x W x 2.",
+    "OUT/NAME/curvature.png": "With --maps curvature: the mean curvature; gray is flat, bumps are brighter.",
+    "OUT/NAME/relief.npy": "With --maps relief: heights in pixels without the shape in the large, H x W.",
+    "OUT/NAME/relief.png": "With --maps relief: gray is 0, white is 1 pixel towards the camera.",
+    "OUT/frames/NAME": "The frames of a film, a capture of its own.",
+    "OUT/NAME/mesh.glb, mesh.ply, depth.npy, depth.tiff, depth.png": "With --surface, or from splinecli integrate"
+    " OUT/NAME, which also writes surface.json. Both can write mesh.obj (with mesh.mtl and mesh.png) and mesh.stl.",
+    "OUT/NAME/page.html": "With --html: all pictures, and the surface under a light that follows the pointer.",
+    "OUT/NAME/report.json": "Lights, method, weights, options, time, warnings and errors.",
+    "OUT/index.html": "With several captures: links to all results.",
+}
+ENVIRONMENT = {
+    "COLUMNS": "Width of help texts and tables.",
+    "NO_COLOR": "If set, the terminal output has no colors.",
+    "OMP_NUM_THREADS": "Number of processor threads of the networks.",
+    "CUDA_VISIBLE_DEVICES": "GPUs that --device auto and cuda may use.",
+}
+EXAMPLES = {
+    "splinecli infer obj/ --lights l.txt": "Estimate the normals of one object from all its images.",
+    "splinecli infer catPNG --n-lights 10 --seed 0 --json": "Use ten lights and print the report.",
+    "splinecli infer captures/* -o results --overwrite": "Process a folder of captures.",
+    "splinecli infer obj/ --auto-mask --maps albedo,preview --surface --html": "Also write albedo, preview, mesh and"
+    " page.",
+    "splinecli watch parts/ -- --lights l.txt --jsonl": "Compute each part that arrives.",
+    "splinecli info obj/": "Show what infer would read.",
+    "splinecli info obj/ --transfer srgb --plot lights.png": "Check sRGB images, and plot the light directions.",
+    "splinecli calibrate chrome/ -o lights": "Measure light directions with a mirror ball.",
+    "splinecli calibrate chrome/ --circle 512,384,200 --gray-ball gray/ -o lights": "Give the outline of the ball, and"
+    " also measure light intensities.",
+    "splinecli integrate results/cat": "Make depth and a mesh from the results of infer.",
+    "splinecli integrate normals.png --mask mask.png --format obj -o surface": "Make a mesh from any normal map.",
+    "splinecli evaluate pmsData --method ls --method spline-net --n-lights 10 --trials 20": "Compare two methods.",
+    "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10 --trials 20 --figures": "Compare all methods"
+    " with two numbers of lights, and draw their maps.",
+    "splinecli prepare --scenes 6 -o set": "Render six scenes in three materials.",
+    "splinecli prepare PRPS PRPS_Diffuse -o cycles": "Make a pixel set from the CyclesPS data.",
+    "splinecli train set --preset compact --steps 300 -o run": "Train briefly on a pixel set.",
+    "splinecli train -o runs/mine --minutes 90": "Train new weights, then use --weights runs/mine/weights.safetensors.",
+    "splinecli train -o runs/mine --resume": "Continue after an interruption.",
+    "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o official.safetensors": "Convert the authors' weights,"
+    " then use --weights official.safetensors.",
+}
+EXAMPLE_WIDTH = 64  # columns; with its indent an example fits a terminal of 80 columns
 
 
 def man_pages() -> dict[str, str]:
@@ -163,9 +117,9 @@ def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
         lines += [".TP", _reference(name), _escape(_paragraphs(command.help)[0])]
     for title, rows in (("EXIT STATUS", EXIT_STATUS), ("FILES", FILES), ("ENVIRONMENT", ENVIRONMENT)):
         lines.append(f".SH {title}")
-        for term, meaning in rows:
+        for term, meaning in rows.items():
             lines += [".TP", f"\\fB{_escape(term)}\\fR", _escape(meaning)]
-    return _page_text([*lines, *_examples(""), *_see_also(commands)])
+    return _page_text([*lines, *_examples("")], commands)
 
 
 def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any]) -> str:
@@ -183,7 +137,7 @@ def _command_page(name: str, command: Any, context: Any, commands: dict[str, Any
     # Commands that this page mentions.
     text = " ".join([command.help, *(parameter.help or "" for parameter in command.params)])
     related = [other for other in commands if other != name and re.search(rf"\b{other}\b", text)]
-    return _page_text([*lines, *_see_also(["", *related])])
+    return _page_text(lines, ["", *related])
 
 
 def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str]:
@@ -205,7 +159,6 @@ def _beginning(title: str, meaning: str, command: Any, context: Any) -> list[str
 
 
 def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
-    """Write the rows of a command's help, with a heading for each panel if there are several."""
     lines = []
     for title, rows in panels.items():
         if len(panels) > 1:
@@ -220,7 +173,7 @@ def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
 def _examples(name: str) -> list[str]:
     """Return the examples of a command, or all for an empty name."""
     lines = [".SH EXAMPLES"]
-    for command_line, meaning in EXAMPLES:
+    for command_line, meaning in EXAMPLES.items():
         if name in ("", shlex.split(command_line)[1]):
             lines += [_escape(meaning), ".PP", ".RS", ".nf", _escape(_wrap(command_line))]
             lines += [".fi", ".RE", ".PP"]
@@ -234,12 +187,8 @@ def _wrap(command_line: str) -> str:
     return " \\\n    ".join(lines).replace("\0", " ")
 
 
-def _see_also(names: Iterable[str]) -> list[str]:
-    return [".SH SEE ALSO", *(f"{_reference(name)}," for name in names)]
-
-
-def _page_text(lines: list[str]) -> str:
-    return "\n".join(lines).rstrip(",") + "\n"
+def _page_text(lines: list[str], related: Iterable[str]) -> str:
+    return "\n".join([*lines, ".SH SEE ALSO", ",\n".join(map(_reference, related))]) + "\n"
 
 
 def _page_name(command: str) -> str:

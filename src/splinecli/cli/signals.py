@@ -9,19 +9,12 @@ import time
 from contextlib import suppress
 from types import FrameType
 
-INTERRUPTED = 130
-"""Exit code of an interrupted process."""
-
-GRACE_SECONDS = 1.5
-"""Time that the command has to clean up."""
+INTERRUPTED = 130  # exit code of an interrupted process
+GRACE_SECONDS = 1.5  # time that the command has to clean up
 
 
-TOLD = threading.Event()
-"""Set when the command tells of the interruption itself, so that it is told once."""
-
-_IMPORT_SECONDS = 0.05
-"""Time between two looks at whether an import is done."""
-
+TOLD = threading.Event()  # set when the command tells of the interruption itself, so that it is told once
+_IMPORT_SECONDS = 0.05  # time between two looks at whether an import is done
 _IMPORTS = "<frozen importlib._bootstrap>"
 
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from typer import Argument, Option
+
+from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.options import computing, outputs, training
-from splinecli.cli.options.values import Device
+from splinecli.cli.values import Device, complete_weights
 from splinecli.errors import UsageError, printable
-from splinecli.training.defaults import (
-    WEIGHTS,
-)
+from splinecli.training import defaults
 
 if TYPE_CHECKING:
     from splinecli.training.config_files import Settings
@@ -22,21 +22,56 @@ if TYPE_CHECKING:
 
 
 def train(
-    output: Path = outputs.RUN,
-    sets: list[Path] | None = training.SETS,
-    preset: str | None = training.PRESET,
-    config: Path | None = training.CONFIG,
-    param: list[str] | None = training.PARAMETERS,
-    start_from: str | None = training.START_FROM,
-    generator_weight: float | None = training.GENERATOR_WEIGHT,
-    n_lights: str | None = training.LIGHT_COUNTS,
-    steps: int | None = training.STEPS,
-    minutes: float | None = training.MINUTES,
-    resume: bool = training.RESUME,
-    seed: int | None = training.RUN_SEED,
-    tensorboard: bool = outputs.TENSORBOARD,
-    device: Device = computing.DEVICE,
-    quiet: bool = outputs.QUIET,
+    output: Path = Option(
+        ...,
+        "--output",
+        "-o",
+        metavar="RUN",
+        help=f"Folder of the run. Its files are updated every {defaults.CHECKPOINT_SECONDS} seconds.",
+    ),
+    sets: list[Path] | None = Argument(None, metavar="SET", help="Pixel sets made by 'splinecli prepare'."),
+    preset: str | None = Option(
+        None,
+        metavar="NAME",
+        help=f"Settings to begin with: {', '.join(defaults.PRESET_NAMES)}. [default: {defaults.DEFAULT_PRESET}]",
+        autocompletion=lambda: list(defaults.PRESET_NAMES),
+    ),
+    config: Path | None = Option(None, metavar="FILE", help="Settings from a TOML file or a run's config.json."),
+    param: list[str] | None = Option(
+        None, metavar="NAME=VALUE", help="One setting, such as pixels.wall_share=0.3. May be repeated."
+    ),
+    start_from: str | None = Option(
+        None,
+        metavar="NAME|FILE",
+        help="Begin with these weights. [default: random weights; preset refine: spline-net]",
+        autocompletion=complete_weights,
+    ),
+    generator_weight: float | None = Option(
+        None, metavar="W", min=0, help="Weight of generated pixels; each SET has weight 1. [default: 0; 1 without SET]"
+    ),
+    n_lights: str | None = Option(
+        None, metavar="K|MIN-MAX", help="Number of lights of each pixel. [default: the preset's]"
+    ),
+    steps: int | None = Option(
+        None,
+        metavar="N",
+        min=1,
+        help=f"Train for N steps. [default: {defaults.DEFAULT_STEPS:,}; presets paper: {defaults.PAPER_STEPS:,},"
+        f" refine: {defaults.REFINE_STEPS:,}]",
+    ),
+    minutes: float | None = Option(
+        None,
+        metavar="M",
+        min=0.01,
+        help="Train for M minutes instead of a number of steps. [default: train for --steps]",
+    ),
+    resume: bool = Option(False, "--resume", help="Continue from the run's checkpoint."),
+    seed: int | None = Option(None, metavar="S", min=0, max=2**32 - 1, help="Seed of the run. [default: 0]"),
+    tensorboard: bool = Option(
+        False, "--tensorboard", help="Also write RUN/tensorboard (needs the extra 'tensorboard')."
+    ),
+    device: Device = shared.DEVICE,
+    quiet: bool = shared.QUIET,
 ) -> None:
     """Train LI-Net and NE-Net, or with --preset refine the refinement net.
 
@@ -48,9 +83,19 @@ def train(
     if steps is not None and minutes is not None:
         raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
 
+    from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
     from splinecli.training.run import configure_run, open_run, resumes
 
-    changes = _changes(sets or [], generator_weight, n_lights, start_from, param or [], seed)
+    changes: list[Settings] = []  # in the order of their precedence
+    if sets or generator_weight is not None:
+        changes.append({"sources": parse_sources(sets or [], generator_weight)})
+    if n_lights is not None:
+        changes.append({"pixels": parse_light_counts(n_lights)})
+    if start_from is not None:
+        changes.append({"start_from": start_from})
+    changes += [parse_parameter(text) for text in param or []]
+    if seed is not None:
+        changes.append({"seed": seed})
     resume = resumes(output, resume=resume)
     settings = configure_run(output, preset, config, changes, resume=resume)
     if steps is not None:
@@ -61,35 +106,10 @@ def train(
     with open_run(settings, output, device.value, resume=resume, tensorboard=tensorboard, warn=warn) as trainer:
         _run(trainer, Messages(quiet=quiet or not trainer.workers.leads))
         if not quiet and trainer.workers.leads:
-            print(printable(output / WEIGHTS))
-
-
-def _changes(
-    sets: list[Path],
-    generator_weight: float | None,
-    n_lights: str | None,
-    start_from: str | None,
-    parameters: list[str],
-    seed: int | None,
-) -> list[Settings]:
-    """Return the settings that the options change, in the order of their precedence. Raises UsageError."""
-    from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
-
-    changes: list[Settings] = []
-    if sets or generator_weight is not None:
-        changes.append({"sources": parse_sources(sets, generator_weight)})
-    if n_lights is not None:
-        changes.append({"pixels": parse_light_counts(n_lights)})
-    if start_from is not None:
-        changes.append({"start_from": start_from})
-    changes += [parse_parameter(text) for text in parameters]
-    if seed is not None:
-        changes.append({"seed": seed})
-    return changes
+            print(printable(output / defaults.WEIGHTS))
 
 
 def _run(trainer: Trainer, messages: Messages) -> None:
-    """Train to the end and show the progress."""
     if trainer.single_scene_sets:
         names = ", ".join(trainer.single_scene_sets)
         messages.warn(f"{names}: the set has a single scene, so training and validation use the same pixels")

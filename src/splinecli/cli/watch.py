@@ -12,23 +12,19 @@ from typer import Argument, Option
 from splinecli.cli.console import Messages
 from splinecli.errors import UsageError
 
-_LOOK_SECONDS = 1.0
-"""Time between two looks at the folder."""
-
-FOLDER = Argument(..., metavar="FOLDER", help="Folder in which captures arrive, a subfolder for each.")
-OPTIONS = Argument(None, metavar="-- OPTIONS", help="Options of infer, after two dashes.")
-MARKER = Option(
-    None, metavar="NAME", help="File that appears in a capture when it is complete. [default: see --settle]"
-)
-SETTLE = Option(5.0, metavar="SECONDS", min=0, help="A capture is complete when nothing in it changed for so long.")
+_LOOK_SECONDS = 1.0  # time between two looks at the folder
 
 
 def watch(
     context: typer.Context,
-    folder: Path = FOLDER,
-    options: list[str] = OPTIONS,
-    marker: str | None = MARKER,
-    settle: float = SETTLE,
+    folder: Path = Argument(..., metavar="FOLDER", help="Folder in which captures arrive, a subfolder for each."),
+    options: list[str] = Argument(None, metavar="-- OPTIONS", help="Options of infer, after two dashes."),
+    marker: str | None = Option(
+        None, metavar="NAME", help="File that appears in a capture when it is complete. [default: see --settle]"
+    ),
+    settle: float = Option(
+        5.0, metavar="SECONDS", min=0, help="A capture is complete when nothing in it changed for so long."
+    ),
 ) -> None:
     """Run infer on each capture that arrives in FOLDER, once it is complete.
 

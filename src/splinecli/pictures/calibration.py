@@ -9,9 +9,7 @@ from splinecli.calibration.balls import BallCalibration
 from splinecli.capture.formats.images import read_image
 from splinecli.pictures.png import Picture
 
-TILE = 200
-"""Width and height of one ball in the picture, in pixels."""
-
+TILE = 200  # width and height of one ball in the picture, in pixels
 _MARGIN = 1.15  # half of a tile's width, in radii of the ball
 _CAPTION = 22  # height of the caption below each tile
 _COLUMNS = 6

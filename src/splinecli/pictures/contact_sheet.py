@@ -60,9 +60,8 @@ def _on_mask(values: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[n
 def _fit(picture: NDArray[np.unsignedinteger], tile: int) -> Picture:
     import cv2
 
-    height, width = picture.shape[:2]
-    scale = tile / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    missing = (tile - size[1], tile - size[0])
-    return np.pad(small, ((missing[0] // 2, -(-missing[0] // 2)), (missing[1] // 2, -(-missing[1] // 2)), (0, 0)))
+    scale = tile / max(picture.shape[:2])
+    height, width = (max(1, round(side * scale)) for side in picture.shape[:2])
+    small = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    top, left = (tile - height) // 2, (tile - width) // 2
+    return np.pad(small, ((top, tile - height - top), (left, tile - width - left), (0, 0)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -70,14 +71,20 @@ def error_curves(panels: Sequence[Panel], *, label: str, logarithmic: bool = Fal
     down = math.ceil(len(panels) / across)
 
     figure = Figure(figsize=(_PANEL_INCHES[0] * across, _PANEL_INCHES[1] * down + 0.4), layout="constrained")
-    places = list(figure.subplots(down, across, squeeze=False).flat)
-    for axes in places[len(panels) :]:
-        axes.set_axis_off()
-    for panel, axes in zip(panels, places, strict=False):
+    places = figure.subplots(down, across, squeeze=False).flat
+    for panel, axes in zip_longest(panels, places):
+        if panel is None:
+            axes.set_axis_off()
+            continue
         for (method, name), points in panel.curves.items():
             _draw_curve(axes, points, styles[method], dashes[name])
         _set_x_axis(axes, panel.ticks, logarithmic=logarithmic)
-        _finish(axes, panel.title, label)
+        axes.set_title(printable(panel.title), fontsize=_LARGE, parse_math=False)
+        axes.set_xlabel(label, fontsize=_SMALL)
+        axes.set_ylabel("mean angular error (deg)", fontsize=_SMALL)
+        axes.set_ylim(bottom=0)
+        axes.tick_params(labelsize=_SMALL)
+        axes.grid(alpha=0.3)
     _add_legend(figure, styles, dashes, across)
     return png_bytes(figure, _DPI)
 
@@ -92,23 +99,14 @@ def _draw_curve(axes: Axes, points: Sequence[Point], style: MethodStyle, dashes:
 def _add_legend(figure: Figure, styles: Mapping[str, MethodStyle], dashes: Mapping[str, _Dashes], across: int) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D([], [], color=style.colour, marker=style.marker, markersize=4, label=_plain(method))
+    handles = [  # a dollar sign would begin a formula
+        Line2D([], [], color=style.colour, marker=style.marker, markersize=4, label=method.replace("$", r"\$"))
         for method, style in styles.items()
     ]
     if len(dashes) > 1:
         handles += [Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in dashes.items()]
     columns = min(len(handles), 2 * across)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=_SMALL)
-
-
-def _finish(axes: Axes, title: str, label: str) -> None:
-    axes.set_title(printable(title), fontsize=_LARGE, parse_math=False)
-    axes.set_xlabel(label, fontsize=_SMALL)
-    axes.set_ylabel("mean angular error (deg)", fontsize=_SMALL)
-    axes.set_ylim(bottom=0)
-    axes.tick_params(labelsize=_SMALL)
-    axes.grid(alpha=0.3)
 
 
 def _set_x_axis(axes: Axes, ticks: Mapping[float, str], *, logarithmic: bool) -> None:
@@ -126,8 +124,3 @@ def _set_x_axis(axes: Axes, ticks: Mapping[float, str], *, logarithmic: bool) ->
         last = position if fits else last
     axes.set_xticks(list(place), labels)
     axes.xaxis.set_minor_locator(NullLocator())
-
-
-def _plain(text: str) -> str:
-    """Return text in which matplotlib finds no formula."""
-    return text.replace("$", r"\$")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.errors import UsageError
 from splinecli.pictures.png import Picture
 
-TOP_DEG = 30.0
-"""Top of the colour scale. Larger errors have the last colour: the scale serves the small errors."""
+TOP_DEG = 30.0  # of the colour scale; larger errors have the last colour: the scale serves the small errors
 
+TICKS = {TOP_DEG * third / 3: f"{TOP_DEG * third / 3:g}" + "+" * (third == 3) for third in range(4)}
 TITLE = "angular error (deg)"
 
 _SMALLEST_HEIGHT = 256  # pixels: room for the colour bar and its text
@@ -20,53 +17,45 @@ _LARGEST_ENLARGED = 1024  # pixels: a small map is not enlarged beyond this widt
 _TEXT_SIZE = 0.45  # OpenCV's font scale in a picture of _USUAL_HEIGHT; capitals are 10 pixels high
 _USUAL_HEIGHT = 400
 _BACKGROUND, _INK = 255, 0
-_TICK_STEPS_DEG = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 45)
-_MOST_STEPS = 4
 
 
-def error_map_picture(error_map_deg: NDArray[np.floating], *, top_deg: float = TOP_DEG) -> Picture:
-    """Return an error map as an RGB picture (H', W', 3) with a colour bar in degrees at its right.
+def error_map_picture(error_map_deg: NDArray[np.floating]) -> Picture:
+    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its right.
 
-    The colours are viridis, from violet for 0 to yellow for top_deg and more. Pixels without an error are white. A map
-    of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to 256
-    rows.
-
-    Args:
-        error_map_deg: (H, W) degrees, NaN where there is no error.
-        top_deg: the top of the colour scale in degrees.
-
-    Raises:
-        UsageError: top_deg is not a finite angle over 0.
+    A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024 pixels, then padded to
+    256 rows.
     """
-    if not 0 < top_deg < math.inf:
-        raise UsageError(f"the top of the error scale is {top_deg:g} degrees; expected more than 0")
-    picture = colour_errors(error_map_deg, top_deg)
+    picture = colour_errors(error_map_deg)
     height, width = picture.shape[:2]
     factor = max(1, min(-(-_SMALLEST_HEIGHT // height), _LARGEST_ENLARGED // width))
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
     missing = max(0, _SMALLEST_HEIGHT - len(picture))
     picture = np.pad(picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=_BACKGROUND)
-    return np.hstack([picture, _colour_bar(len(picture), top_deg)])
+    return np.hstack([picture, _colour_bar(len(picture))])
 
 
-def colour_errors(error_map_deg: NDArray[np.floating], top_deg: float) -> Picture:
-    """Return the colours (H, W, 3) of errors (H, W) in degrees, white for NaN."""
+def colour_errors(error_map_deg: NDArray[np.floating]) -> Picture:
+    """Return the colours (H, W, 3) of errors (H, W) in degrees: viridis, from violet for 0 to yellow; white for NaN."""
     import cv2
 
     known = np.isfinite(error_map_deg)
-    shares = np.where(known, error_map_deg, 0) / top_deg
+    shares = np.where(known, error_map_deg, 0) / TOP_DEG
     levels = np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
     picture: Picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
     picture[~known] = _BACKGROUND
     return picture
 
 
-def _colour_bar(height: int, top_deg: float) -> Picture:
+def bounding_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and the columns of the smallest box that has all of a mask (H, W)."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def _colour_bar(height: int) -> Picture:
     """Return the colour bar with ticks, labels and a vertical title: (height, W, 3), W as large as needed."""
     scale = max(1.0, height / _USUAL_HEIGHT)
-    labels = [(value, f"{value:g}") for value in _ticks_deg(top_deg)]
-    labels[-1] = (top_deg, f"{top_deg:g}+")
-    texts = [_text(label, scale) for _, label in labels]
+    texts = [_text(label, scale) for label in TICKS.values()]
     title = np.rot90(_text(TITLE, scale))
     gap, bar_width, line = round(8 * scale), round(18 * scale), max(1, round(scale))
     margin = texts[0].shape[0]  # keeps the outermost labels whole
@@ -75,23 +64,15 @@ def _colour_bar(height: int, top_deg: float) -> Picture:
     label_x = 3 * gap + bar_width
     title_x = label_x + max(text.shape[1] for text in texts) + gap
     panel = np.full((height, title_x + title.shape[1] + gap, 3), _BACKGROUND, np.uint8)
-    column = np.linspace(top_deg, 0, bar_height)[:, None].repeat(bar_width, axis=1)
-    panel[margin : margin + bar_height, 2 * gap : 2 * gap + bar_width] = colour_errors(column, top_deg)
-    for (value, _), text in zip(labels, texts, strict=True):
-        y = margin + round((1 - value / top_deg) * (bar_height - 1))
+    column = np.linspace(TOP_DEG, 0, bar_height)[:, None].repeat(bar_width, axis=1)
+    panel[margin : margin + bar_height, 2 * gap : 2 * gap + bar_width] = colour_errors(column)
+    for value, text in zip(TICKS, texts, strict=True):
+        y = margin + round((1 - value / TOP_DEG) * (bar_height - 1))
         top = min(y - line // 2, margin + bar_height - line)
         panel[top : top + line, 2 * gap + bar_width : label_x - gap // 2] = _INK
         _paste(panel, text, y - text.shape[0] // 2, label_x)
     _paste(panel, title, (height - title.shape[0]) // 2, title_x)
     return panel
-
-
-def _ticks_deg(top_deg: float) -> list[float]:
-    """Return round angles from 0 up, and the top itself."""
-    step = next((step for step in _TICK_STEPS_DEG if top_deg / step <= _MOST_STEPS), top_deg)
-    ticks = [float(tick) for tick in np.arange(0, top_deg, step)]
-    # A label close to the top one would overlap it.
-    return [tick for tick in ticks if top_deg - tick >= step / 2] + [top_deg]
 
 
 def _text(text: str, scale: float) -> Picture:
@@ -103,9 +84,7 @@ def _text(text: str, scale: float) -> Picture:
     canvas = np.full((height + below + 2 * thickness, width + 2 * thickness), _BACKGROUND, np.uint8)
     cv2.putText(canvas, text, (thickness, height + thickness), font, size, _INK, thickness, cv2.LINE_AA)
     # OpenCV 4 and 5 have different fonts and report different heights, so crop to the drawn pixels.
-    ink = canvas < _BACKGROUND
-    rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
-    return canvas[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return canvas[bounding_box(canvas < _BACKGROUND)]
 
 
 def _paste(panel: Picture, gray: Picture, y: int, x: int) -> None:

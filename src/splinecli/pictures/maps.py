@@ -9,11 +9,8 @@ from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.pictures.png import Picture
 
-PREVIEW_LIGHT = (-0.72, 0.48, 0.5)
-"""Light direction of the preview: low, from the upper left, which shows relief best."""
-
-WHITE_QUANTILE = 0.99
-"""White in a picture of an albedo map is this quantile of the pixels' largest channel."""
+PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
+WHITE_QUANTILE = 0.99  # of the largest channel: this albedo is white in a picture
 
 
 def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> Picture:
@@ -41,8 +38,7 @@ def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) ->
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0
-"""Mean curvature in 1/pixel, and relief in pixels, that is white in a picture. The same for all parts of a batch."""
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # white in a picture: mean curvature in 1/pixel, relief in pixels
 
 
 def signed_picture(values: NDArray[np.float32], scale: float) -> Picture:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import encode_picture
-from splinecli.pictures.error_map import TITLE, TOP_DEG, colour_errors
+from splinecli.pictures.error_map import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 from splinecli.pictures.plotting import png_bytes
 from splinecli.pictures.png import Picture
 
@@ -50,13 +50,13 @@ def method_maps(
     """
     from matplotlib.figure import Figure
 
-    box = _bounding_box(mask)
+    box = bounding_box(mask)
     height, width = mask[box].shape
     scale = _scale(height, width, columns=1 + len(normal_maps))
     truth = _resize(_colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale)
     normals = {name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()}
     shown_deg = {name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()}
-    errors = {name: _resize(colour_errors(shown_deg[name][box], TOP_DEG), scale) for name in normal_maps}
+    errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
     captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
 
     cell_height, cell_width = (max(side, _SMALLEST_CELL) for side in truth.shape[:2])
@@ -90,54 +90,27 @@ def _draw_bar(figure: Figure, right: int, bottom: int, height: int, text: int) -
     inset = text // 2  # room for half a label at either end
     length = height - 2 * inset
     column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
-    figure.figimage(colour_errors(column, TOP_DEG), right - text, bottom + inset, origin="lower")
-    for share, label in (
-        (0, "0"),
-        (1 / 3, f"{TOP_DEG / 3:g}"),
-        (2 / 3, f"{TOP_DEG * 2 / 3:g}"),
-        (1, f"{TOP_DEG:g}+"),
-    ):
-        y = bottom + inset + share * (length - 1)
-        _write(figure, right - 1.4 * text, y, label, text, align="right")
+    figure.figimage(colour_errors(column), right - text, bottom + inset, origin="lower")
+    for value, label in TICKS.items():
+        _write(figure, right - 1.4 * text, bottom + inset + value / TOP_DEG * (length - 1), label, text, ha="right")
     size = _text_height(height, [TITLE], most=text)
     _write(figure, right - 4 * text, bottom + height / 2, TITLE, size, rotation=90)
 
 
 def _write(
-    figure: Figure,
-    x: float,
-    y: float,
-    words: str,
-    height: int,
-    *,
-    align: Literal["center", "right"] = "center",
-    rotation: float = 0,
+    figure: Figure, x: float, y: float, words: str, height: int, *, ha: str = "center", rotation: float = 0
 ) -> None:
     """Write text centred at (x, y) in pixels from the bottom left."""
     from matplotlib.transforms import IdentityTransform
 
-    figure.text(
-        x,
-        y,
-        words,
-        fontsize=height / _POINT,
-        ha=align,
-        va="center",
-        rotation=rotation,
-        transform=IdentityTransform(),
-        parse_math=False,
-    )
+    size, in_pixels = height / _POINT, IdentityTransform()
+    figure.text(x, y, words, size=size, ha=ha, va="center", rotation=rotation, transform=in_pixels, parse_math=False)
 
 
 def _text_height(width: int, lines: Sequence[str], *, most: int = _LARGEST_TEXT) -> int:
     """Return a text height in pixels at which each line fits into the width; short lines do not fill it."""
     longest = max(18, *(len(line) for line in lines))
     return min(most, max(_SMALLEST_TEXT, int(width / (_TEXT_WIDTH * longest))))
-
-
-def _bounding_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def _scale(height: int, width: int, columns: int) -> float:

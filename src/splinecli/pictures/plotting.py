@@ -22,14 +22,8 @@ class MethodStyle(NamedTuple):
 
 # The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can distinguish. Gray
 # replaces their yellow, which is too light for a line on white. The markers help in prints without colour.
-_STYLES = tuple(
-    MethodStyle(colour, marker)
-    for colour, marker in zip(
-        ("#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080", "#7F5F3F"),
-        "osD^vXP*h",
-        strict=True,
-    )
-)
+_COLOURS = ["#D55E00", "#0072B2", "#000000", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#808080", "#7F5F3F"]
+_STYLES = tuple(map(MethodStyle, _COLOURS, "osD^vXP*h"))
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
 
-Picture = NDArray[np.uint8]
-"""An RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits."""
+Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits
 
 
-_HEAD = 33
-"""Bytes of the signature and of the header, which is the first chunk of a file."""
+_HEAD = 33  # bytes of the signature and of the header, which is the first chunk of a file
 
 
 def encode_png(
@@ -41,9 +39,5 @@ def encode_png(
     # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
     chunks = [b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()]
     chunks += [b"cICP\x01\x01\x00\x01"] if film else []
-    return file[:_HEAD] + b"".join(map(_chunk, chunks)) + file[_HEAD:]
-
-
-def _chunk(content: bytes) -> bytes:
-    """Return a chunk of a name and its content."""
-    return struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))
+    whole = [struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks]
+    return file[:_HEAD] + b"".join(whole) + file[_HEAD:]

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from splinecli.capture.layouts.image_lists import natural_key
 from splinecli.errors import InputError
 
-Stamp = tuple[int, int, int]
-"""Number of files, their bytes, and the newest time of a change in nanoseconds."""
+Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds
 
 
 @dataclass
@@ -57,8 +57,6 @@ class Arrivals:
         Raises:
             InputError: the folder cannot be read.
         """
-        from splinecli.capture.layouts.image_lists import natural_key
-
         found = {path: _stamp(path) for path in self._subfolders()}
         self._seen = {path: seen for path, seen in self._seen.items() if path in found}
         ready = []

@@ -5,21 +5,23 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splinecli.errors import InputError, ModelError, SplinecliError
+from splinecli.methods import Estimator, MethodOptions
 from splinecli.pipeline.capture_list import Member, Shard, list_captures
+from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
+from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.member import Outcome, Redo, failed, run_member
 from splinecli.pipeline.observer import SILENT, Observer
-
-if TYPE_CHECKING:
-    from splinecli.methods import Estimator, MethodOptions
-    from splinecli.pipeline.connection import ClusterOptions
-    from splinecli.results.index import Entry
+from splinecli.results.index import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
+from splinecli.system.files import check_writable, write_text
+from splinecli.system.publishing import held_folder
 
 
 def infer_batch(
@@ -53,9 +55,6 @@ def infer_batch(
         OutputError: the output folder cannot be written, or the disk is full.
         SplinecliError: the connection to a Dask scheduler was lost.
     """
-    from splinecli.results.index import Entry, check_index_free, has_index
-    from splinecli.system.files import check_writable
-
     members = list_captures(folders, shard)
     options.check_files()
     output = Path(options.output)
@@ -64,63 +63,40 @@ def infer_batch(
     if with_index:
         check_index_free(output, overwrite=redo == "all")
     entries: dict[int, Entry] = {}
-    for number, outcome in _outcomes(members, options, observer, redo, cluster):
+    if cluster is not None and cluster.address is None:
+        if not cluster.workers:
+            cluster = replace(cluster, workers=choose_workers(members, options))
+        cluster = cluster.on_cores(len(members))
+    outcomes: Iterable[tuple[int, Outcome]]
+    if cluster is None:
+        method = cache(partial(make_method, options))
+        outcomes = enumerate(run_member(member, options, redo, method, observer) for member in members)
+    else:
+        outcomes = _on_workers(members, options, observer, redo, cluster)
+    for number, outcome in outcomes:
         if outcome.status != "changed":
             entries[number] = Entry.of(outcome.report)
         yield outcome
     if with_index and members:
-        _write_index([entries[number] for number in sorted(entries)], output, observer)
-
-
-def _outcomes(
-    members: Sequence[Member],
-    options: InferOptions,
-    observer: Observer,
-    redo: Redo,
-    cluster: ClusterOptions | None,
-) -> Iterator[tuple[int, Outcome]]:
-    """Yield the number and the outcome of each capture."""
-    if cluster is not None and cluster.address is None:
-        from splinecli.pipeline.capture_memory import choose_workers
-
-        if not cluster.workers:
-            cluster = replace(cluster, workers=choose_workers(members, options))
-        cluster = cluster.on_cores(len(members))
-    if cluster is None:
-        yield from enumerate(_one_by_one(members, options, observer, redo))
-        return
-    yield from _on_workers(members, options, observer, redo, cluster)
-
-
-def _one_by_one(members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo) -> Iterator[Outcome]:
-    """Yield the outcomes of captures that this process computes."""
-    estimator: Estimator | None = None
-
-    def method() -> Estimator:
-        nonlocal estimator
-        estimator = estimator or make_method(options)
-        return estimator
-
-    for member in members:
-        yield run_member(member, options, redo, method, observer)
+        with held_folder(output, observer.warn, wait=True):
+            # Of those that changed it shows the results that were kept.
+            shown = with_earlier([entries[number] for number in sorted(entries)], output)
+            write_text(output / INDEX, index_page(shown, output))
 
 
 def _on_workers(
     members: Sequence[Member], options: InferOptions, observer: Observer, redo: Redo, cluster: ClusterOptions
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and the outcome of each capture as it ends on another process."""
-    from splinecli.pipeline.capture_memory import expected_bytes
-    from splinecli.pipeline.distribution import Item, LostError, distributor
-
     # On any device: the machine of the command may have none of the workers' GPUs.
     weights = make_method(replace(options, device="cpu") if cluster.address else options).weights
-    settings = _Settings(options, redo, None if weights is None else weights["sha256"])
+    infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
     items = (
         Item((number, member), str(member.folder), expected_bytes(member, options))
         for number, member in enumerate(members)
     )
     with (
-        distributor(settings, _prepare, _infer, Path(options.output), cluster, observer) as workers,
+        distributor(infer, Path(options.output), cluster, observer) as workers,
         observer.progress("captures", len(members), unit="captures") as advance,
     ):
         began, n_failed, n_pixels = time.monotonic(), 0, 0
@@ -142,15 +118,6 @@ def _on_workers(
             yield number, outcome
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """What all captures of a batch share, and the checksum of the weights on the machine of the command."""
-
-    options: InferOptions
-    redo: Redo
-    weights_sha256: str | None
-
-
 class _Warnings(Observer):
     """Keeps warnings, which go back with the report."""
 
@@ -161,17 +128,12 @@ class _Warnings(Observer):
         self.found.append(message)
 
 
-def _prepare(settings: _Settings) -> None:
-    """Check on a worker the files that the options name, and the weights."""
-    settings.options.check_files()
-    _method(settings)
-
-
-def _infer(settings: _Settings, number: int, member: Member) -> tuple[Outcome, list[str]]:
+def _infer(
+    options: InferOptions, redo: Redo, sha256: str | None, number: int, member: Member
+) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return what became of it and the warnings."""
-    from splinecli.pipeline.distribution import SAME_STORAGE, this_worker
-
-    observer = _Warnings()
+    options.check_files()
+    estimator, observer = _method(options, options.method_options, sha256), _Warnings()
     if member.missing is None and not os.path.lexists(member.folder):
         here = this_worker()
         member = replace(
@@ -180,42 +142,25 @@ def _infer(settings: _Settings, number: int, member: Member) -> tuple[Outcome, l
                 f"the folder does not exist on the worker {here}", path=member.folder, hint=SAME_STORAGE
             ),
         )
-    outcome = run_member(member, settings.options, settings.redo, lambda: _method(settings), observer)
+    outcome = run_member(member, options, redo, lambda: estimator, observer)
     return outcome, observer.found
 
 
-_made: dict[tuple[str, MethodOptions, str | None], Estimator] = {}
-"""The estimator of this worker; loading it takes a second."""
-
-
-def _method(settings: _Settings) -> Estimator:
-    options, sha256 = settings.options, settings.weights_sha256
-    key = (options.method, options.method_options, sha256)
-    if key not in _made:
-        estimator = make_method(options)
-        found = None if estimator.weights is None else estimator.weights["sha256"]
-        if found != sha256:
-            raise ModelError(
-                f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
-                path=options.weights,
-                hint="Use the same file, and the same version of splinecli, everywhere",
-            )
-        _made.clear()
-        _made[key] = estimator
-    return _made[key]
+@lru_cache(maxsize=1)
+def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
+    """Return the estimator of this worker; loading it takes a second. Options are equal on any device, `method` not."""
+    estimator = make_method(options)
+    found = None if estimator.weights is None else estimator.weights["sha256"]
+    if found != sha256:
+        raise ModelError(
+            f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the command",
+            path=options.weights,
+            hint="Use the same file, and the same version of splinecli, everywhere",
+        )
+    return estimator
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
     """Return the exit code of a batch: 1 if there is a defect, else the highest number."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
-
-
-def _write_index(entries: Sequence[Entry], output: Path, observer: Observer) -> None:
-    """Write the page of all captures. Of those that changed it shows the results that were kept."""
-    from splinecli.results.index import INDEX, index_page, with_earlier
-    from splinecli.system.files import write_text
-    from splinecli.system.publishing import held_folder
-
-    with held_folder(output, observer.warn, wait=True):
-        write_text(output / INDEX, index_page(with_earlier(entries, output), output))

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.calibration.balls import CalibratedLights, calibrate_ball, combine_balls, find_ball_files
+from splinecli.calibration.circle import Circle
+from splinecli.calibration.gray import measure_light_intensities
+from splinecli.calibration.lamp_positions import LampPositions, triangulate_lamps
+from splinecli.calibration.report import calibration_report, summary_lines
+from splinecli.capture.lights.light_files import read_light_directions, rows_text
+from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import UsageError
-from splinecli.maths.transfer import AUTOMATIC, TransferCurve
+from splinecli.maths.transfer import AUTOMATIC, TransferCurve, parse_transfer
+from splinecli.pictures.calibration import calibration_picture
+from splinecli.pictures.png import encode_png
 from splinecli.pipeline.observer import SILENT, Observer
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from splinecli.calibration.balls import BallCalibration, BallFiles, CalibratedLights
-    from splinecli.calibration.circle import Circle
-    from splinecli.calibration.gray import Target
-    from splinecli.calibration.lamp_positions import LampPositions
+from splinecli.system.files import check_free
+from splinecli.system.publishing import held_folder, new_files
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
@@ -86,8 +90,6 @@ class CalibrateOptions:
     @property
     def curve(self) -> TransferCurve:
         """The transfer curve of the gray target's images, as in RadiometricCalibration."""
-        from splinecli.maths.transfer import parse_transfer
-
         return parse_transfer(self.transfer)
 
 
@@ -98,9 +100,6 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         InputError: an image or file cannot be used, or the numbers of images and lights differ.
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
     """
-    from splinecli.system.files import check_free
-    from splinecli.system.publishing import held_folder
-
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
         return _calibrate_into(options, observer)
@@ -108,11 +107,6 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
 
 def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, Any]:
     """Do the work of calibrate_lights in the folder of results, which the caller holds."""
-    from splinecli.calibration.balls import combine_balls, find_ball_files
-    from splinecli.calibration.lamp_positions import triangulate_lamps
-    from splinecli.calibration.report import calibration_report, summary_lines
-    from splinecli.capture.lights.light_files import read_light_directions
-
     target = options.gray_ball or options.gray_card
     # A wrong path must not come to light after all images are read.
     target_files = None if target is None else find_ball_files(target)
@@ -122,18 +116,21 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     ]
     known = None if options.compare is None else read_light_directions(options.compare, len(balls[0].images))
     circles = options.circles or [None] * len(balls)
-    lights = combine_balls(_calibrate_balls(balls, circles, options.camera_matrix, observer))
+    with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
+        calibrated = [
+            calibrate_ball(ball, circle=circle, camera_matrix=options.camera_matrix, progress=lambda: advance(1))
+            for ball, circle in zip(balls, circles, strict=True)
+        ]
+    lights = combine_balls(calibrated)
     intensities = None
     warnings: list[str] = []
     if target_files is not None:
-        from splinecli.calibration.gray import measure_light_intensities
-        from splinecli.capture.linearise import RadiometricCalibration
-
-        kind: Target = "ball" if options.gray_ball is not None else "card"
         radiometry = RadiometricCalibration(options.curve, automatic=options.transfer == AUTOMATIC)
         radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
         warnings = [f"{target}: {warning}" for warning in of_curve]
-        intensities = measure_light_intensities(target_files, lights.directions, kind, radiometry=radiometry)
+        intensities = measure_light_intensities(
+            target_files, lights.directions, "ball" if options.gray_ball is not None else "card", radiometry=radiometry
+        )
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
     report["warnings"] += warnings
@@ -149,21 +146,6 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     return report
 
 
-def _calibrate_balls(
-    balls: Sequence[BallFiles],
-    circles: Sequence[Circle | None],
-    camera_matrix: Path | None,
-    observer: Observer,
-) -> list[BallCalibration]:
-    from splinecli.calibration.balls import calibrate_ball
-
-    with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
-        return [
-            calibrate_ball(ball, circle=circle, camera_matrix=camera_matrix, progress=lambda: advance(1))
-            for ball, circle in zip(balls, circles, strict=True)
-        ]
-
-
 def _write(
     folder: Path,
     lights: CalibratedLights,
@@ -171,11 +153,6 @@ def _write(
     lamps: LampPositions | None,
     report: dict[str, Any],
 ) -> None:
-    from splinecli.capture.lights.light_files import rows_text
-    from splinecli.pictures.calibration import calibration_picture
-    from splinecli.pictures.png import encode_png
-    from splinecli.system.publishing import new_files
-
     known = lamps if lamps is not None and lamps.known else None
     texts = {
         DIRECTIONS: rows_text(lights.directions),

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from splinecli.capture import capture_name
+from splinecli.capture.formats.film import is_film
+from splinecli.capture.paths import find_mode, resolve
 from splinecli.errors import InputError, UsageError
+from splinecli.methods import method_names
+from splinecli.results.files import MAPS, NORMALS
 
 _SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
 
@@ -75,14 +80,18 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
     chosen = folders if shard is None else shard.choose(folders)
     # Also of the other shards, because their results go to the same place.
     members = {folder: _member(folder) for folder in folders}
-    _check_names({folder: member.name for folder, member in members.items() if member.missing is None})
+    seen: dict[str, Path] = {}
+    for folder, member in members.items():
+        if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
+            raise UsageError(
+                f"{other} and {folder} have the same name, so their results would overwrite each other",
+                hint="Run them one by one with different -o",
+            )
     return [members[folder] for folder in chosen]
 
 
 def _own_path(folder: Path) -> Path:
     """Return one path for all spellings of a folder. A link keeps its name, because its results have it."""
-    from splinecli.capture.paths import resolve
-
     try:
         return resolve(folder) if ".." in folder.parts else folder.absolute()
     except InputError:
@@ -91,42 +100,19 @@ def _own_path(folder: Path) -> Path:
 
 def _member(folder: Path) -> Member:
     """Return the capture in the folder. Raises UsageError for a word of another option."""
-    from splinecli.capture.formats.film import is_film
-    from splinecli.capture.paths import find_mode
-    from splinecli.methods import method_names
-    from splinecli.results.files import MAPS, NORMALS
-
+    # What is wrong with a folder that cannot be read is reported when its turn comes.
     try:
         exists = find_mode(folder) is not None
     except InputError:
-        exists = True  # what is wrong with it is reported when its turn comes
+        exists = True
     if exists:
-        return Member(folder, _name(folder))
+        try:
+            return Member(folder, capture_name(folder))
+        except InputError:
+            return Member(folder, folder.name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
         raise UsageError(
-            "the folder does not exist",
-            path=folder,
-            hint="Write lists with commas, such as --maps albedo,confidence",
+            "the folder does not exist", path=folder, hint="Write lists with commas, such as --maps albedo,confidence"
         )
     kind = "film" if is_film(folder) else "folder"
     return Member(folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder))
-
-
-def _name(folder: Path) -> str:
-    from splinecli.capture import capture_name
-
-    try:
-        return capture_name(folder)
-    except InputError:
-        return folder.name  # what is wrong with it is reported when its turn comes
-
-
-def _check_names(names: Mapping[Path, str]) -> None:
-    seen: dict[str, Path] = {}
-    for folder, name in names.items():
-        other = seen.setdefault(name, folder)
-        if other is not folder:
-            raise UsageError(
-                f"{other} and {folder} have the same name, so their results would overwrite each other",
-                hint="Run them one by one with different -o",
-            )

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splinecli.capture import CaptureSource
+from splinecli.capture.capture_size import capture_bytes
+from splinecli.capture.formats.facts import StoredSize
 from splinecli.errors import SplinecliError
+from splinecli.pipeline.capture_list import Member
+from splinecli.pipeline.infer_options import InferOptions
+from splinecli.system.devices import choose_device, count_available_cores
+from splinecli.system.memory import available_memory
 
-if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource
-    from splinecli.capture.formats.facts import StoredSize
-    from splinecli.pipeline.capture_list import Member
-    from splinecli.pipeline.infer_options import InferOptions
+BASE_BYTES = 500 * 2**20  # of Python, PyTorch and a batch of pixels; captures and their refinement take more
+REFINED_PIXELS, REFINED_BYTES = 736**2, 1100  # at most refined at once, a tile with its margin; of each
 
-BASE_BYTES = 500 * 2**20
-"""Memory of Python, PyTorch and a batch of pixels. The memory of a capture and of the refinement is added to it."""
-
-REFINED_PIXELS, REFINED_BYTES = 736**2, 1100
-"""The most pixels that are refined at once: a tile with its margin. Bytes of each."""
-
-INDIRECT_BYTES = 4
-"""Bytes of each pixel of the capture for its indirect light."""
-
+INDIRECT_BYTES = 4  # of each pixel of the capture, for its indirect light
 _WORTH_A_MASK = 10**9  # bytes from which the mask is read to find out how much of them is needed
 _ASKED = 16  # captures that stand for a batch
 
@@ -34,8 +31,6 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
         n_pixels: the number of the mask's pixels.
         n_lights: the number of images that are read.
     """
-    from splinecli.capture.capture_size import capture_bytes
-
     of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
     return capture_bytes(largest, n_pixels, n_lights) + of_pixels
 
@@ -55,8 +50,6 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
         open_source: returns the capture.
         n_lights: the number of images that are read; 0 for all.
     """
-    import numpy as np
-
     try:
         source = open_source()
         size = source.facts[0].size
@@ -75,9 +68,6 @@ def choose_workers(members: Sequence[Member], options: InferOptions) -> int:
 
     A GPU computes one at a time.
     """
-    from splinecli.system.devices import choose_device, count_available_cores
-    from splinecli.system.memory import available_memory
-
     if choose_device(options.device).type == "cuda":
         return 1
     asked = members[:: max(1, len(members) // _ASKED)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import os
 import warnings
 from collections.abc import Iterator
@@ -23,9 +22,7 @@ from splinecli.system.files import read_json
 if TYPE_CHECKING:
     from distributed import Client
 
-RETRIES = 2
-"""How often an item is repeated whose worker of this machine was lost. A running cluster has a setting of its own."""
-
+RETRIES = 2  # of an item whose worker of this machine was lost; a running cluster has a setting of its own
 _CONNECT_SECONDS = 5.0
 _ANSWER_SECONDS = 6.0  # that a server may take to answer as a scheduler does
 _CLOSE_SECONDS = 5.0
@@ -126,7 +123,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     import dask
     from distributed import LocalCluster
 
-    threads = max(1, min(count_available_cores() // options.workers, _threads_of_user()))
+    of_user = os.environ.get("OMP_NUM_THREADS", "")
+    threads = count_available_cores() // options.workers
+    threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
     settings: dict[str, Any] = {
@@ -135,9 +134,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
         "distributed.scheduler.allowed-failures": RETRIES,
         "distributed.worker.preload": [_IGNORE_INTERRUPTS],
         "logging": dict.fromkeys(_LOGGERS, "critical"),
+        # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives it up.
+        "distributed.deploy.lost-worker-timeout": "1 h",
     }
-    # On a busy machine, a worker that is started anew may need longer than Dask waits before it gives the worker up.
-    settings["distributed.deploy.lost-worker-timeout"] = "1 h"
     _start_resource_tracker()
     with dask.config.set(settings):
         cluster = LocalCluster(
@@ -159,20 +158,12 @@ def _start_resource_tracker() -> None:
     """Start the process in which Python counts semaphores, without its warning: SIGTERM may end this process first."""
     if os.name == "nt":  # where there is no such process
         return
-    before = os.environ.get("PYTHONWARNINGS")
+    before = os.environ.get("PYTHONWARNINGS", "")
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
         resource_tracker.ensure_running()
     finally:
-        del os.environ["PYTHONWARNINGS"]
-        if before is not None:
-            os.environ["PYTHONWARNINGS"] = before
-
-
-def _threads_of_user() -> float:
-    """Return the threads that OMP_NUM_THREADS allows."""
-    number = os.environ.get("OMP_NUM_THREADS", "")
-    return int(number) if number.isdecimal() else math.inf
+        os.environ["PYTHONWARNINGS"] = before
 
 
 def _address(text: str) -> str:

@@ -6,29 +6,26 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splinecli.capture import Capture
+from splinecli.capture.capture_warnings import CaptureWarning, not_distilled
 from splinecli.errors import UsageError
+from splinecli.inference import light_on
+from splinecli.methods import Estimator
+from splinecli.methods.estimator import ConfidentEstimator, tells_confidence
+from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize, student_sizes
 from splinecli.pipeline.observer import SILENT, Observer
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture
-    from splinecli.capture.capture_warnings import CaptureWarning
-    from splinecli.methods import Estimator
     from splinecli.methods.distilled import DistilledEstimator
-    from splinecli.methods.estimator import ConfidentEstimator
-    from splinecli.methods.student_size import StudentSize
 
-AUTOMATIC_FROM = 100_000
-"""Pixels of the smallest capture for which a network is distilled unless the user asks for it."""
-
-GAIN = 2.0
-"""Above that size, learning must be this many times as fast as the network on every pixel. A GPU may not need it."""
+AUTOMATIC_FROM = 100_000  # pixels: smaller captures are distilled only where the user asks for it
+GAIN = 2.0  # above that size, learning must be this many times as fast as the network; a GPU may not need it
 
 
 def distil_for(
-    capture: Capture,
-    estimator: Estimator,
-    wanted: bool | None,
-    observer: Observer = SILENT,
+    capture: Capture, estimator: Estimator, wanted: bool | None, observer: Observer = SILENT
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
@@ -39,22 +36,17 @@ def distil_for(
     Raises:
         UsageError: it is wanted, but the method gives no confidence, or the capture is too small.
     """
-    from splinecli.methods.estimator import tells_confidence
-
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
     if not tells_confidence(estimator):
         return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
-    from splinecli.capture.capture_warnings import not_distilled
-    from splinecli.inference import light_on
-    from splinecli.methods.distilled import distil
-    from splinecli.methods.student_size import FEWEST_PIXELS, student_sizes
-
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_PIXELS:
         return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     if wanted is None and not _is_faster(capture, estimator, sizes[0]):
         return None, []
+    from splinecli.methods.distilled import distil
+
     for size in sizes:
         try:
             with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
@@ -74,9 +66,6 @@ def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarnin
 
 def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: StudentSize) -> bool:
     """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
-    import numpy as np
-
-    from splinecli.inference import light_on
     from splinecli.methods.distilled import seconds_of_learning
 
     light = light_on(capture, np.linspace(0, capture.n_pixels - 1, 1024).astype(np.intp))

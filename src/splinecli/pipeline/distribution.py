@@ -10,7 +10,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from itertools import count
@@ -24,7 +24,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pipeline.connection import ClusterOptions, connected
 from splinecli.pipeline.observer import Observer
 from splinecli.system.extras import import_extra
-from splinecli.system.files import UNFINISHED, refusals_as_output_errors
+from splinecli.system.files import UNFINISHED, made_folder, refusals_as_output_errors
 from splinecli.system.memory import available_memory, keep_freed_memory
 
 if TYPE_CHECKING:
@@ -37,9 +37,7 @@ _LOOK_SECONDS = 0.5  # between two looks at which workers there are
 _NO_WORKER_SECONDS = 60.0  # after which a cluster of this machine counts as lost
 _PROBE_SECONDS = 3.0  # a network drive may show a new file a little later
 
-_ONE_AT_A_TIME = Lock()
-"""A worker process does one item at a time, whatever its number of threads: the working folder and
-PyTorch's threads belong to the process."""
+_ONE_AT_A_TIME = Lock()  # item of a worker: the working folder and PyTorch's threads belong to the process
 
 
 class LostError(SplinecliError):
@@ -55,35 +53,28 @@ class Item:
     memory: float = 0.0
 
 
+def _versions() -> dict[str, str]:
+    return {"splinecli": __version__, "distributed": metadata.version("distributed")}
+
+
 @dataclass(frozen=True)
 class Work:
     """What all items of a command share. It travels with each item.
 
     Args:
-        settings: of the command.
-        prepare: called with the settings before each item. It raises what is wrong with the worker.
-        do: called with the settings and the arguments of an item. It returns the result.
-        folder: the working folder of the command, which its relative paths start from.
+        do: called with the arguments of an item. It returns the result, or raises what is wrong with the worker.
         probe: a file in the output folder. Workers that do not see it have another storage.
+        folder: the working folder of the command, which its relative paths start from.
         versions: of the packages that must be the same.
     """
 
-    settings: Any
-    prepare: Callable[[Any], object]
     do: Callable[..., Any]
-    folder: str
     probe: str
-    versions: dict[str, str]
-
-    @classmethod
-    def of_this_process(
-        cls, settings: Any, prepare: Callable[[Any], object], do: Callable[..., Any], probe: Path
-    ) -> Work:
-        """Return the work of a command under the folder of this process."""
-        return cls(settings, prepare, do, str(Path.cwd()), str(probe), _versions())
+    folder: str = field(default_factory=os.getcwd)
+    versions: dict[str, str] = field(default_factory=_versions)
 
     def enter(self) -> None:
-        """Make this worker ready. Raises UsageError or InputError if it does not fit, and what `prepare` raises."""
+        """Make this worker ready. Raises UsageError or InputError if it does not fit."""
         for (package, expected), found in zip(self.versions.items(), _versions().values(), strict=True):
             if found != expected:
                 raise UsageError(f"found {package} {found}, expected {expected} as on this machine", hint=SAME_VERSIONS)
@@ -99,7 +90,6 @@ class Work:
                 raise InputError("the folder is not the one of this machine", path=probe.parent, hint=SAME_STORAGE)
             time.sleep(0.1)
         keep_freed_memory()
-        self.prepare(self.settings)
 
 
 def this_worker() -> str:
@@ -112,7 +102,7 @@ def _do(work: Work, *args: Any) -> Any:
     try:
         with _ONE_AT_A_TIME:
             work.enter()
-            return work.do(work.settings, *args)
+            return work.do(*args)
     except SplinecliError as error:
         problem = f"{error.problem} (on the worker {this_worker()})"
         raise type(error)(problem, path=error.path, line=error.line, hint=error.hint) from None
@@ -143,7 +133,10 @@ class Distributor:
             SplinecliError: what an item raised, or what is wrong with a worker. The message names the worker.
             SplinecliError: the scheduler was lost.
         """
-        self._check_installed()
+        # Where splinecli is not installed, a worker could not even read an item.
+        for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
+            if isinstance(found, metadata.PackageNotFoundError):
+                raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
         source, following = iter(items), None
         free_memory, began = available_memory(), time.monotonic()
         for n_looks in count():
@@ -154,10 +147,19 @@ class Distributor:
                 following = following or next(source, None)
                 if following is None:
                     break
-                largest = max(map(_memory_limit, workers.values()))
+                limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
+                largest = max(float(limit or math.inf) for limit in limits)
+                # The workers of a cluster have limits of Dask. Those of this machine share its memory.
+                used = 0.0 if self.options.address else sum(item.memory for item in self.running.values())
                 if following.memory > largest:
-                    yield following, _too_large(following, largest)
-                elif self._has_room(following, free_memory):
+                    error = LostError(
+                        f"it takes about {following.memory / 1e9:.1f} GB of memory, but the largest worker has"
+                        f" {largest / 1e9:.1f} GB",
+                        path=following.name,
+                        hint="Start fewer workers on each machine, with more memory each",
+                    )
+                    yield following, error
+                elif not used or used + following.memory <= free_memory:
                     self._submit(following, workers)
                 else:
                     break
@@ -172,12 +174,6 @@ class Distributor:
                     hint="If there is too little memory, use fewer. Dask's output says more",
                 )
             yield from self._take_results()
-
-    def _check_installed(self) -> None:
-        """Raise UsageError if splinecli is not installed on a worker: it could not even read an item."""
-        for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
-            if isinstance(found, metadata.PackageNotFoundError):
-                raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
 
     def _workers(self) -> dict[str, dict[str, Any]]:
         """Return what Dask says of the workers that may be used. Raises SplinecliError if the scheduler is lost."""
@@ -197,24 +193,13 @@ class Distributor:
             )
         return with_gpu
 
-    def _has_room(self, item: Item, free_memory: float) -> bool:
-        """Return whether this machine's memory holds one more item. The workers of a cluster have limits of Dask."""
-        used = sum(other.memory for other in self.running.values())
-        return bool(self.options.address) or not used or used + item.memory <= free_memory
-
     def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
         needed = {"GPU": 1.0} if self.options.gpu else {}
         if any("MEMORY" in _resources(info) for info in workers.values()):
             needed["MEMORY"] = item.memory
+        key, resources = f"splinecli-{uuid.uuid4().hex}", needed or None
         try:
-            future = self.client.submit(
-                _do,
-                self.work,
-                *item.args,
-                key=f"splinecli-{uuid.uuid4().hex}",
-                resources=needed or None,
-                pure=False,
-            )
+            future = self.client.submit(_do, self.work, *item.args, key=key, resources=resources, pure=False)
         except (OSError, RuntimeError) as error:
             raise _scheduler_lost() from error
         self.running[future] = item
@@ -242,7 +227,12 @@ class Distributor:
             future.add_done_callback(self._done.put)  # the worker was lost with the result: Dask repeats it
             return
         except KilledWorker as error:
-            result = _lost(item, error)
+            last = getattr(error.last_worker, "address", error.last_worker)
+            result = LostError(
+                f"its worker was lost {error.allowed_failures + 1} times, the last one {last}",
+                path=item.name,
+                hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
+            )
         del self.running[future]
         yield item, result
 
@@ -251,51 +241,20 @@ def _resources(info: dict[str, Any]) -> dict[str, float]:
     return info.get("resources") or {}
 
 
-def _memory_limit(info: dict[str, Any]) -> float:
-    """Return the bytes of memory of a worker."""
-    return float(_resources(info).get("MEMORY") or info.get("memory_limit") or math.inf)
-
-
-def _too_large(item: Item, largest: float) -> LostError:
-    return LostError(
-        f"it takes about {item.memory / 1e9:.1f} GB of memory, but the largest worker has {largest / 1e9:.1f} GB",
-        path=item.name,
-        hint="Start fewer workers on each machine, with more memory each",
-    )
-
-
-def _lost(item: Item, error: Any) -> LostError:
-    last = error.last_worker
-    return LostError(
-        f"its worker was lost {error.allowed_failures + 1} times, the last one {getattr(last, 'address', last)}",
-        path=item.name,
-        hint="If there was too little memory, start fewer workers on each machine, or make the images smaller",
-    )
-
-
 def _scheduler_lost() -> SplinecliError:
     return SplinecliError(
-        "the connection to the Dask scheduler was lost",
-        hint="Run the same command again. It skips what is done",
+        "the connection to the Dask scheduler was lost", hint="Run the same command again. It skips what is done"
     )
-
-
-def _versions() -> dict[str, str]:
-    return {"splinecli": __version__, "distributed": metadata.version("distributed")}
 
 
 @contextmanager
 def distributor(
-    settings: Any,
-    prepare: Callable[[Any], object],
-    do: Callable[..., Any],
-    output: Path,
-    options: ClusterOptions,
-    observer: Observer,
+    do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers; see Work for the first three arguments.
+    """Yield a Distributor with a connection to its workers.
 
     Args:
+        do: see Work.
         output: the output folder, by which workers show that they have the same storage. It is made as needed.
 
     Raises:
@@ -303,16 +262,13 @@ def distributor(
         OutputError: the folder cannot be made.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
-    with refusals_as_output_errors(output):
-        made = [place for place in (output, *output.parents) if not place.exists()]
-        output.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-    try:
-        with connected(options) as client:
-            work = Work.of_this_process(settings, prepare, do, probe.absolute())
-            yield Distributor(client, work, options, observer)
-    finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
-            for place in made:
-                place.rmdir()
+    with ExitStack() as stack:
+        with refusals_as_output_errors(output):
+            stack.enter_context(made_folder(output))
+            probe.touch()
+        try:
+            with connected(options) as client:
+                yield Distributor(client, Work(do, str(probe.absolute())), options, observer)
+        finally:
+            with suppress(OSError):
+                probe.unlink(missing_ok=True)

@@ -7,18 +7,20 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from splinecli.capture import Capture
+from splinecli.capture.capture_warnings import ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
+from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.methods import Estimator
+from splinecli.methods.near_light import find_surface
+from splinecli.pipeline.distillation import distil_for
 from splinecli.pipeline.observer import SILENT, Advance, Observer
 from splinecli.results.clock import Clock
 
 if TYPE_CHECKING:
-    from splinecli.capture import Capture
-    from splinecli.capture.capture_warnings import CaptureWarning
-    from splinecli.inference import NormalEstimate
-    from splinecli.methods import Estimator
     from splinecli.methods.distilled import DistilledEstimator
 
-_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}
-"""What the clock calls the later stages of an estimation."""
+_STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # as the clock calls them
 
 
 def estimate_capture(
@@ -46,12 +48,6 @@ def estimate_capture(
         progress: called with the number of pixels that were just estimated, in place of the observer.
         clock: is told of the stages.
     """
-    from splinecli.capture.capture_warnings import ROUGH_LIGHTS
-    from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
-    from splinecli.inference import estimate_normals
-    from splinecli.methods.near_light import find_surface
-    from splinecli.pipeline.distillation import distil_for
-
     clock = clock or Clock()
     clock.begin("check")
     warnings = [*capture.warnings, *check(capture)]
@@ -82,8 +78,7 @@ def estimate_capture(
 def _untrained_lights(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:
     if estimator.weights is None:
         return []
-    from splinecli.capture.capture_warnings import UNTRAINED_LIGHTS, CaptureWarning
     from splinecli.networks.weights import untrained_warning
 
-    texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
-    return [CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts]
+    warnings = untrained_warning(estimator.weights["sha256"], capture.n_lights)
+    return [CaptureWarning(UNTRAINED_LIGHTS, text) for text in warnings]

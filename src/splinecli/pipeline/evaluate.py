@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,7 @@ from splinecli.capture.lights.found_lights import ESTIMATE
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, UsageError
-from splinecli.evaluation.capture_figures import (
-    CaptureFigure,
-    capture_figures,
-    file_stems,
-    has_observation_maps,
-)
+from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
 from splinecli.evaluation.files import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
@@ -27,7 +23,9 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import Elsewhere, evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
+from splinecli.networks.weights import untrained_warning
 from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.evaluate_on_workers import score_on_workers
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.system.devices import count_available_cores
 from splinecli.system.files import check_writable
@@ -99,8 +97,7 @@ class EvaluateOptions:
         check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.lights not in (None, ESTIMATE):
             raise UsageError(
-                f"--lights is {self.lights}; expected {ESTIMATE}",
-                hint="Without it, the captures' light files count",
+                f"--lights is {self.lights}; expected {ESTIMATE}", hint="Without it, the captures' light files count"
             )
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
             raise UsageError(
@@ -111,8 +108,7 @@ class EvaluateOptions:
             raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(
-                "--jobs contradicts --workers and --cluster",
-                hint="Leave it out: a worker scores one trial at a time",
+                "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"
             )
         for name in self.methods:
             check_method(name)
@@ -184,7 +180,14 @@ def evaluate_captures(
     check_skip_first(protocols[0], list(distinct_names(captures).values()))
     read_draws_file(protocols[0])
     _check_counts(captures, protocols)
-    estimators = _make_estimators(options)
+    estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
+    if options.method_options.weights is not None and not any(estimator.weights for estimator in estimators):
+        names = ", ".join(estimator.name for estimator in estimators)
+        raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
+    jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
+    elsewhere: Elsewhere | None = None
+    if (cluster := options.cluster and options.cluster.on_cores()) is not None:
+        elsewhere = partial(score_on_workers, estimators, options.method_options, protocols, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(
@@ -192,8 +195,8 @@ def evaluate_captures(
                 estimators,
                 protocols,
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
-                jobs=_default_jobs(estimators) if options.jobs is None else options.jobs,
-                elsewhere=_elsewhere(options, estimators, protocols, observer),
+                jobs=options.jobs or jobs,
+                elsewhere=elsewhere,
                 on_progress=_follow(advance),
             )
         plots = make_plots(evaluations)
@@ -205,29 +208,6 @@ def evaluate_captures(
     return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
 
 
-def _elsewhere(
-    options: EvaluateOptions,
-    estimators: Sequence[Estimator],
-    protocols: Sequence[Protocol],
-    observer: Observer,
-) -> Elsewhere | None:
-    """Return what scores trials in other processes, if the options ask for it."""
-    cluster = None if options.cluster is None else options.cluster.on_cores()
-    if cluster is None:
-        return None
-    from splinecli.pipeline.evaluate_on_workers import OnWorkers
-
-    return OnWorkers(estimators, options.method_options, protocols, cluster, Path(options.output), observer)
-
-
-def _make_estimators(options: EvaluateOptions) -> list[Estimator]:
-    estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
-    if options.method_options.weights is not None and not any(e.weights for e in estimators):
-        names = ", ".join(e.name for e in estimators)
-        raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
-    return estimators
-
-
 def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> None:
     """Raise UsageError if more lights are requested than any capture has."""
     most = 0
@@ -237,12 +217,6 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
             raise UsageError(f"{protocol.n_lights} lights were requested, but the captures have at most {most}")
-
-
-def _default_jobs(estimators: Sequence[Estimator]) -> int:
-    if any(estimator.device.startswith("cuda") for estimator in estimators):
-        return 1
-    return count_available_cores()
 
 
 def _follow(advance: Callable[..., None]) -> Callable[[float, int, str], None]:
@@ -265,7 +239,6 @@ def _draw_figures(
     pixels: Sequence[tuple[int, int]],
     observer: Observer,
 ) -> tuple[list[CaptureFigure], list[str]]:
-    """Return the figures of the captures that were scored, and the problems of those without figures."""
     folders = {name: folder for folder, name in distinct_names(captures).items()}
     names = [name for name in folders if name in evaluation.captures]
     figures: list[CaptureFigure] = []
@@ -282,9 +255,5 @@ def _draw_figures(
 def _untrained(evaluations: Sequence[Evaluation]) -> list[str]:
     """Return warnings about shipped weights that were used with numbers of lights they were not trained for."""
     used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
-    if not used:
-        return []
-    from splinecli.networks.weights import untrained_warning
-
     counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
     return [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]

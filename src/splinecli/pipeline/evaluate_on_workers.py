@@ -5,6 +5,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from splinecli.capture import open_capture
@@ -27,9 +28,16 @@ class _Settings:
     protocols: tuple[Protocol, ...]
 
 
-@dataclass(frozen=True)
-class OnWorkers:
-    """Scores draws on workers. Only the process of the command writes the store of trials.
+def score_on_workers(
+    estimators: Sequence[Estimator],
+    method_options: MethodOptions,
+    protocols: Sequence[Protocol],
+    cluster: ClusterOptions,
+    output: Path,
+    observer: Observer,
+    draws: Sequence[DrawTask],
+) -> Iterator[tuple[DrawTask, DrawScores]]:
+    """Yield the draws with their scores as they end. Only the process of the command writes the store of trials.
 
     Args:
         estimators, method_options: the methods.
@@ -37,38 +45,28 @@ class OnWorkers:
         cluster: where draws are scored.
         output: a folder that all workers see.
         observer: receives messages.
+        draws: what is scored.
+
+    Raises:
+        LostError: the workers of a draw were lost. All others are scored.
+        SplinecliError: what a trial or Distributor.run raises.
     """
-
-    estimators: Sequence[Estimator]
-    method_options: MethodOptions
-    protocols: Sequence[Protocol]
-    cluster: ClusterOptions
-    output: Path
-    observer: Observer
-
-    def __call__(self, draws: Sequence[DrawTask]) -> Iterator[tuple[DrawTask, DrawScores]]:
-        """Yield the draws with their scores as they end.
-
-        Raises:
-            LostError: the workers of a draw were lost. All others are scored.
-            SplinecliError: what a trial or Distributor.run raises.
-        """
-        settings = _Settings(
-            uuid.uuid4().hex,
-            tuple(estimator.name for estimator in self.estimators),
-            self.method_options,
-            tuple(estimator.fingerprint for estimator in self.estimators),
-            tuple(self.protocols),
-        )
-        lost: LostError | None = None
-        with distributor(settings, _scorer, _score, self.output, self.cluster, self.observer) as workers:
-            for item, result in workers.run(_items(draws)):
-                if isinstance(result, LostError):
-                    lost = result
-                else:
-                    yield item.args[0], result
-        if lost is not None:
-            raise lost
+    settings = _Settings(
+        uuid.uuid4().hex,
+        tuple(estimator.name for estimator in estimators),
+        method_options,
+        tuple(estimator.fingerprint for estimator in estimators),
+        tuple(protocols),
+    )
+    lost: LostError | None = None
+    with distributor(partial(_score, settings), output, cluster, observer) as workers:
+        for item, result in workers.run(_items(draws)):
+            if isinstance(result, LostError):
+                lost = result
+            else:
+                yield item.args[0], result
+    if lost is not None:
+        raise lost
 
 
 def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
@@ -79,11 +77,10 @@ def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
         yield Item((draw,), draw.name, memory)
 
 
-_scorers: dict[str, DrawScorer] = {}
-"""That of the command that this worker serves."""
+_scorers: dict[str, DrawScorer] = {}  # that of the command that this worker serves
 
 
-def _scorer(settings: _Settings) -> DrawScorer:
+def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
     if settings.command not in _scorers:
         estimators = [make_estimator(name, settings.method_options) for name in settings.methods]
         for estimator, expected in zip(estimators, settings.fingerprints, strict=True):
@@ -95,8 +92,4 @@ def _scorer(settings: _Settings) -> DrawScorer:
                 )
         _scorers.clear()
         _scorers[settings.command] = DrawScorer(estimators, settings.protocols)
-    return _scorers[settings.command]
-
-
-def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
-    return _scorer(settings).score(draw)
+    return _scorers[settings.command].score(draw)

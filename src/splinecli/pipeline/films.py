@@ -18,9 +18,7 @@ from splinecli.system.files import read_json
 from splinecli.system.locks import RefusedFolderError
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
-FOLDER = "frames"
-"""The folder in the output folder of `infer` with a folder of frames for each film."""
-
+FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film
 _RECORD = "film.json"
 _FRAME = re.compile(r"frame-\d{6,}\.png")
 

@@ -2,45 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splinecli import __version__
-from splinecli.errors import SplinecliError
+from splinecli.capture import CaptureSource
+from splinecli.capture.stamp import digest
+from splinecli.errors import OutputError, SplinecliError
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
+from splinecli.results.index import Entry
+from splinecli.system.files import file_sha256
 from splinecli.system.locks import RefusedFolderError
-
-if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource
+from splinecli.system.publishing import is_plain
 
 
-@dataclass(frozen=True)
-class EarlierResults:
-    """What a folder of results contains before a run.
+class ChangedError(OutputError):
+    """A folder has results of other input files, other options or another version."""
 
-    Args:
-        report: the report in the folder if these results are still good, else None.
-        changed: why they are not, in words; empty if they are, or if there are none.
-        unfinished: why what is in the folder does not count as results, in words; empty if it does.
-    """
-
-    report: dict[str, Any] | None = None
-    changed: str = ""
-    unfinished: str = ""
+    def __init__(self, made: str, folder: Path) -> None:
+        hint = "Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o"
+        super().__init__(f"contains results made {made}", path=folder, hint=hint)
 
 
-def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierResults:
-    """Compare the results in `target` with the capture in `folder` and the options.
+def find_earlier(
+    target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
+) -> dict[str, Any] | None:
+    """Return the report in `target` if its results are those of the capture in `folder` and the options.
+
+    Without results it is None. If an interrupted run left some, `warn` receives a sentence about that.
 
     Raises:
+        ChangedError: the results are not those of this capture and these options.
         InputError: the capture cannot be read.
         RefusedFolderError: both are one folder, which may have files of the user with the names of results.
     """
-    from splinecli.results.files import OWN_FILES, REPORT, UnfinishedError, read_report
-    from splinecli.results.index import Entry
-    from splinecli.system.publishing import is_plain
-
     try:
         report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
@@ -49,22 +47,25 @@ def find_earlier(target: Path, folder: Path, options: InferOptions) -> EarlierRe
             raise ValueError
     except UnfinishedError as error:
         found = next((name for name in OWN_FILES if (target / name).exists()), None)
-        if found is not None and not is_plain(target / REPORT) and target.samefile(folder):
+        if found is None:
+            return None
+        if not is_plain(target / REPORT) and target.samefile(folder):
             raise RefusedFolderError(
                 f"contains {found}, but no {REPORT}, and is the folder of the capture",
                 path=target,
                 hint="Add --overwrite, or choose another place with -o",
             ) from None
-        return EarlierResults(unfinished="" if found is None else str(error))
+        warn(f"{target}: {error}, so it is computed again")
+        return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
-        return EarlierResults(changed="contains results made by another version")
+        raise ChangedError("by another version", target) from None
     if version != __version__:
-        return EarlierResults(changed=f"contains results made by version {version}")
+        raise ChangedError(f"by version {version}", target)
     if earlier != options:
-        return EarlierResults(changed=f"contains results made with {_differences(earlier, options)}")
+        raise ChangedError(f"with {_differences(earlier, options)}", target)
     if stamp != inputs_sha256(options.open(folder), options.weights):
-        return EarlierResults(changed="contains results made from other input files")
-    return EarlierResults(report)
+        raise ChangedError("from other input files", target)
+    return report
 
 
 def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
@@ -72,9 +73,6 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
     `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
     """
-    from splinecli.capture.stamp import digest
-    from splinecli.system.files import file_sha256
-
     if weights is not None and Path(weights).is_file():
         weights = loaded or file_sha256(Path(weights))
     return digest([*source.stamp, weights])

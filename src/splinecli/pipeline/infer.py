@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from splinecli.capture import Capture, CaptureSource, capture_name
+from splinecli.capture.capture_size import results_bytes
+from splinecli.capture.formats.image_size import check_memory
+from splinecli.capture.lights.draws import draw_lights
+from splinecli.capture.restore.light_refinement import refine_capture
+from splinecli.diagnosis.checks import check_capture
 from splinecli.errors import OutputError, UsageError
+from splinecli.inference import NormalEstimate
+from splinecli.methods import Estimator, make_estimator
+from splinecli.methods.estimator import tells_confidence
+from splinecli.pictures.light_sky import sky_plot
+from splinecli.pictures.maps import albedo_picture
+from splinecli.pictures.png import encode_png
+from splinecli.pipeline.estimate import estimate_capture
 from splinecli.pipeline.finished import inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from splinecli.capture import Capture, CaptureSource
-    from splinecli.inference import NormalEstimate
-    from splinecli.methods import Estimator
-    from splinecli.results.clock import Clock
-    from splinecli.system.publishing import NewFiles
+from splinecli.pipeline.surface import make_surface, view_of_report
+from splinecli.results import files
+from splinecli.results.albedo import albedo_map
+from splinecli.results.clock import Clock
+from splinecli.results.page import result_page
+from splinecli.results.report import report_of
+from splinecli.surface.mesh import check_triangles
+from splinecli.surface.relief import relief_of_normals
+from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
+from splinecli.system.publishing import Content, held_folder, refuse_link
 
 
 def infer_capture(
@@ -44,73 +60,57 @@ def infer_capture(
         ModelError: the weights cannot be used.
         OutputError: the results cannot be written, or another process writes into that folder (BusyError).
     """
-    from splinecli.capture import capture_name
-
     with held_results(capture_name(folder), options, observer) as target:
-        return _infer_into(folder, target, options, observer, estimator)
+        clock = Clock()
+        if options.finds_lights:
+            _check_light_files(target)
+        source, capture = _read(folder, options, observer)
+        estimator = estimator or make_method(options)
+        _check_results(capture, folder, options)
+        estimate, distilled = estimate_capture(
+            capture,
+            estimator,
+            partial(check_capture, source, strict=options.strict),
+            refine_lights=partial(refine_capture, intensities_known=source.intensities_known)
+            if options.refine_lights
+            else None,
+            distil=options.distil,
+            strict=options.strict,
+            observer=observer,
+            clock=clock,
+        )
+        for warning in estimate.capture.warnings:
+            observer.warn(f"{capture.name}: {warning}")
+        loaded = None if estimator.weights is None else estimator.weights["sha256"]
+        report = report_of(
+            estimate,
+            estimator,
+            options.as_dict(),
+            inputs_sha256(source, options.weights, loaded=loaded),
+            light_file=source.files.light_directions,
+            as_stored=options.as_stored,
+            distillation=None if distilled is None else distilled.report(),
+        )
+        further = _further_files(source, estimate, report, options, observer, clock)
+        clock.begin("write")
+        return files.write_estimate(
+            estimate,
+            report,
+            target,
+            formats=options.formats,
+            convention=options.convention,
+            clock=clock,
+            more=chain.from_iterable(further),
+        )
 
 
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
     """Hold the folder of results of a capture (see held_folder) and yield it. Raises OutputError."""
-    from splinecli.system.publishing import held_folder, refuse_link
-
     target = Path(options.output) / name
     refuse_link(target)
     with held_folder(target, observer.warn):
         yield target
-
-
-def _infer_into(
-    folder: Path, target: Path, options: InferOptions, observer: Observer, estimator: Estimator | None
-) -> dict[str, Any]:
-    """Do the work of infer_capture in the folder of results, which the caller holds."""
-    from splinecli.diagnosis.checks import check_capture
-    from splinecli.pipeline.estimate import estimate_capture
-    from splinecli.results.clock import Clock
-    from splinecli.results.files import write_estimate
-    from splinecli.results.report import report_of
-
-    clock = Clock()
-    if options.finds_lights:
-        _check_light_files(target)
-    source, capture = _read(folder, options, observer)
-    if estimator is None:
-        estimator = make_method(options)
-    _check_results(capture, folder, options)
-    estimate, distilled = estimate_capture(
-        capture,
-        estimator,
-        partial(check_capture, source, strict=options.strict),
-        refine_lights=_light_refinement(source, options),
-        distil=options.distil,
-        strict=options.strict,
-        observer=observer,
-        clock=clock,
-    )
-    for warning in estimate.capture.warnings:
-        observer.warn(f"{capture.name}: {warning}")
-    loaded = None if estimator.weights is None else estimator.weights["sha256"]
-    report = report_of(
-        estimate,
-        estimator,
-        options.as_dict(),
-        inputs_sha256(source, options.weights, loaded=loaded),
-        light_file=source.files.light_directions,
-        as_stored=options.as_stored,
-        distillation=None if distilled is None else distilled.report(),
-    )
-    further = _further_files(source, estimate, report, options, observer, clock)
-    clock.begin("write")
-    return write_estimate(
-        estimate,
-        report,
-        target,
-        formats=options.formats,
-        convention=options.convention,
-        clock=clock,
-        more=further,
-    )
 
 
 def make_method(options: InferOptions) -> Estimator:
@@ -120,9 +120,6 @@ def make_method(options: InferOptions) -> Estimator:
         UsageError: the method uses no weights or gives no confidence, and the options ask for it.
         ModelError: the weights cannot be used.
     """
-    from splinecli.methods import make_estimator
-    from splinecli.methods.estimator import tells_confidence
-
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:
         raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
@@ -132,37 +129,26 @@ def make_method(options: InferOptions) -> Estimator:
 
 
 def _read(folder: Path, options: InferOptions, observer: Observer) -> tuple[CaptureSource, Capture]:
-    """Return the opened capture, and the capture under the chosen lights."""
     source = options.open(folder)
     name = source.files.name
     if options.auto_mask:
         with observer.progress(f"{name}: finding the object", source.n_lights) as advance:
             source = source.find_mask(lambda: advance(1))
-    indices = _choose_lights(source, options)
+    indices = options.light_indices
+    if options.n_lights is not None:
+        indices = draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
     count = source.n_lights if indices is None else len(indices)
     with observer.progress(f"{name}: reading", count) as advance:
         capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
     return source, capture
 
 
-def _choose_lights(source: CaptureSource, options: InferOptions) -> Sequence[int] | None:
-    if options.n_lights is None:
-        return options.light_indices
-    from splinecli.capture.lights.draws import draw_lights
-
-    return draw_lights(source.light_directions, options.n_lights, trials=1, seed=options.seed)[0]
-
-
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
     """Raise InputError, before hours of work, for results that take more memory than is left, or an empty mesh."""
-    from splinecli.capture.capture_size import results_bytes
-    from splinecli.capture.formats.image_size import check_memory
-
     albedo = "albedo" in options.maps or options.html
+    surface = options.surface or "relief" in options.maps
     check_memory(
-        results_bytes(
-            capture.n_pixels, capture.n_lights, albedo=albedo, surface=options.surface or "relief" in options.maps
-        ),
+        results_bytes(capture.n_pixels, capture.n_lights, albedo=albedo, surface=surface),
         f"the results of {capture.n_pixels} pixels take",
         folder,
         hint="Mask the object, or use --scale or --crop"
@@ -170,32 +156,19 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
         + (", or neither albedo in --maps nor --html" if albedo else ""),
     )
     if options.surface:
-        from splinecli.surface.mesh import check_triangles
-
         check_triangles(capture.mask)
 
 
 def _check_light_files(target: Path) -> None:
     """Raise OutputError for a light file in the folder of results that no earlier run wrote."""
-    from splinecli.results.files import LIGHT_FILES, own_light_files
-
-    own = own_light_files(target)
-    for name in LIGHT_FILES:
+    own = files.own_light_files(target)
+    for name in files.LIGHT_FILES:
         if (target / name).exists() and name not in own:
             raise OutputError(
                 "the file is not from an earlier run, and --lights estimate would overwrite it",
                 path=target / name,
                 hint="Choose another -o",
             )
-
-
-def _light_refinement(source: CaptureSource, options: InferOptions) -> Callable[[Capture], Capture] | None:
-    if not options.refine_lights:
-        return None
-    from splinecli.capture.restore.light_refinement import refine_capture
-
-    known = source.intensities_known
-    return partial(refine_capture, intensities_known=known)
 
 
 def _further_files(
@@ -205,99 +178,51 @@ def _further_files(
     options: InferOptions,
     observer: Observer,
     clock: Clock,
-) -> list[Callable[[NewFiles], None]]:
-    """Compute what else the options ask for. Each function that is returned writes some files."""
-    from splinecli.pictures.light_sky import sky_plot
-    from splinecli.results import files
-
+) -> list[Iterable[tuple[str, Content]]]:
+    """Compute what else the options ask for, put what the report says of the surface into it, and return the files."""
     capture = estimate.capture
-    writers: list[Callable[[NewFiles], None]] = []
+    found: list[Iterable[tuple[str, Content]]] = [files.map_files(estimate, options.maps)]
     albedo = colours = None
     clock.begin("pictures")
     if "albedo" in options.maps or options.html:
-        from splinecli.pictures.maps import albedo_picture
-        from splinecli.results.albedo import albedo_map
-
         with observer.progress(f"{capture.name}: albedo", capture.n_lights) as advance:
             albedo = albedo_map(source, capture, estimate.normal_map, progress=lambda: advance(1))
         colours = albedo_picture(albedo, capture.mask)
         if "albedo" in options.maps:
-            writers.append(partial(files.write_albedo, albedo, capture.mask, exr="exr" in options.formats))
-    if "confidence" in options.maps and estimate.confidence_map is not None:
-        writers.append(partial(files.write_confidence, estimate.confidence_map))
-    for name, write in (
-        ("preview", files.write_preview),
-        ("gradient", files.write_gradient),
-        ("curvature", files.write_curvature),
-    ):
-        if name in options.maps:
-            writers.append(partial(write, estimate))
+            found.append(files.albedo_files(albedo, capture.mask, exr="exr" in options.formats))
     if "relief" in options.maps:
-        from splinecli.surface.relief import relief_of_normals
-
-        writers.append(partial(files.write_relief, relief_of_normals(estimate.normal_map, capture.mask)))
+        found.append(files.relief_files(relief_of_normals(estimate.normal_map, capture.mask)))
     light_plot = None
     if capture.light_errors_deg is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)
-        writers.append(partial(files.write_lights, capture, light_plot))
+        found.append(files.light_files(capture, light_plot))
     if source.automatic_mask is not None:
-        writers.append(partial(files.write_mask, source.window.filled(capture.mask)))
+        found.append([(files.FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
         clock.begin("surface")
-        writers.append(_surface(estimate, colours, report, options, observer))
+        camera_matrix, pixel_size = view_of_report(report)
+        with observer.progress(f"{capture.name}: integrating", 1) as advance:
+            surface, report["surface"] = make_surface(
+                estimate.normal_map,
+                capture.mask,
+                camera_matrix,
+                colours,
+                stiffness=options.stiffness,
+                pixel_size_mm=pixel_size,
+                progress=advance,
+            )
+        formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
+        found.append(encode_surface(surface, formats))
     if options.html:
         clock.begin("pictures")
-        writers.append(_page(estimate, albedo, {**report, "seconds": clock.seconds()}, light_plot))
-    return writers
-
-
-def _surface(
-    estimate: NormalEstimate,
-    colours: NDArray[np.uint8] | None,
-    report: dict[str, Any],
-    options: InferOptions,
-    observer: Observer,
-) -> Callable[[NewFiles], None]:
-    """Integrate the normals, put what the report says of the surface into it, and return what writes the files."""
-    from splinecli.pipeline.surface import make_surface, view_of_report
-    from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
-
-    camera_matrix, pixel_size = view_of_report(report)
-    with observer.progress(f"{estimate.capture.name}: integrating", 1) as advance:
-        surface, report["surface"] = make_surface(
+        page = result_page(
+            {**report, "seconds": clock.seconds()},
             estimate.normal_map,
-            estimate.capture.mask,
-            camera_matrix,
-            colours,
-            stiffness=options.stiffness,
-            pixel_size_mm=pixel_size,
-            progress=advance,
+            capture.mask,
+            albedo=albedo,
+            confidence_map=estimate.confidence_map,
+            error_map_deg=estimate.error_map_deg,
+            light_plot=light_plot,
         )
-    formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
-
-    def write(new: NewFiles) -> None:
-        for name, content in encode_surface(surface, formats):
-            new.write(name, content)
-
-    return write
-
-
-def _page(
-    estimate: NormalEstimate,
-    albedo: NDArray[np.float32] | None,
-    report: dict[str, Any],
-    light_plot: bytes | None,
-) -> Callable[[NewFiles], None]:
-    from splinecli.results.files import PAGE
-    from splinecli.results.page import result_page
-
-    page = result_page(
-        report,
-        estimate.normal_map,
-        estimate.capture.mask,
-        albedo=albedo,
-        confidence_map=estimate.confidence_map,
-        error_map_deg=estimate.error_map_deg,
-        light_plot=light_plot,
-    )
-    return lambda new: new.write(PAGE, page)
+        found.append([(files.PAGE, page)])
+    return found

@@ -7,11 +7,14 @@ from dataclasses import asdict, dataclass, field
 from math import isfinite
 from typing import Any, Literal, get_args
 
+from splinecli.capture.lights.draws import check_draw_settings
+from splinecli.capture.record import check_light_indices
 from splinecli.errors import UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
 from splinecli.pipeline.reading import Reading
 from splinecli.pipeline.surface import check_pixel_size
+from splinecli.results.files import MAPS, NORMALS
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.system.exr import check_exr
 
@@ -66,10 +69,6 @@ class InferOptions(Reading):
     convention: Convention = "opengl"
 
     def __post_init__(self) -> None:
-        from splinecli.capture.lights.draws import check_draw_settings
-        from splinecli.capture.record import check_light_indices
-        from splinecli.results.files import MAPS, NORMALS
-
         super().__post_init__()
         if self.n_lights is not None and self.light_indices is not None:
             raise UsageError("--n-lights and --light-indices contradict each other", hint="Leave one out")
@@ -109,11 +108,6 @@ class InferOptions(Reading):
     def method_options(self) -> MethodOptions:
         """The part of the options that concerns the method."""
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
-
-    @property
-    def scales_surface(self) -> bool:
-        """Whether the pixel size also scales a surface."""
-        return self.surface
 
     def check_files(self) -> None:
         """See Reading. Raise UsageError, too, if a package that the options need is not installed."""

@@ -5,33 +5,33 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from splinecli.capture.capture_warnings import estimated_lights
+from splinecli.capture.lights.found_lights import FoundLights
+from splinecli.capture.lights.light_files import rows_text
+from splinecli.capture.summary import CaptureSummary, summarise_capture
+from splinecli.diagnosis.checks import check_sample
+from splinecli.diagnosis.evidence import StatedLights
+from splinecli.diagnosis.light_advice import candidate_rows
 from splinecli.errors import InputError, UsageError
+from splinecli.methods.student_size import student_sizes
+from splinecli.pictures.light_sky import sky_plot
 from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
+from splinecli.pipeline.distillation import AUTOMATIC_FROM
 from splinecli.pipeline.films import unpacked
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.reading import Reading
+from splinecli.system.files import check_free, write_bytes
 
-if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource
-    from splinecli.capture.lights.found_lights import FoundLights
-    from splinecli.capture.summary import CaptureSummary
-
-PIXELS_PER_SECOND = 2000
-"""Speed of spline-net on a laptop's processor. benchmarks/inference_speed.py measures that of your machine."""
-
-LEARNED_PER_SECOND = 1000
-"""Pixels of the sample of a distilled network: a pixel's time in the network, and that of learning it."""
-
-DISTILLED_PER_SECOND = 130_000
-"""Speed of reading, of the distilled network, of the refinement and of writing together, on two cores."""
-
-SURFACE_PER_SECOND = 50_000
-"""Speed of integration, mesh and their files on one core. Noise of the normals and tears take longer."""
-
+# Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.
+PIXELS_PER_SECOND = 2000  # of spline-net
+LEARNED_PER_SECOND = 1000  # of the sample of a distilled network, in the network and in learning
+DISTILLED_PER_SECOND = 130_000  # reading, distilled network, refinement and writing together, on two cores
+SURFACE_PER_SECOND = 50_000  # integration, mesh and their files, on one core
 STARTING_SECONDS = 3
-"""Time that infer takes besides the pixels."""
 
 ORIGINS = {
     "given": "given by --white-level",
@@ -85,17 +85,14 @@ def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[
 
 
 def _describe(options: InfoOptions, observer: Observer) -> dict[str, Any]:
-    from splinecli.capture.capture_warnings import estimated_lights
-    from splinecli.capture.lights.light_files import rows_text
-    from splinecli.capture.summary import summarise_capture
-    from splinecli.diagnosis.checks import check_sample
-    from splinecli.diagnosis.evidence import StatedLights
-    from splinecli.diagnosis.light_advice import candidate_rows
-    from splinecli.system.files import check_free, write_bytes
-
     source = options.reading.open(options.capture)
     if options.plot is not None:
-        _check_plot(options.plot, source, overwrite=options.overwrite)
+        if options.plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
+            raise UsageError(
+                f"the plot {options.plot} would be in the folder of the images and count as an image of the capture",
+                hint="Choose another folder for it",
+            )
+        check_free(options.plot.parent, [options.plot.name], overwrite=options.overwrite)
     if options.mended_lights is not None:
         if source.lamps is not None and source.lamps.used:
             raise UsageError("--mended-lights writes directions, but the lights are near lamps")
@@ -105,7 +102,8 @@ def _describe(options: InfoOptions, observer: Observer) -> dict[str, Any]:
     summary, found_lights = _with_found_lights(summary)
     source = summary.source
     if options.plot is not None:
-        write_bytes(options.plot, _sky_plot(source, found_lights))
+        errors_deg = None if found_lights is None else found_lights.errors_deg
+        write_bytes(options.plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
     check, warnings = None, summary.warnings()
     if summary.sample is not None and summary.closeup is not None:
         lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
@@ -188,17 +186,6 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     ]
 
 
-def _check_plot(plot: Path, source: CaptureSource, *, overwrite: bool) -> None:
-    from splinecli.system.files import check_free
-
-    if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-        raise UsageError(
-            f"the plot {plot} would be in the folder of the images and count as an image of the capture",
-            hint="Choose another folder for it",
-        )
-    check_free(plot.parent, [plot.name], overwrite=overwrite)
-
-
 def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLights | None]:
     """Return the summary with the lights that are found from its sample, and these; None where files give them."""
     source, sample = summary.source, summary.sample
@@ -211,26 +198,21 @@ def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLi
     return replace(summary, source=replace(source, light_directions=found.directions)), found
 
 
-def _sky_plot(source: CaptureSource, found: FoundLights | None) -> bytes:
-    from splinecli.pictures.light_sky import sky_plot
-
-    errors_deg = None if found is None else found.errors_deg
-    return sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg)
-
-
 def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any]:
     source, files, level = summary.source, summary.source.files, summary.white_level
     kinds = sorted({(image.shape[1], image.shape[0], image.shape[2], image.dtype) for image in summary.images})
     angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
     intensities = files.light_intensities
-    seconds = STARTING_SECONDS + _seconds(summary)
+    first, seconds = summary.images[0], STARTING_SECONDS + _seconds(summary)
+    largest = first.shape, np.dtype(first.dtype).itemsize
+    memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
     if intensities is None and (source.light_intensities != 1).any():
         intensities = files.light_directions  # the light files of AliceVision have both
     return {
         "capture": files.name,
         "layout": files.layout,
         "images": len(summary.images),
-        "first_image": summary.images[0].path.name,
+        "first_image": first.path.name,
         "last_image": summary.images[-1].path.name,
         "image_kinds": [
             {"size": [width, height], "channels": channels, "type": dtype} for width, height, channels, dtype in kinds
@@ -256,7 +238,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
             "saturated": round(max(image.saturated for image in summary.images), 4),
         },
         "expect": {
-            "memory_mib": round(_memory_mib(summary)),
+            "memory_mib": round(memory / 2**20),
             "seconds": round(seconds),
             "seconds_with_surface": round(seconds + summary.n_pixels / SURFACE_PER_SECOND),
         },
@@ -265,18 +247,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
 
 def _seconds(summary: CaptureSummary) -> float:
     """Return the time of spline-net on a capture, distilled from the size where `infer` does so."""
-    from splinecli.methods.student_size import student_sizes
-    from splinecli.pipeline.distillation import AUTOMATIC_FROM
-
     count, lamps = summary.n_pixels, summary.source.lamps
     if count < AUTOMATIC_FROM or (lamps is not None and lamps.used):
         return count / PIXELS_PER_SECOND
     return student_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
-
-
-def _memory_mib(summary: CaptureSummary) -> float:
-    import numpy as np
-
-    first = summary.images[0]
-    largest = first.shape, np.dtype(first.dtype).itemsize
-    return (BASE_BYTES + infer_bytes(largest, summary.n_pixels, summary.source.n_lights)) / 2**20

@@ -6,37 +6,31 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
-from splinecli.errors import InputError, SplinecliError, UsageError
+import numpy as np
+
+from splinecli.capture import read_image, read_normal_map
+from splinecli.capture.capture_size import BYTES_OF_SURFACE
+from splinecli.capture.formats.depth_files import read_depth
+from splinecli.capture.formats.image_size import ExpectedSize, check_memory
+from splinecli.capture.lights.lamp_files import read_camera_matrix
+from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.surface import (
-    check_pixel_size,
-    make_surface,
-    view_of_report,
-)
+from splinecli.pipeline.surface import check_pixel_size, make_surface, view_of_report
+from splinecli.results.files import ALBEDO_PICTURE, NORMALS, REPORT, UnfinishedError, read_report
 from splinecli.surface.bilateral_equations import STIFFNESS
-from splinecli.surface.surface_files import (
-    DEFAULT_FORMATS,
-    SURFACE_FILES,
-    SURFACE_REPORT,
-    encode_surface,
-    file_names,
-)
+from splinecli.surface.camera import ray_basis
+from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES, SURFACE_REPORT, encode_surface, file_names
 from splinecli.system.exr import check_exr
 from splinecli.system.extras import import_extra
-from splinecli.system.files import read_json
+from splinecli.system.files import check_free, read_json
+from splinecli.system.publishing import held_folder, new_files
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+SCHEMA = 2  # rises when a field of the report changes its meaning
 
-SCHEMA = 2
-"""The version of the fields of surface.json. It rises when a field changes its meaning."""
-
-INPUT_FORMATS = ("npy", "tiff", "png", "png8")
-"""The formats in which `integrate` looks for a normal map in a folder, exact ones first."""
+INPUT_FORMATS = ("npy", "tiff", "png", "png8")  # of the normal map in a folder, exact ones first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +82,7 @@ class IntegrateOptions:
         if self.prior_detail is not None and self.prior is None:
             raise UsageError("--prior-detail needs --prior")
         for name in self.formats:
-            if name not in SURFACE_FILES:
-                raise UsageError(f"no format named {name!r}; expected one of {', '.join(SURFACE_FILES)}")
+            check_one_of("format", name, SURFACE_FILES)
 
     @property
     def folder(self) -> Path:
@@ -110,9 +103,6 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
         OutputError: the results exist and `overwrite` is not set, or they cannot be written.
         UsageError: the stiffness or the largest step is negative.
     """
-    from splinecli.system.files import check_free
-    from splinecli.system.publishing import held_folder
-
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
     check_exr(options.formats)
@@ -124,15 +114,6 @@ def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT)
 def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, Any]:
     """Do the work of integrate_normal_map in the folder of results, which the caller holds."""
     started = time.perf_counter()
-    import numpy as np
-
-    from splinecli.capture import read_normal_map
-    from splinecli.capture.capture_size import BYTES_OF_SURFACE
-    from splinecli.capture.formats.depth_files import read_depth
-    from splinecli.capture.formats.image_size import ExpectedSize, check_memory
-    from splinecli.capture.lights.lamp_files import read_camera_matrix
-    from splinecli.system.publishing import new_files
-
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
     convention = options.convention or ("opengl" if made_by is None else made_by["options"]["convention"])
@@ -152,8 +133,12 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     prior = None
     if options.prior is not None:
         prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
-    picture = options.colours or _find_albedo(options.normals)
-    colours = None if picture is None else _read_colours(picture, mask.shape)
+    picture, colours = options.colours, None
+    if picture is None and (options.normals / ALBEDO_PICTURE).is_file():
+        picture = options.normals / ALBEDO_PICTURE
+    if picture is not None:
+        image = np.broadcast_to(read_image(picture, ExpectedSize(mask.shape, "the normal map")), (*mask.shape, 3))
+        colours = np.rint(255 * image.clip(0, 1)).astype(np.uint8)
     with observer.progress("integrating", 1.0) as advance:
         surface, found = make_surface(
             normal_map,
@@ -206,8 +191,6 @@ def _earlier_files(folder: Path) -> list[str]:
 
 
 def _find_normal_map(folder: Path) -> Path:
-    from splinecli.results.files import NORMALS, REPORT, UnfinishedError, read_report
-
     names = [NORMALS[name] for name in INPUT_FORMATS]
     try:
         files = read_report(folder)["files"]
@@ -223,9 +206,6 @@ def _find_normal_map(folder: Path) -> Path:
 
 def _report_of(path: Path) -> dict[str, Any] | None:
     """Return the report of the `infer` that wrote a normal map; None for a normal map from elsewhere."""
-    from splinecli.results.files import REPORT
-    from splinecli.surface.camera import ray_basis
-
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:
@@ -245,23 +225,3 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         path=path.parent / REPORT,
         hint="Run 'splinecli infer' again, or move the normal map to another folder",
     )
-
-
-def _find_albedo(folder: Path) -> Path | None:
-    from splinecli.results.files import ALBEDO_PICTURE
-
-    path = folder / ALBEDO_PICTURE
-    return path if path.is_file() else None
-
-
-def _read_colours(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return the image at `path` as (H, W, 3) uint8 RGB."""
-    import numpy as np
-
-    from splinecli.capture import read_image
-    from splinecli.capture.formats.image_size import ExpectedSize
-
-    image = read_image(path, ExpectedSize(shape, "the normal map"))
-    rgb = np.broadcast_to(image, (*shape, 3))
-    colours: NDArray[np.uint8] = np.rint(255 * rgb.clip(0, 1)).astype(np.uint8)
-    return colours

@@ -7,22 +7,20 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from splinecli.errors import InputError, OutputError, SplinecliError
+from splinecli.methods import Estimator
 from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.films import unpacked
-from splinecli.pipeline.finished import find_earlier
+from splinecli.pipeline.finished import ChangedError, find_earlier
 from splinecli.pipeline.infer import held_results, infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
+from splinecli.system.locks import RefusedFolderError
 from splinecli.system.memory import is_out_of_memory
 
-if TYPE_CHECKING:
-    from splinecli.methods import Estimator
-
-Redo = Literal["nothing", "changed", "all"]
-"""What to do with captures that have results: keep them all, redo what changed, or redo everything."""
+Redo = Literal["nothing", "changed", "all"]  # of the captures that have results
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
@@ -65,15 +63,20 @@ def run_member(
         OutputError: the output folder cannot be written, or the disk is full.
     """
     if member.missing is not None:
-        return replace(failed(member.name, member.missing), status="missing")
+        return failed(member.name, member.missing, status="missing")
     try:
         folder = unpacked(member.folder, Path(options.output), options, observer, redo=redo)
         member = replace(member, folder=folder)
-        outcome = _earlier_outcome(member, options, observer, redo)
+        if redo != "all":
+            with held_results(member.name, options, observer) as target:
+                report = find_earlier(target, folder, options, observer.warn)
+            if report is not None:
+                return Outcome(member.name, "skipped", report)
+    except ChangedError as error:
+        if redo == "nothing":
+            return failed(member.name, error, status="changed")
     except Exception as error:
-        outcome = _failure(member, error)
-    if outcome is not None:
-        return outcome
+        return _failure(member, error)
     estimator = method()
     try:
         return Outcome(member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator))
@@ -81,35 +84,8 @@ def run_member(
         return _failure(member, error)
 
 
-def _error_document(error: SplinecliError, capture: str) -> dict[str, Any]:
-    """Return the document that stands in place of the report of a capture."""
-    return {"capture": capture, "error": str(error), "exit_code": error.exit_code}
-
-
-def _earlier_outcome(member: Member, options: InferOptions, observer: Observer, redo: Redo) -> Outcome | None:
-    """Return the outcome of a capture that is not to be computed, or None."""
-    if redo == "all":
-        return None
-    with held_results(member.name, options, observer) as target:
-        earlier = find_earlier(target, member.folder, options)
-    if earlier.report is not None:
-        return Outcome(member.name, "skipped", earlier.report)
-    if earlier.unfinished:
-        observer.warn(f"{target}: {earlier.unfinished}, so it is computed again")
-    if not earlier.changed or redo == "changed":
-        return None
-    error = OutputError(
-        earlier.changed,
-        path=target,
-        hint="Add --update to redo what changed, --overwrite to redo everything, or choose another place with -o",
-    )
-    return Outcome(member.name, "changed", _error_document(error, member.name), error.exit_code)
-
-
 def _failure(member: Member, error: Exception) -> Outcome:
     """Return what became of a capture that failed. Raises OutputError again, if other folders would fail, too."""
-    from splinecli.system.locks import RefusedFolderError
-
     name = member.name
     if isinstance(error, OutputError) and not isinstance(error, RefusedFolderError):
         raise error
@@ -130,6 +106,7 @@ def _failure(member: Member, error: Exception) -> Outcome:
     return failed(name, defect, "".join(traceback.format_exception(error)))
 
 
-def failed(name: str, error: SplinecliError, trace: str = "") -> Outcome:
-    """Return the outcome of a capture that failed."""
-    return Outcome(name, "failed", _error_document(error, name), error.exit_code, trace)
+def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status = "failed") -> Outcome:
+    """Return the outcome of a capture that has no results of this run."""
+    document = {"capture": name, "error": str(error), "exit_code": error.exit_code}
+    return Outcome(name, status, document, error.exit_code, trace)

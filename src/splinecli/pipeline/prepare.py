@@ -11,6 +11,7 @@ from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.observer import SILENT, Advance, Observer
+from splinecli.pipeline.prepare_on_workers import render_on_workers
 from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
 from splinecli.pixel_sets.rendered import ScenePlan, add_scene
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
@@ -75,25 +76,43 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         with observer.progress("preparing", len(captures) + len(options.scenes.names)) as advance:
             skipped = _add_captures(writer, captures, options, observer, advance)
             _add_scenes(writer, options, observer, advance)
-        if not len(writer):
-            return _summary(PixelSet(options.output, ()), skipped)
-        # Before the set counts as finished, so that a finished set has its own overview.
-        write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
-        pixel_set = writer.finish()
-    return _summary(pixel_set, skipped)
+        pixel_set = PixelSet(options.output, ())
+        if len(writer):
+            # Before the set counts as finished, so that a finished set has its own overview.
+            write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
+            pixel_set = writer.finish()
+    return {
+        "set": str(pixel_set.folder),
+        "entries": len(pixel_set.entries),
+        "scenes": len({entry.scene for entry in pixel_set.entries}),
+        "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
+        "bytes": sum((pixel_set.folder / name).stat().st_size for name in pixel_set.file_names),
+        "manifest": str(pixel_set.folder / MANIFEST),
+        "contact_sheet": str(pixel_set.folder / CONTACT_SHEET) if pixel_set.entries else None,
+        "skipped": skipped,
+    }
 
 
 def _add_captures(
-    writer: PixelSetWriter,
-    captures: dict[str, Path],
-    options: PrepareOptions,
-    observer: Observer,
-    advance: Advance,
+    writer: PixelSetWriter, captures: dict[str, Path], options: PrepareOptions, observer: Observer, advance: Advance
 ) -> list[dict[str, Any]]:
-    """Add the captures and return what became of those that were left out."""
+    """Add the captures and return those that were left out. Raises OutputError if the set cannot be written."""
     skipped: list[dict[str, Any]] = []
     for name, folder in captures.items():
-        error = _add_capture(writer, name, folder, options)
+        error: SplinecliError | None = None
+        try:
+            add_capture(
+                writer,
+                name,
+                folder,
+                as_stored=options.as_stored,
+                white_level=options.white_level,
+                update=options.update,
+            )
+        except (InputError, CaptureChangedError) as refused:
+            error = refused
+        except OSError as refused:
+            error = InputError(f"cannot be read ({refused.strerror or refused})", path=refused.filename or folder)
         if error is None:
             observer.say(writer.describe(name))
         else:
@@ -103,29 +122,10 @@ def _add_captures(
     return skipped
 
 
-def _add_capture(writer: PixelSetWriter, name: str, folder: Path, options: PrepareOptions) -> SplinecliError | None:
-    """Add a capture, or return why it cannot be used. Raises OutputError if the set cannot be written."""
-    try:
-        add_capture(
-            writer,
-            name,
-            folder,
-            as_stored=options.as_stored,
-            white_level=options.white_level,
-            update=options.update,
-        )
-    except (InputError, CaptureChangedError) as error:
-        return error
-    except OSError as error:
-        return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
-    return None
-
-
 def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Observer, advance: Advance) -> None:
     plan = options.scenes
     cluster = None if options.cluster is None else options.cluster.on_cores(len(plan.names))
     if cluster is not None:
-        from splinecli.pipeline.prepare_on_workers import render_on_workers
 
         def show(position: int) -> None:
             for name in plan.entry_names(position).values():
@@ -145,16 +145,3 @@ def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Obser
         for name in add_scene(writer, plan, position, reach):
             observer.say(writer.describe(name))
         reach(1.0)
-
-
-def _summary(pixel_set: PixelSet, skipped: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "set": str(pixel_set.folder),
-        "entries": len(pixel_set.entries),
-        "scenes": len({entry.scene for entry in pixel_set.entries}),
-        "n_pixels": sum(entry.n_pixels for entry in pixel_set.entries),
-        "bytes": sum((pixel_set.folder / name).stat().st_size for name in pixel_set.file_names),
-        "manifest": str(pixel_set.folder / MANIFEST),
-        "contact_sheet": str(pixel_set.folder / CONTACT_SHEET) if pixel_set.entries else None,
-        "skipped": skipped,
-    }

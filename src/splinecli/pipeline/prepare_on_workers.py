@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,12 +20,6 @@ from splinecli.pixel_sets.rendered import (
 )
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.system.files import UNFINISHED
-
-
-@dataclass(frozen=True)
-class _Settings:
-    plan: ScenePlan
-    folder: Path
 
 
 def render_on_workers(
@@ -50,7 +44,7 @@ def render_on_workers(
         SplinecliError: what add_scene or Distributor.run raises.
     """
     missing = [position for position in range(len(plan.names)) if not has_scene(writer, plan, position)]
-    settings = _Settings(replace(plan), writer.folder)  # a copy without what the plan has read from files
+    plan_to_send = replace(plan)  # a copy without what the plan has read from files
     rendered: dict[int, str | LostError] = {}
     position = 0
 
@@ -59,7 +53,7 @@ def render_on_workers(
         while position < len(plan.names) and (position in rendered or position not in missing):
             shape = rendered.get(position)
             if isinstance(shape, str):
-                path = _path(settings, position)
+                path = _path(writer.folder, position)
                 add_rendered(writer, plan, position, shape, partial(load_rendered, path))
                 path.unlink()
             if not isinstance(shape, LostError):
@@ -67,29 +61,26 @@ def render_on_workers(
             position += 1
 
     try:
-        with distributor(settings, _prepare, _render, writer.folder, cluster, observer) as workers:
+        with distributor(partial(_render, plan_to_send, writer.folder), writer.folder, cluster, observer) as workers:
             add_those_in_order()
             for item, result in workers.run(Item((number,), plan.names[number]) for number in missing):
                 rendered[item.args[0]] = result
                 add_those_in_order()
     finally:
         for number in missing:
-            _path(settings, number).unlink(missing_ok=True)
+            _path(writer.folder, number).unlink(missing_ok=True)
     for result in rendered.values():
         if isinstance(result, LostError):
             raise result
 
 
-def _path(settings: _Settings, position: int) -> Path:
-    return settings.folder / f".scene{position}{UNFINISHED}"
+def _path(folder: Path, position: int) -> Path:
+    return folder / f".scene{position}{UNFINISHED}"
 
 
-def _prepare(settings: _Settings) -> None:
-    settings.plan.check_inputs()
-
-
-def _render(settings: _Settings, position: int) -> str:
+def _render(plan: ScenePlan, folder: Path, position: int) -> str:
     """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
-    rendered = render_planned(settings.plan, position)
-    save_rendered(rendered, _path(settings, position))
+    plan.check_inputs()
+    rendered = render_planned(plan, position)
+    save_rendered(rendered, _path(folder, position))
     return rendered.shape

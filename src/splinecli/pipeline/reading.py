@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
-from splinecli.capture.lights.found_lights import FirstLight
+from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
+from splinecli.capture.layouts.image_lists import check_not_empty, list_images
+from splinecli.capture.lights.found_lights import ESTIMATE, FirstLight, LightFinder
+from splinecli.capture.lights.lamp_files import LampOptions
 from splinecli.capture.lights.light_angles import LightForm
+from splinecli.capture.lights.light_frames import parse_light_frame
+from splinecli.capture.paths import check_file
+from splinecli.capture.reader import EQUAL
+from splinecli.capture.restore.white_level import check_white_level
+from splinecli.capture.window import parse_window
 from splinecli.errors import UsageError, check_one_of
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
-
-if TYPE_CHECKING:
-    from splinecli.capture import CaptureSource, RadiometricCalibration
-    from splinecli.capture.lights.found_lights import LightFinder
-    from splinecli.capture.lights.lamp_files import LampOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,12 +64,9 @@ class Reading:
     flat_field: str | None = None
     white_level: float | None = None
     strict: bool = False
+    surface = False  # is made of the capture, too, in the unit of pixel_size; a field of InferOptions
 
     def __post_init__(self) -> None:
-        from splinecli.capture.lights.light_frames import parse_light_frame
-        from splinecli.capture.restore.white_level import check_white_level
-        from splinecli.capture.window import parse_window
-
         if self.finds_lights:
             self._check_found_lights()
         elif self.first_light is not None:
@@ -82,8 +82,6 @@ class Reading:
     @property
     def finds_lights(self) -> bool:
         """Whether the lights are found from the images."""
-        from splinecli.capture.lights.found_lights import ESTIMATE
-
         return self.lights == ESTIMATE
 
     def _check_found_lights(self) -> None:
@@ -107,29 +105,19 @@ class Reading:
         return None if self.finds_lights else self.lights
 
     @property
-    def scales_surface(self) -> bool:
-        """Whether the pixel size also scales a surface."""
-        return False
-
-    @property
     def lamps(self) -> LampOptions:
         """The part of the options that concerns near lamps. Raises UsageError."""
-        from splinecli.capture.lights.lamp_files import LampOptions
-
         return LampOptions(
             positions=self.light_positions,
             distance=self.light_distance,
             pixel_size=self.pixel_size,
-            scales_surface=self.scales_surface,
+            scales_surface=self.surface,
             object_width=self.object_width,
             camera_matrix=self.camera_matrix,
         )
 
     def check_files(self) -> None:
         """Raise InputError if a file that the options name does not exist, or --flat-field contains no images."""
-        from splinecli.capture.paths import check_file
-        from splinecli.capture.reader import EQUAL
-
         intensities = None if self.intensities == EQUAL else self.intensities
         named = (self.light_file, self.light_positions, intensities, self.camera_matrix, self.mask)
         for name in (*named, self.ground_truth, self.ambient):
@@ -139,9 +127,6 @@ class Reading:
 
     def radiometric_calibration(self) -> RadiometricCalibration:
         """Return how the images' values become linear light. Raises InputError."""
-        from splinecli.capture import RadiometricCalibration
-        from splinecli.capture.layouts.image_lists import check_not_empty, list_images
-
         flats: tuple[Path, ...] = ()
         if self.flat_field is not None:
             folder = Path(self.flat_field)
@@ -152,10 +137,6 @@ class Reading:
 
     def open(self, folder: Path) -> CaptureSource:
         """Open the capture in the folder under these options. Raises InputError."""
-        from splinecli.capture import open_capture
-        from splinecli.capture.lights.light_frames import parse_light_frame
-        from splinecli.capture.window import parse_window
-
         find: LightFinder | None = None
         if self.finds_lights:
             from splinecli.light.unknown_lights import find_lights

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.window import parse_window
 from splinecli.errors import UsageError
 from splinecli.surface.bilateral_equations import STIFFNESS
+from splinecli.surface.camera import focal_length
+from splinecli.surface.decimation import decimate, mesh_to_decimate
+from splinecli.surface.integration import integrate_normals
+from splinecli.surface.mesh import surface_mesh
 from splinecli.surface.surface_files import Surface
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
@@ -46,23 +49,10 @@ def make_surface(
     Raises:
         InputError, UsageError: see integrate_normals, surface_mesh and decimate.
     """
-    import numpy as np
-
-    from splinecli.surface.camera import focal_length
-    from splinecli.surface.decimation import decimate, mesh_to_decimate
-    from splinecli.surface.integration import integrate_normals
-    from splinecli.surface.mesh import surface_mesh
-
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
-        normal_map,
-        mask,
-        camera_matrix,
-        stiffness=stiffness,
-        prior=prior,
-        prior_detail=prior_detail,
-        progress=progress,
+        normal_map, mask, camera_matrix, stiffness=stiffness, prior=prior, prior_detail=prior_detail, progress=progress
     )
     if n_triangles is None:
         mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
@@ -84,14 +74,21 @@ def make_surface(
     elif pixel_size_mm is not None:
         unit, millimetres, scale = "millimetre", 1.0, pixel_size_mm / pixel
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
-    surface = Surface(depth, mesh, unit, millimetres)
-    return surface, _report(surface, camera_matrix is not None, stiffness, pixel_size_mm)
+    report = {
+        "camera": "orthographic" if camera_matrix is None else "perspective",
+        "unit": unit,
+        "pixel_size_mm": pixel_size_mm,
+        "range": [_round(float(end(depth))) for end in (np.nanmin, np.nanmax)],
+        "n_vertices": len(mesh.vertices),
+        "n_triangles": len(mesh.triangles),
+        "normal_texture": mesh.normal_texture is not None,
+        "stiffness": stiffness,
+    }
+    return Surface(depth, mesh, unit, millimetres), report
 
 
 def view_of_report(
-    report: Mapping[str, Any],
-    camera_matrix: NDArray[np.floating] | None = None,
-    pixel_size_mm: float | None = None,
+    report: Mapping[str, Any], camera_matrix: NDArray[np.floating] | None = None, pixel_size_mm: float | None = None
 ) -> tuple[NDArray[np.float64] | None, float | None]:
     """Return camera matrix and pixel size in millimetres of the normal map that a report of `infer` describes.
 
@@ -102,10 +99,6 @@ def view_of_report(
     Raises:
         KeyError, TypeError, ValueError, UsageError: it is no report of this version of `infer`.
     """
-    import numpy as np
-
-    from splinecli.capture.window import parse_window
-
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])
     matrix = None if camera_matrix is None else window.camera(camera_matrix)
@@ -114,10 +107,7 @@ def view_of_report(
     if pixel_size_mm is None and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
     check_pixel_size(pixel_size_mm)
-    return (
-        matrix,
-        None if pixel_size_mm is None else pixel_size_mm * window.step,
-    )
+    return matrix, None if pixel_size_mm is None else pixel_size_mm * window.step
 
 
 def check_pixel_size(pixel_size: float | None) -> None:
@@ -126,21 +116,6 @@ def check_pixel_size(pixel_size: float | None) -> None:
         raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}")
 
 
-def _report(surface: Surface, perspective: bool, stiffness: float, pixel_size_mm: float | None) -> dict[str, Any]:
-    import numpy as np
-
-    return {
-        "camera": "perspective" if perspective else "orthographic",
-        "unit": surface.unit,
-        "pixel_size_mm": pixel_size_mm,
-        "range": [_round(float(end(surface.depth))) for end in (np.nanmin, np.nanmax)],
-        "n_vertices": len(surface.mesh.vertices),
-        "n_triangles": len(surface.mesh.triangles),
-        "normal_texture": surface.mesh.normal_texture is not None,
-        "stiffness": stiffness,
-    }
-
-
-def _round(value: float, digits: int = 7) -> float:
+def _round(value: float) -> float:
     """Round a number to as many significant digits as float32 has."""
-    return float(f"{value:.{digits}g}") if math.isfinite(value) else value
+    return float(f"{value:.7g}")

@@ -11,18 +11,9 @@ from splinecli.capture import Capture, CaptureSource
 from splinecli.capture.masks import take_pixels
 from splinecli.capture.observations import StoredPixels
 
-LIT = 0.15
-"""A light counts for a pixel if n.l is above this."""
-
-AGREEING = 0.3
-"""An observation counts if its albedo differs from the pixel's median by at most this share of the median.
-
-This leaves out highlights and cast shadows.
-"""
-
-RESTORED_WEIGHT = 1e-3
-"""Weight of a restored observation: its colour is saturated, so that the other observations decide."""
-
+LIT = 0.15  # a light counts for a pixel if n.l is above this
+AGREEING = 0.3  # an observation counts within this share of the median albedo: no highlights, no cast shadows
+RESTORED_WEIGHT = 1e-3  # of a restored observation, whose colour is saturated: the others decide
 _TILE_PIXELS = 65_536
 
 

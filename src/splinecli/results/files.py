@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.capture.lights.light_files import rows_text
-from splinecli.inference import NormalEstimate
 from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
 from splinecli.maths.normals import Convention, describe, encode_picture
+from splinecli.pictures.error_map import error_map_picture
 from splinecli.pictures.maps import (
     CURVATURE_SCALE,
     RELIEF_SCALE,
@@ -24,10 +24,14 @@ from splinecli.pictures.maps import (
     signed_picture,
 )
 from splinecli.pictures.png import encode_png
-from splinecli.results.clock import Clock
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.system.exr import encode_exr
 from splinecli.system.files import read_json
-from splinecli.system.publishing import NewFiles, is_plain, new_files
+from splinecli.system.publishing import Content, is_plain, new_files
+
+if TYPE_CHECKING:
+    from splinecli.inference import NormalEstimate
+    from splinecli.results.clock import Clock
 
 NORMALS = {
     "png": "normals.png",
@@ -42,11 +46,13 @@ ERROR_MAP = "error_map.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR, PREVIEW = "albedo.png", "albedo.npy", "albedo.exr", "preview.png"
 CONFIDENCE_PICTURE, CONFIDENCE = "confidence.png", "confidence.npy"
-LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
+LIGHT_FILES = LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
     "light_directions.txt",
     "light_intensities.txt",
     "lights.png",
 )
+"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
+
 GRADIENT, CURVATURE_PICTURE, CURVATURE = "gradient.npy", "curvature.png", "curvature.npy"
 RELIEF_PICTURE, RELIEF = "relief.png", "relief.npy"
 MAPS = {
@@ -71,8 +77,8 @@ OWN_FILES = (
 )
 """All files that `infer` and `integrate` may write into a capture's folder of results, but LIGHT_FILES."""
 
-LIGHT_FILES = (LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT)
-"""What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
+
+Files = Iterator[tuple[str, Content]]  # names and contents, each made when it is asked for
 
 
 class UnfinishedError(ValueError):
@@ -87,7 +93,7 @@ def write_estimate(
     formats: Sequence[str],
     convention: Convention,
     clock: Clock,
-    more: Sequence[Callable[[NewFiles], None]] = (),
+    more: Iterable[tuple[str, Content]] = (),
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report.
 
@@ -100,7 +106,7 @@ def write_estimate(
         formats: keys of NORMALS.
         convention: whether green is y up or y down in pictures of normals.
         clock: tells the seconds of all stages, of which writing is the last.
-        more: functions that write further files of OWN_FILES, such as write_albedo.
+        more: names and contents of further files of OWN_FILES.
 
     Raises:
         OutputError: a file cannot be written.
@@ -112,9 +118,9 @@ def write_estimate(
             with new.open(NORMALS[form]) as file:
                 write_normals(estimate, form, file, convention)
         if estimate.error_map_deg is not None:
-            write_error_map(estimate.error_map_deg, new)
-        for write in more:
-            write(new)
+            new.write(ERROR_MAP, encode_png(error_map_picture(estimate.error_map_deg)))
+        for name, content in more:
+            new.write(name, content)
         report = {
             **report,
             "seconds": clock.seconds(),
@@ -134,14 +140,6 @@ def own_light_files(folder: Path) -> list[str]:
         return []
 
 
-def write_lights(capture: Capture, plot: bytes, new: NewFiles) -> None:
-    """Write lights that were found from the images as `--lights` and `--intensities` read them, and their plot."""
-    new.write(LIGHT_DIRECTIONS, rows_text(capture.light_directions))
-    if capture.estimated_intensities is not None:
-        new.write(LIGHT_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1)))
-    new.write(LIGHT_PLOT, plot)
-
-
 def read_report(folder: Path) -> dict[str, Any]:
     """Return the report of a folder of results whose files are as it states. Links in the folder are not followed.
 
@@ -158,10 +156,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not (isinstance(files, list) and all(isinstance(name, str) for name in files) and isinstance(sizes, dict)):
         raise ValueError("the report has no list of files, or no sizes")
     # The mask is made to be edited, and `integrate` may have replaced the surface.
-    changeable = (
-        FOUND_MASK,
-        *(file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()),
-    )
+    changeable = (FOUND_MASK, *(file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()))
     for name in files:
         path = folder / name
         if name in changeable:
@@ -185,8 +180,6 @@ def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], conventi
     elif form == "npy":
         np.save(file, estimate.normal_map, allow_pickle=False)
     elif form == "exr":
-        from splinecli.system.exr import encode_exr
-
         signs = np.array((1, 1 if convention == "opengl" else -1, 1), np.float32)
         colours = (estimate.normal_map * signs + 1) / 2 * estimate.capture.mask[..., None]
         file.write(encode_exr(colours, {"normals": f"(n + 1) / 2; {describe(convention)}"}))
@@ -196,61 +189,42 @@ def write_normals(estimate: NormalEstimate, form: str, file: IO[bytes], conventi
         tifffile.imwrite(file, estimate.normal_map, photometric="rgb", description=f"normals: {describe('opengl')}")
 
 
-def write_error_map(error_map_deg: NDArray[np.float32], new: NewFiles) -> None:
-    """Write a picture of an error map (H, W) in degrees, NaN where there is no error."""
-    from splinecli.pictures.error_map import error_map_picture
+def light_files(capture: Capture, plot: bytes) -> Files:
+    """Yield lights that were found from the images, as `--lights` and `--intensities` read them, and their plot."""
+    yield LIGHT_DIRECTIONS, rows_text(capture.light_directions)
+    if capture.estimated_intensities is not None:
+        yield LIGHT_INTENSITIES, rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1))
+    yield LIGHT_PLOT, plot
 
-    new.write(ERROR_MAP, encode_png(error_map_picture(error_map_deg)))
 
-
-def write_albedo(albedo: NDArray[np.float32], mask: NDArray[np.bool_], new: NewFiles, *, exr: bool) -> None:
-    """Write a linear albedo map (H, W, 3) as a float32 NPY file, as a picture and, with exr, as a float16 EXR file."""
-    with new.open(ALBEDO) as file:
-        np.save(file, albedo, allow_pickle=False)
+def albedo_files(albedo: NDArray[np.float32], mask: NDArray[np.bool_], *, exr: bool) -> Files:
+    """Yield a linear albedo map (H, W, 3) as a float32 NPY file, as a picture and, with exr, as a float16 EXR file."""
+    yield ALBEDO, albedo
     if exr:
-        from splinecli.system.exr import encode_exr
-
         largest = np.finfo(np.float16).max
-        content = encode_exr(albedo.clip(0, largest).astype(np.float16), {"colours": "linear RGB"})
-        new.write(ALBEDO_EXR, content)
-    new.write(ALBEDO_PICTURE, encode_png(albedo_picture(albedo, mask)))
+        yield ALBEDO_EXR, encode_exr(albedo.clip(0, largest).astype(np.float16), {"colours": "linear RGB"})
+    yield ALBEDO_PICTURE, encode_png(albedo_picture(albedo, mask))
 
 
-def write_confidence(confidence_map: NDArray[np.float32], new: NewFiles) -> None:
-    """Write a confidence map (H, W) as a float32 NPY file and as a gray picture."""
-    with new.open(CONFIDENCE) as file:
-        np.save(file, confidence_map, allow_pickle=False)
-    new.write(CONFIDENCE_PICTURE, encode_png(confidence_picture(confidence_map)))
+def map_files(estimate: NormalEstimate, maps: Sequence[str]) -> Files:
+    """Yield those of the maps that follow from the normals alone: float32 NPY files, and pictures."""
+    normal_map, mask = estimate.normal_map, estimate.capture.mask
+    if "confidence" in maps and estimate.confidence_map is not None:
+        yield CONFIDENCE, estimate.confidence_map
+        yield CONFIDENCE_PICTURE, encode_png(confidence_picture(estimate.confidence_map))
+    if "preview" in maps:
+        yield PREVIEW, encode_png(preview_picture(normal_map, mask))
+    if "gradient" in maps:
+        yield GRADIENT, gradient_of_normals(normal_map, mask)
+    if "curvature" in maps:
+        curvature = curvature_of_normals(normal_map, mask)
+        scale = f"mean curvature, black {-CURVATURE_SCALE}, gray 0, white {CURVATURE_SCALE} per pixel"
+        yield CURVATURE, curvature
+        yield CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], CURVATURE_SCALE), {"curvature": scale})
 
 
-def write_mask(mask: NDArray[np.bool_], new: NewFiles) -> None:
-    """Write a mask (H, W) as a black and white picture."""
-    new.write(FOUND_MASK, encode_png(mask * np.uint8(255)))
-
-
-def write_preview(estimate: NormalEstimate, new: NewFiles) -> None:
-    """Write a shaded picture of the surface."""
-    new.write(PREVIEW, encode_png(preview_picture(estimate.normal_map, estimate.capture.mask)))
-
-
-def write_gradient(estimate: NormalEstimate, new: NewFiles) -> None:
-    """Write the slopes (H, W, 2) as a float32 NPY file."""
-    with new.open(GRADIENT) as file:
-        np.save(file, gradient_of_normals(estimate.normal_map, estimate.capture.mask), allow_pickle=False)
-
-
-def write_curvature(estimate: NormalEstimate, new: NewFiles) -> None:
-    """Write the mean and Gaussian curvature (H, W, 2) as a float32 NPY file, and the mean one as a gray picture."""
-    curvature = curvature_of_normals(estimate.normal_map, estimate.capture.mask)
-    with new.open(CURVATURE) as file:
-        np.save(file, curvature, allow_pickle=False)
-    scale = f"mean curvature, black {-CURVATURE_SCALE}, gray 0, white {CURVATURE_SCALE} per pixel"
-    new.write(CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], CURVATURE_SCALE), {"curvature": scale}))
-
-
-def write_relief(relief: NDArray[np.float32], new: NewFiles) -> None:
-    """Write a relief (H, W) as a float32 NPY file and as a gray picture."""
-    with new.open(RELIEF) as file:
-        np.save(file, relief, allow_pickle=False)
+def relief_files(relief: NDArray[np.float32]) -> Files:
+    """Yield a relief (H, W) as a float32 NPY file and as a gray picture."""
     scale = f"height, black {-RELIEF_SCALE}, gray 0, white {RELIEF_SCALE} pixels"
-    new.write(RELIEF_PICTURE, encode_png(signed_picture(relief, RELIEF_SCALE), {"relief": scale}))
+    yield RELIEF, relief
+    yield RELIEF_PICTURE, encode_png(signed_picture(relief, RELIEF_SCALE), {"relief": scale})

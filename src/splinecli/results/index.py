@@ -9,6 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import numpy as np
+
+from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.image_size import image_bytes
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
 from splinecli.results.templates import render
@@ -16,12 +21,8 @@ from splinecli.system.memory import is_out_of_memory
 
 INDEX = "index.html"
 
-THUMBNAIL = 256, 192
-"""Largest width and height of a small normal map in pixels: twice its size on the page, for sharp screens."""
-
-_LARGEST_SHOWN = 10**9
-"""Bytes of the largest normal map that is shown small: 33 megapixels of 16 bits. Others in the folder may be bombs."""
-
+THUMBNAIL = 256, 192  # largest width and height in pixels: twice its size on the page, for sharp screens
+_LARGEST_SHOWN = 10**9  # bytes of a normal map shown small: 33 megapixels of 16 bits; others may be bombs
 _OURS = b'<meta name="generator" content="splinecli">'
 _START = 1 << 16  # bytes of a page, which contain this mark
 
@@ -101,11 +102,6 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
 def _thumbnail(path: Path) -> str | None:
     """Return a picture of at most THUMBNAIL pixels as a JPEG data URL, or None where it cannot be read."""
     import cv2
-    import numpy as np
-
-    from splinecli.capture.formats.decoding import decode_image
-    from splinecli.capture.formats.facts import read_facts
-    from splinecli.capture.formats.image_size import image_bytes
 
     try:
         if image_bytes(*read_facts(path).size) > _LARGEST_SHOWN:

@@ -10,27 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import unit
-from splinecli.pictures.error_map import TOP_DEG, colour_errors
+from splinecli.pictures.error_map import TICKS, TOP_DEG, colour_errors
 from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture
 from splinecli.pictures.png import Picture, encode_png
 from splinecli.results.templates import render
 
-LARGEST_MAP = 8_000_000
-"""Largest number of pixels of the maps on a page. Larger maps are reduced, so that browsers can open the file."""
+LARGEST_MAP = 8_000_000  # pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
+LONGEST_SIDE = 8192  # pixels: most devices draw pictures up to this side
+QUICK_MAP, FIRST_MAP = 500_000, 100_000  # pixels: above the first, a page begins with maps of the second
 
-LONGEST_SIDE = 8192
-"""Largest width or height of the maps on a page in pixels: most devices draw pictures up to this side."""
+LOW_BITS = 5  # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
 
-QUICK_MAP, FIRST_MAP = 500_000, 100_000
-"""A page with maps of more than QUICK_MAP pixels has maps of FIRST_MAP pixels, too, which are shown first."""
-
-LOW_BITS = 5
-"""Bits of a normal's component below the 8 bits of a picture.
-
-13 bits keep a normal within 0.01 degrees, where 8 bits would show bands in a highlight. More bits would be noise,
-which PNG cannot compress, and would make the file twice as large.
-"""
-
+_LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # stands for a component of 1
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 
@@ -73,17 +64,20 @@ def result_page(
         maps["confidence"] = confidence_picture(reduced)
     if error_map_deg is not None:
         errors, known = _reduce(error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP)
-        error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan), TOP_DEG))
+        error_png = _data_url(colour_errors(np.where(known, errors[..., 0], np.nan)))
     first = _first_pictures(maps, normals, shown) if shown.size > QUICK_MAP else {}
-    height, width = shown.shape
+    (height, width), size = shown.shape, _size(shown)
     is_reduced = shown.shape != mask.shape
+    stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None])[0]
     millimetres = (report.get("surface") or {}).get("pixel_size_mm")
     return render(
         "page.html",
         title=report["capture"],
         report=report,
-        facts=_facts(report, reduced=(width, height) if is_reduced else None),
-        reduced=_reduction(mask.shape, shown.shape) if is_reduced else None,
+        facts=_facts(report, size if is_reduced else None),
+        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all of them."
+        if is_reduced
+        else None,
         unit="pixels" if millimetres is None else "mm",
         units_per_pixel=mask.shape[1] / width * (millimetres or 1),
         errors=_errors(report),
@@ -91,13 +85,13 @@ def result_page(
         height=height,
         light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
         low_scale=2**LOW_BITS,
-        largest_code=_largest_code(),
+        largest_code=_LARGEST_CODE,
         first={name: _data_url(picture) for name, picture in first.items()},
         maps={name: _data_url(picture) for name, picture in maps.items()},
         error_map=error_png,
         light_plot=None if light_plot is None else _png_url(light_plot),
-        error_colours=_error_colours(),
-        error_ticks=[f"{TOP_DEG * third / 3:g}°" for third in range(4)],
+        error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
+        error_ticks=[f"{value:g}°" for value in TICKS],
     )
 
 
@@ -108,13 +102,8 @@ def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tupl
     the first picture is outside, since no unit normal is near (-1, -1, -1). The pictures have no alpha channel,
     because a browser would multiply the colours by it.
     """
-    codes = np.rint((normals + 1) / 2 * _largest_code()).astype(np.uint16) * mask[..., None]
+    codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
     return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
-
-
-def _largest_code() -> int:
-    """Return the number that stands for a component of 1."""
-    return int(2 ** (8 + LOW_BITS) - 1)
 
 
 def _first_pictures(
@@ -151,9 +140,15 @@ def _reduce(
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 
-def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> list[tuple[str, str]]:
-    """Return terms and values; `reduced` is the width and height of the page's maps if they were reduced."""
+def _size(mask: NDArray[np.bool_]) -> str:
+    height, width = mask.shape
+    return f"{width}{_TIMES}{height}"
+
+
+def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
+    """Return terms and values; `reduced` is the size of the page's maps if they were reduced."""
     weights, expected = report["weights"], report["expected_under_5"]
+    seconds = report["seconds"].items()  # of the stages up to this page
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
     return [
         ("Method", report["method"]),
@@ -162,23 +157,10 @@ def _facts(report: Mapping[str, Any], *, reduced: tuple[int, int] | None) -> lis
         ("Pixels", f"{report['n_pixels']:,}"),
         ("Size", _TIMES.join(map(str, report["image_size"]))),
         *([] if expected is None else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]),
-        *([] if reduced is None else [("Size on this page", _TIMES.join(map(str, reduced)))]),
-        ("Seconds", ", ".join(_seconds(report["seconds"]))),
+        *([] if reduced is None else [("Size on this page", reduced)]),
+        ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:g}" for name, n in seconds if n and name != "total")),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
-
-
-def _seconds(of_stages: Mapping[str, float]) -> list[str]:
-    """Return the seconds of the stages up to this page."""
-    return [
-        f"{name.replace('_', ' ')} {seconds:g}" for name, seconds in of_stages.items() if seconds and name != "total"
-    ]
-
-
-def _reduction(whole: tuple[int, ...], shown: tuple[int, ...]) -> str:
-    """Return the sentence that says that the maps (H, W) were reduced."""
-    sizes = [_TIMES.join(map(str, reversed(shape))) for shape in (shown, whole)]
-    return f"This page shows {sizes[0]} of the {sizes[1]} pixels. The other files have all of them."
 
 
 def _errors(report: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -192,12 +174,6 @@ def _errors(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Under 5°", f"{errors['under_5']:.1%}"),
         ("Under 10°", f"{errors['under_10']:.1%}"),
     ]
-
-
-def _error_colours() -> str:
-    """Return the colours of the error map, from 0 to TOP_DEG, as stops of a CSS gradient."""
-    stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None], TOP_DEG)[0]
-    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in stops)
 
 
 def _data_url(picture: Picture) -> str:

@@ -13,8 +13,7 @@ from splinecli.capture.stored import name_reading
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
 
-SCHEMA = 2
-"""The version of the report's fields. It rises when a field changes its meaning."""
+SCHEMA = 2  # rises when a field of the report changes its meaning
 
 
 def report_of(

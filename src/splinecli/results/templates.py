@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from splinecli import __version__
+
 
 def render(template: str, **values: object) -> str:
     """Return the page that a template makes of the values. Values are escaped; a missing value is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    from splinecli import __version__
 
     environment = Environment(
         loader=PackageLoader("splinecli", "assets"),

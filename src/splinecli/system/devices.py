@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from contextlib import suppress
 from typing import TYPE_CHECKING, Literal
 
 from splinecli.errors import UsageError
@@ -38,9 +38,11 @@ def choose_precision(
     import torch
 
     if device.type == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    # A CPU without the instructions emulates bfloat16, which is slower than float32.
-    return "bfloat16" if _cpu_has_bfloat16() else "float32"
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:  # a CPU without the instructions emulates bfloat16, which is slower than float32
+        found = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+        native = bool(found.get("avx512_bf16") or found.get("amx_bf16") or found.get("bf16"))
+    return "bfloat16" if native else "float32"
 
 
 def use_available_cores() -> int:
@@ -64,39 +66,20 @@ def count_available_cores() -> int:
     It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its control group, which
     containers and job schedulers set (Linux).
     """
-    limits = [float(os.cpu_count() or 1)]
+    limits = [os.cpu_count() or 1, *cgroup_quotas()]
     if hasattr(os, "sched_getaffinity"):
         limits.append(len(os.sched_getaffinity(0)))
-    limits += cgroup_quotas()
     return max(1, int(min(limits)))
 
 
 def cgroup_quotas() -> list[float]:
     """Return the CPU quotas, in cores, of this process's control groups and of the groups above them."""
-    return [quota for folder in own_groups("cpu") for quota in (*_quota_v2(folder), *_quota_v1(folder))]
-
-
-def _quota_v2(folder: Path) -> list[float]:
-    """Read "QUOTA PERIOD" in microseconds from cpu.max; the quota is "max" where there is none."""
-    fields = _read_fields(folder / "cpu.max")
-    return [float(fields[0]) / float(fields[1])] if len(fields) == 2 and fields[0] != "max" else []
-
-
-def _quota_v1(folder: Path) -> list[float]:
-    """Read quota and period from their own files; the quota is -1 where there is none."""
-    fields = _read_fields(folder / "cpu.cfs_quota_us") + _read_fields(folder / "cpu.cfs_period_us")
-    return [float(fields[0]) / float(fields[1])] if len(fields) == 2 and float(fields[0]) > 0 else []
-
-
-def _read_fields(path: Path) -> list[str]:
-    try:
-        return path.read_text("utf-8").split()
-    except OSError:
-        return []
-
-
-def _cpu_has_bfloat16() -> bool:
-    import torch
-
-    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
-    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16") or capabilities.get("bf16"))
+    quotas = []
+    for folder in own_groups("cpu"):
+        # Quota and period in microseconds: in one file of version 2, or in two of version 1. The first is "max" or -1
+        # where there is none.
+        for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
+            with suppress(OSError):
+                quota, period = " ".join((folder / name).read_text("utf-8") for name in names).split()
+                quotas += [] if quota in ("max", "-1") else [float(quota) / float(period)]
+    return quotas

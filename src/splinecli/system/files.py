@@ -14,9 +14,7 @@ from typing import IO, Any
 
 from splinecli.errors import OutputError
 
-UNFINISHED = ".splinecli-unfinished"
-"""The ending of hidden files that are being written. What a killed process left is removed later."""
-
+UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
 _MOST_JSON = 1 << 24  # bytes of a file
 _MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
 
@@ -34,6 +32,23 @@ def create_hidden(folder: Path) -> IO[bytes]:
 
 
 @contextmanager
+def made_folder(folder: Path) -> Iterator[list[Path]]:
+    """Make a folder, and yield those that were made: it and its parents. At the end, empty ones are removed again.
+
+    Raises:
+        OSError: the folder cannot be made.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield made
+    finally:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()
+
+
+@contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Yield a new file that takes the place of `path` after the block, so that it appears complete or not at all.
 
@@ -43,12 +58,9 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     Raises:
         OutputError: the file cannot be written.
     """
-    made: list[Path] = []
     temporary: Path | None = None
-    with refusals_as_output_errors(path):
+    with refusals_as_output_errors(path), made_folder(path.parent) as made:
         try:
-            made = [place for place in path.parents if not place.exists()]
-            path.parent.mkdir(parents=True, exist_ok=True)
             with create_hidden(path.parent) as file:
                 temporary = Path(file.name)
                 yield file
@@ -56,12 +68,8 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
             temporary.replace(path)
             sync_names(path.parent, *made)
         finally:
-            # This also runs on Ctrl-C, so no partial file and no empty folder is left.
-            if temporary is not None:
+            if temporary is not None:  # also on Ctrl-C
                 temporary.unlink(missing_ok=True)
-            with suppress(OSError):
-                for place in made:
-                    place.rmdir()
 
 
 def write_bytes(path: Path, content: bytes) -> None:

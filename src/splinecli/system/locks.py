@@ -13,9 +13,7 @@ from typing import IO, Any
 
 from splinecli.errors import OutputError
 
-LOCK = ".lock"
-"""The lock file in a folder that only one process at a time may write into. It is removed at the end."""
-
+LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
 _SECONDS_BETWEEN_TRIES = 0.02
 
 

@@ -9,19 +9,11 @@ from pathlib import Path
 
 from splinecli.errors import SplinecliError
 
-LARGEST_IMAGE = 400_000_000
-"""Pixels of the largest image that is read."""
-
+LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
 _LIBRARIES, _BUFFER = 1.5e9, 64 * 2**20  # bytes
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of malloc.h
 _LARGEST_KEPT, _MOST_KEPT = 2**27, 2**29  # bytes
-_NO_MEMORY = (
-    "allocate memory",
-    "out of memory",
-    "not enough memory",
-    "failed to map segment",
-    "start new thread",
-)
+_NO_MEMORY = ("allocate memory", "out of memory", "not enough memory", "failed to map segment", "start new thread")
 _GROUPS = Path("/proc/self/cgroup")  # lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
 _MOUNT = Path("/sys/fs/cgroup")
 _GROUP_FILES = (  # the limit, the use, and the file cache within it

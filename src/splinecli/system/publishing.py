@@ -9,19 +9,25 @@ anything, and no link in it is followed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.system.files import (
     UNFINISHED,
     check_writable,
     create_hidden,
+    made_folder,
     refusals_as_output_errors,
     sync,
     sync_names,
 )
 from splinecli.system.locks import RefusedFolderError, locked
+
+Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
 
 UNDONE = "an interrupted run left unfinished files, which are removed"
 
@@ -42,23 +48,17 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
         OutputError: the folder cannot be made or written.
     """
     check_writable(folder)
-    made: list[Path] = []
-    try:
-        with ExitStack() as stack:
-            with refusals_as_output_errors(folder):
-                made = [place for place in (folder, *folder.parents) if not place.exists()]
-                stack.enter_context(locked(folder, wait=wait))
-                sync_names(folder, *made)
-                left = [path for path in folder.glob(f".*{UNFINISHED}") if is_plain(path)]
-                for path in left:
-                    path.unlink()
-                if left:
-                    warn(f"{folder}: {UNDONE}")
-            yield
-    finally:
-        with suppress(OSError):
-            for place in made:
-                place.rmdir()
+    with ExitStack() as stack:
+        with refusals_as_output_errors(folder):
+            made = stack.enter_context(made_folder(folder))
+            stack.enter_context(locked(folder, wait=wait))
+            sync_names(folder, *made)
+            left = [path for path in folder.glob(f".*{UNFINISHED}") if is_plain(path)]
+            for path in left:
+                path.unlink()
+            if left:
+                warn(f"{folder}: {UNDONE}")
+        yield
 
 
 class NewFiles:
@@ -83,10 +83,13 @@ class NewFiles:
                 yield file
             sync(self._hidden[name])
 
-    def write(self, name: str, content: bytes | str) -> None:
-        """Write a new file. Text becomes UTF-8, and what is not valid text becomes escapes. Raises OutputError."""
+    def write(self, name: str, content: Content) -> None:
+        """Write a new file. An array becomes NPY, text UTF-8 with escapes for what is not valid. Raises OutputError."""
         with self.open(name) as file:
-            file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
+            if isinstance(content, np.ndarray):
+                np.save(file, content, allow_pickle=False)
+            else:
+                file.write(content if isinstance(content, bytes) else content.encode(errors="backslashreplace"))
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:
         """Remove the earlier files, and rename the new ones to their places, the report last. Raises OSError."""

@@ -1,61 +1,34 @@
-"""The values of options: those that are allowed, their completion, and their parsing."""
+"""The values of options: those that are allowed, their completion, their parsing, and the records that they fill."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from enum import StrEnum
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from enum import Enum, StrEnum
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from splinecli.errors import UsageError
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from splinecli.calibration.circle import Circle
     from splinecli.pipeline.connection import ClusterOptions
 
+    Record = TypeVar("Record", bound=DataclassInstance)
 
 _MOST_DIGITS = 18  # of a number of images
 
 
-class Device(StrEnum):
-    """Device to compute on."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-class FirstLight(StrEnum):
-    """Side of the image from which a light comes."""
-
-    left = "left"
-    right = "right"
-    above = "above"
-    below = "below"
-
-
-class LightForm(StrEnum):
-    """Numbers of a light: a vector, or azimuth and elevation in degrees."""
-
-    xyz = "xyz"
-    azel = "azel"
-    slant_tilt = "slant-tilt"
-
-
-class NormalConvention(StrEnum):
-    """Direction of the green channel of a normal map: up in opengl, down in directx."""
-
-    opengl = "opengl"
-    directx = "directx"
-
-
-class Precision(StrEnum):
-    """Number format to compute in."""
-
-    auto = "auto"
-    float32 = "float32"
-    bfloat16 = "bfloat16"
+# Each is a type of Typer: the values that an option may have.
+Device = StrEnum("Device", ["auto", "cpu", "cuda"])
+FirstLight = StrEnum("FirstLight", ["left", "right", "above", "below"])
+LightForm = StrEnum("LightForm", {"xyz": "xyz", "azel": "azel", "slant_tilt": "slant-tilt"})
+NormalConvention = StrEnum("NormalConvention", ["opengl", "directx"])
+Precision = StrEnum("Precision", ["auto", "float32", "bfloat16"])
 
 
 def complete_curves() -> list[str]:
@@ -69,29 +42,31 @@ def complete_weights() -> list[str]:
     return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
 
 
-def complete_list(*items: str | Callable[[], list[str]]) -> Callable[[str], list[str]]:
-    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma.
+def listed(names: Iterable[str]) -> str:
+    """Return "a, b or c"."""
+    *most, last = names
+    return f"{', '.join(most)} or {last}" if most else last
 
-    Args:
-        items: the items, or functions that return them.
-    """
+
+def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma."""
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")
-        names = [name for item in items for name in ([item] if isinstance(item, str) else item())]
-        return [",".join([*typed, name]) for name in names if name not in typed]
+        return [",".join([*typed, name]) for name in items if name not in typed]
 
     return complete
 
 
-def split_commas(text: str, option: str, allowed: list[str]) -> list[str]:
+def split_commas(text: str, option: str, allowed: Iterable[str]) -> tuple[str, ...]:
     """Return the items of "a,b". Raises UsageError for an item that is not allowed."""
-    items = [item.strip() for item in text.split(",") if item.strip()]
+    names = list(allowed)
+    items = tuple(item.strip() for item in text.split(",") if item.strip())
     for item in items:
-        if item not in allowed:
-            raise UsageError(f"{option} has {item!r}; expected a list of {', '.join(allowed)}, such as {allowed[0]}")
+        if item not in names:
+            raise UsageError(f"{option} has {item!r}; expected a list of {', '.join(names)}, such as {names[0]}")
     if not items:
-        raise UsageError(f"{option} is empty; expected a list of {', '.join(allowed)}")
+        raise UsageError(f"{option} is empty; expected a list of {', '.join(names)}")
     return items
 
 
@@ -103,8 +78,7 @@ def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False
         raise UsageError(f"--workers is {workers!r}; expected a number from 1, or auto")
     if address is not None and workers != "1":
         raise UsageError(
-            "--workers and --cluster contradict each other",
-            hint="Leave --workers out: the cluster has its workers",
+            "--workers and --cluster contradict each other", hint="Leave --workers out: the cluster has its workers"
         )
     if address is None and workers == "1":
         return None
@@ -112,10 +86,10 @@ def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False
     return ClusterOptions(workers=number, address=address, gpu=gpu)
 
 
-def parse_indices(text: str, option: str) -> list[int]:
+def parse_indices(text: str, option: str) -> tuple[int, ...]:
     """Return the whole numbers of "0,5,12". Raises UsageError."""
     try:
-        return [int(item) for item in text.split(",")]
+        return tuple(int(item) for item in text.split(","))
     except ValueError:
         raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
 
@@ -159,3 +133,31 @@ def parse_light_count(text: str) -> int | None:
         return int(text)
     except ValueError:
         raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
+
+
+def record_from(record: type[Record], arguments: Mapping[str, Any], **values: Any) -> Record:
+    """Build a record of options from the arguments of a command that have the names of its fields.
+
+    Args:
+        record: a frozen dataclass.
+        arguments: of the command, such as its `locals()`. A choice becomes its value, a list a tuple, and a path text
+            if the field holds no path.
+        values: of fields that need more than this, in place of the arguments.
+
+    Raises:
+        UsageError: the record refuses a value.
+    """
+    given = {
+        field.name: _of_field(arguments[field.name], str(field.type))
+        for field in fields(record)
+        if field.name in arguments
+    }
+    return record(**given | values)
+
+
+def _of_field(value: Any, kind: str) -> Any:
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, list):
+        return tuple(value)
+    return str(value) if isinstance(value, Path) and "Path" not in kind else value
