@@ -78,7 +78,7 @@ def capture_figures(
     estimator = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
     # Under near lamps, each pixel has light directions of its own.
     if estimator is not None and capture.lamps is None:
-        whole = stored.capture if trial.as_stored else stored.restore(stored.estimate_intensities())
+        whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
         chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
         png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."

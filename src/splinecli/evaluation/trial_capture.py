@@ -67,29 +67,29 @@ class TrialSource:
         It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
         """
         rows = None if whole else self.rows
-        if trial.light_error_deg is None and not trial.finds_lights:
+        if trial.protocol.light_error_deg is None and not trial.protocol.finds_lights:
             return self._see(trial, rows)
         capture = self._see(trial, None)
-        if trial.light_error_deg is not None:
+        if trial.protocol.light_error_deg is not None:
             known = self.stored.intensities_known
-            capture = refine_capture(capture, error_deg=trial.light_error_deg, intensities_known=known)
+            capture = refine_capture(capture, error_deg=trial.protocol.light_error_deg, intensities_known=known)
         return capture if rows is None else capture.choose_pixels(rows)
 
     def _see(self, trial: Trial, rows: NDArray[np.integer] | None) -> Capture:
         position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
         seen = self.stored.choose_lights([position[light] for light in trial.lights])
-        if trial.light_noise_deg:
+        if trial.protocol.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
-        if trial.finds_lights:
+        if trial.protocol.finds_lights:
             seen = seen.find_lights(partial(find_lights, refuse=False))
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
-        intensities = None if trial.as_stored else seen.estimate_intensities()
+        intensities = None if trial.protocol.as_stored else seen.estimate_intensities()
         if rows is None or seen.capture.lamps is None:
             if rows is not None:
                 seen = seen.choose_pixels(rows)
-            return seen.capture if trial.as_stored else seen.restore(intensities)
+            return seen.capture if trial.protocol.as_stored else seen.restore(intensities)
         # Near lamps need the surface, which only all pixels together have.
-        capture = find_surface(seen.capture if trial.as_stored else seen.restore(intensities))
+        capture = find_surface(seen.capture if trial.protocol.as_stored else seen.restore(intensities))
         return capture.choose_pixels(rows)
 
 
@@ -148,10 +148,10 @@ def _with_noise(capture: Capture, trial: Trial) -> Capture:
 
 
 def _tilted(light_directions: NDArray[np.float64], trial: Trial) -> NDArray[np.float64]:
-    generator = np.random.default_rng([NOISE_STREAM, trial.seed, trial.number])
+    generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
     # Few lights and much noise can give lights in one plane. Such noise is drawn again.
     for _ in range(_RETILTS):
-        tilted = tilt_lights(light_directions, trial.light_noise_deg, generator)
+        tilted = tilt_lights(light_directions, trial.protocol.light_noise_deg, generator)
         if not in_one_plane(tilted):
             break
     return tilted

@@ -5,17 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
-from splinecli.capture.stamp import digest
 from splinecli.evaluation.protocol import Protocol
-from splinecli.methods import Estimator
 from splinecli.system.files import parse_json, refusals_as_output_errors, write_text
 from splinecli.system.publishing import is_plain
 
@@ -31,7 +28,7 @@ class Trial:
         method: name of the method.
         number: number of the trial, from 0.
         lights: the draw.
-        light_noise_deg, seed, max_pixels, as_stored, light_error_deg, finds_lights: see Protocol.
+        protocol: what else decides the score.
         made_of: digest of the capture's files and of the method's settings.
     """
 
@@ -39,43 +36,39 @@ class Trial:
     method: str
     number: int
     lights: Draw
-    light_noise_deg: float
-    seed: int
-    max_pixels: int | None
-    as_stored: bool
+    protocol: Protocol
     made_of: str
-    light_error_deg: float | None = None
-    finds_lights: bool = False
 
-    @classmethod
-    def of(cls, capture: str, method: str, number: int, lights: Draw, protocol: Protocol, *, made_of: str) -> Trial:
-        """Return a trial of a protocol."""
-        return cls(
-            capture,
-            method,
-            number,
-            lights,
-            protocol.light_noise_deg,
-            protocol.seed,
-            protocol.max_pixels,
-            protocol.as_stored,
-            made_of,
-            protocol.light_error_deg,
-            protocol.finds_lights,
-        )
+    @property
+    def record(self) -> dict[str, Any]:
+        """The trial as JSON values."""
+        p = self.protocol
+        return {
+            "capture": self.capture,
+            "method": self.method,
+            "number": self.number,
+            "lights": self.lights,
+            "light_noise_deg": p.light_noise_deg,
+            "seed": p.seed,
+            "max_pixels": p.max_pixels,
+            "as_stored": p.as_stored,
+            "made_of": self.made_of,
+            "light_error_deg": p.light_error_deg,
+            "finds_lights": p.finds_lights,
+        }
 
     @property
     def key(self) -> str:
         """SHA-256 of what decides the score. The noise depends on seed and number, the pixels on the seed."""
-        values = asdict(self)
+        values = self.record
         del values["capture"]  # only a name in the tables: made_of has the files themselves
-        if self.light_error_deg is None:
+        if self.protocol.light_error_deg is None:
             del values["light_error_deg"]  # so that earlier trials stay valid
-        if not self.finds_lights:
+        if not self.protocol.finds_lights:
             del values["finds_lights"]  # likewise
-        if self.light_noise_deg == 0:
+        if self.protocol.light_noise_deg == 0:
             del values["number"]
-            if self.max_pixels is None:
+            if self.protocol.max_pixels is None:
                 del values["seed"]
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
@@ -142,19 +135,9 @@ class TrialStore:
             self._scores[trial.key] = score
             if self._path is None:
                 return
-            line = json.dumps({**asdict(trial), **asdict(score), "key": trial.key})
+            line = json.dumps({**trial.record, **asdict(score), "key": trial.key})
             with refusals_as_output_errors(self._path), self._path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
-
-
-def plan_trials(
-    capture: str, stamp: Sequence[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
-) -> list[Trial]:
-    """Return the trials of one method on one capture, given the stamp of the capture's files."""
-    made_of = digest([__version__, estimator.fingerprint, *stamp])
-    return [
-        Trial.of(capture, estimator.name, number, draw, protocol, made_of=made_of) for number, draw in enumerate(draws)
-    ]
 
 
 def _lines(path: Path) -> Iterator[str]:

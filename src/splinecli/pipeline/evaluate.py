@@ -193,7 +193,7 @@ def evaluate_captures(
                 protocols,
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
                 jobs=_default_jobs(estimators) if options.jobs is None else options.jobs,
-                elsewhere=_elsewhere(options, estimators, protocols, observer),
+                elsewhere=_elsewhere(options, estimators, observer),
                 on_progress=_follow(advance),
             )
         plots = make_plots(evaluations)
@@ -205,19 +205,14 @@ def evaluate_captures(
     return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
 
 
-def _elsewhere(
-    options: EvaluateOptions,
-    estimators: Sequence[Estimator],
-    protocols: Sequence[Protocol],
-    observer: Observer,
-) -> Elsewhere | None:
+def _elsewhere(options: EvaluateOptions, estimators: Sequence[Estimator], observer: Observer) -> Elsewhere | None:
     """Return what scores trials in other processes, if the options ask for it."""
     cluster = None if options.cluster is None else options.cluster.on_cores()
     if cluster is None:
         return None
     from splinecli.pipeline.evaluate_on_workers import OnWorkers
 
-    return OnWorkers(estimators, options.method_options, protocols, cluster, Path(options.output), observer)
+    return OnWorkers(estimators, options.method_options, cluster, Path(options.output), observer)
 
 
 def _make_estimators(options: EvaluateOptions) -> list[Estimator]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from splinecli.capture import open_capture
 from splinecli.errors import ModelError
 from splinecli.evaluation.draws_elsewhere import DrawScorer, DrawScores, DrawTask
-from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import Estimator, MethodOptions, make_estimator
 from splinecli.pipeline.capture_memory import source_bytes
 from splinecli.pipeline.connection import ClusterOptions
@@ -24,7 +23,6 @@ class _Settings:
     methods: tuple[str, ...]
     method_options: MethodOptions
     fingerprints: tuple[str, ...]
-    protocols: tuple[Protocol, ...]
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,6 @@ class OnWorkers:
 
     Args:
         estimators, method_options: the methods.
-        protocols: those of the evaluation.
         cluster: where draws are scored.
         output: a folder that all workers see.
         observer: receives messages.
@@ -41,7 +38,6 @@ class OnWorkers:
 
     estimators: Sequence[Estimator]
     method_options: MethodOptions
-    protocols: Sequence[Protocol]
     cluster: ClusterOptions
     output: Path
     observer: Observer
@@ -58,7 +54,6 @@ class OnWorkers:
             tuple(estimator.name for estimator in self.estimators),
             self.method_options,
             tuple(estimator.fingerprint for estimator in self.estimators),
-            tuple(self.protocols),
         )
         lost: LostError | None = None
         with distributor(settings, _scorer, _score, self.output, self.cluster, self.observer) as workers:
@@ -74,9 +69,10 @@ class OnWorkers:
 def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
     folder, memory = None, 0.0
     for draw in draws:
-        if draw.folder != folder:
-            folder, memory = draw.folder, source_bytes(lambda: open_capture(draw.folder))  # noqa: B023 - called here
-        yield Item((draw,), draw.name, memory)
+        if draw.reading.folder != folder:
+            folder = draw.reading.folder
+            memory = source_bytes(lambda: open_capture(folder))  # noqa: B023 - called here
+        yield Item((draw,), draw.reading.name, memory)
 
 
 _scorers: dict[str, DrawScorer] = {}
@@ -94,7 +90,7 @@ def _scorer(settings: _Settings) -> DrawScorer:
                     hint="Use the same weight file everywhere, and the same --precision",
                 )
         _scorers.clear()
-        _scorers[settings.command] = DrawScorer(estimators, settings.protocols)
+        _scorers[settings.command] = DrawScorer(estimators)
     return _scorers[settings.command]
 
 
