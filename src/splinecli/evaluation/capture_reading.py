@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, open_capture
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
+from splinecli.capture.lights.draws import PIXELS_STREAM
 from splinecli.capture.sample import sample_observations
 from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.errors import InputError
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.scored_pixels import scored_rows
 from splinecli.evaluation.trial_capture import TrialSource
 
 OnImage = Callable[[int, int], object]
@@ -103,3 +104,21 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
                 " and are not scored."
             )
     return tuple(notes)
+
+
+def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> NDArray[np.intp]:
+    """Return the rows of the observations that have ground truth, in rising order.
+
+    With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. A method
+    that sees neighbours estimates all pixels, and only these are scored.
+
+    Raises:
+        InputError: the capture has no ground truth.
+    """
+    if capture.ground_truth is None:
+        raise InputError(f"{capture.name}: the capture has no ground truth")
+    rows = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
+    if max_pixels is not None and len(rows) > max_pixels:
+        generator = np.random.default_rng([PIXELS_STREAM, seed, len(rows)])
+        rows = np.sort(generator.permutation(rows)[:max_pixels])
+    return rows

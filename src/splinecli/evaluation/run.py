@@ -65,9 +65,11 @@ def evaluate_all(
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
-    check_methods(estimators)
-    if not captures:
+    if not captures or not estimators:
         raise UsageError("there is nothing to score: give at least one capture and one method")
+    for method, count in Counter(estimator.name for estimator in estimators).items():
+        if count > 1:
+            raise UsageError(f"method {method} comes twice", hint="Name each method once")
     tasks = [ProtocolTrials.of(protocol) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
@@ -80,25 +82,9 @@ def evaluate_all(
         run.run(jobs)
     else:
         run.run_elsewhere(elsewhere)
-    settings = {
-        e.name: {
-            "weights": e.weights,
-            "device": e.device,
-            "precision": e.precision,
-            "fingerprint": e.fingerprint,
-        }
-        for e in estimators
-    }
+    names_of_settings = ("weights", "device", "precision", "fingerprint")
+    settings = {e.name: {name: getattr(e, name) for name in names_of_settings} for e in estimators}
     return [replace(task.evaluation(names, store), settings=settings) for task in tasks]
-
-
-def check_methods(estimators: Sequence[Estimator]) -> None:
-    """Raise UsageError where there are no estimators, or two have the same name."""
-    if not estimators:
-        raise UsageError("there is nothing to score: give at least one capture and one method")
-    for method, count in Counter(estimator.name for estimator in estimators).items():
-        if count > 1:
-            raise UsageError(f"method {method} comes twice", hint="Name each method once")
 
 
 class _Run:

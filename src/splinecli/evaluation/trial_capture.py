@@ -15,17 +15,17 @@ from splinecli.capture.lights.draws import NOISE_STREAM
 from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stored import StoredCapture
-from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Score, Trial
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.light.unknown_lights import find_lights
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.methods.near_light import find_surface
 from splinecli.system.progress import Progress
 
 _RETILTS = 100
+_LARGEST_TILT_DEG = 89.0
 
 
 @dataclass(frozen=True)
@@ -154,4 +154,24 @@ def _tilted(light_directions: NDArray[np.float64], trial: Trial) -> NDArray[np.f
         tilted = tilt_lights(light_directions, trial.protocol.light_noise_deg, generator)
         if not in_one_plane(tilted):
             break
+    return tilted
+
+
+def tilt_lights(
+    light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return unit light directions (F, 3), each turned by an angle from N(0, sigma_deg) in a random direction.
+
+    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is turned the
+    opposite way and stays above it, so that a capture may have any of the directions.
+    """
+    n_lights = len(light_directions)
+    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
+    # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
+    across = generator.normal(size=(n_lights, 3))
+    along = np.einsum("fi,fi->f", across, light_directions)
+    across = unit(across - along[:, None] * light_directions)
+    sunk = np.cos(angle) * light_directions[:, 2] + np.sin(angle) * across[:, 2] <= 0
+    angle = np.where(sunk, -angle, angle)[:, None]
+    tilted: NDArray[np.float64] = unit(np.cos(angle) * light_directions + np.sin(angle) * across)
     return tilted

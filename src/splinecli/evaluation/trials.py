@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -90,6 +90,9 @@ class Score:
     found_light_error_deg: float | None = None
 
 
+_FIELDS = [field.name for field in fields(Score)]
+
+
 class TrialStore:
     """Scores by trial, in memory and, where a path is given, in a file of JSON lines.
 
@@ -112,15 +115,9 @@ class TrialStore:
         with refusals_as_output_errors(path):
             kept = []
             for line in _lines(path) if is_plain(path) and not fresh else ():
-                record = _read_line(line)
-                if record is not None:
+                if (read := _read_line(line)) is not None:
                     kept.append(line.rstrip("\n") + "\n")
-                    self._scores[record["key"]] = Score(
-                        record["mae_deg"],
-                        record["seconds"],
-                        record["estimated_intensities"],
-                        record.get("found_light_error_deg"),
-                    )
+                    self._scores.update((read,))
             # Anew, because the next lines would reach every other name of this file.
             if os.path.lexists(path):
                 write_text(path, "".join(kept))
@@ -147,12 +144,13 @@ def _lines(path: Path) -> Iterator[str]:
             yield line
 
 
-def _read_line(line: str) -> dict[str, Any] | None:
+def _read_line(line: str) -> tuple[str, Score] | None:
+    """Return the key and the score of a trial."""
     try:
         record = parse_json(line)
-        numbers, estimated = (record["mae_deg"], record["seconds"]), record["estimated_intensities"]
-    except (ValueError, TypeError, KeyError):
+        key, score = record["key"], Score(**{name: record.get(name) for name in _FIELDS})
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
-    usable = all(isinstance(number, float) for number in numbers) and isinstance(estimated, bool)
-    usable = usable and isinstance(record.get("found_light_error_deg"), float | None)
-    return dict(record) if usable and isinstance(record.get("key"), str) else None
+    usable = isinstance(key, str) and isinstance(score.mae_deg, float) and isinstance(score.seconds, float)
+    usable = usable and isinstance(score.estimated_intensities, bool)
+    return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None
