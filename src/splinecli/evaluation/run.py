@@ -163,12 +163,10 @@ class _Progress:
         self._begun = 0
 
     def note(self, text: str) -> None:
-        """Show a text."""
         with self._lock:
             self._show(text)
 
     def skip(self, count: int) -> None:
-        """Count trials that are not computed."""
         with self._lock:
             self._finished += count
             self._show("")
