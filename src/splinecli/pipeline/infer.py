@@ -233,7 +233,7 @@ def _further_files(
         if name in options.maps:
             writers.append(partial(write, estimate))
     if "relief" in options.maps:
-        from splinecli.surface.relief import relief_of_normals
+        from splinecli.surface.integration import relief_of_normals
 
         writers.append(partial(files.write_relief, relief_of_normals(estimate.normal_map, capture.mask)))
     light_plot = None
