@@ -43,10 +43,6 @@ class CaptureReading:
     lights: tuple[int, ...]
     whole: bool
 
-    def open(self) -> CaptureSource:
-        """Open the capture. Raises InputError, UsageError."""
-        return open_to_score(self.folder, self.protocols[0])
-
     def read(self, source: CaptureSource, on_image: OnImage | None = None) -> tuple[TrialSource, list[tuple[str, ...]]]:
         """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""
         n_read = 0
@@ -77,8 +73,7 @@ def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
 
 
 def _as_input_error(error: OSError, folder: Path) -> InputError:
-    path = Path(error.filename) if error.filename else folder
-    return InputError(f"cannot be read ({error.strerror or error})", path=path)
+    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
 
 
 def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:

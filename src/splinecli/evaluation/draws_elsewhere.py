@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.capture_reading import CaptureReading
+from splinecli.evaluation.capture_reading import CaptureReading, open_to_score
 from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
 from splinecli.evaluation.trials import Score, Trial
 from splinecli.methods import Estimator
@@ -43,8 +43,9 @@ class DrawScorer:
         """Return the scores of a draw. Raises what a trial raises."""
         if self._last is None or self._last[0] != task.reading:
             self._last = None  # frees the memory
+            reading = task.reading
             try:
-                self._last = task.reading, *task.reading.read(task.reading.open())
+                self._last = reading, *reading.read(open_to_score(reading.folder, reading.protocols[0]))
             except (InputError, UsageError) as error:
                 return DrawScores(error=error)
         _, source, notes = self._last

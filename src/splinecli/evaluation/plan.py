@@ -36,11 +36,6 @@ class ProtocolTrials:
     failures: dict[str, SplinecliError] = field(default_factory=dict)
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, protocol: Protocol) -> ProtocolTrials:
-        """Return a protocol with its draws file read, without trials. Raises UsageError, InputError."""
-        return cls(*read_draws_file(protocol))
-
     def fail(self, capture: str, error: SplinecliError) -> None:
         """Record why a capture cannot be scored, and drop its trials."""
         self.failures.setdefault(capture, error)

@@ -14,7 +14,7 @@ from threading import Lock
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.draws_elsewhere import DrawScores, DrawTask
 from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, check_skip_first, distinct_names
+from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, check_skip_first, distinct_names, read_draws_file
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import SharedDraw
 from splinecli.evaluation.trials import Trial, TrialStore
@@ -70,7 +70,7 @@ def evaluate_all(
     for method, count in Counter(estimator.name for estimator in estimators).items():
         if count > 1:
             raise UsageError(f"method {method} comes twice", hint="Name each method once")
-    tasks = [ProtocolTrials.of(protocol) for protocol in protocols]
+    tasks = [ProtocolTrials(*read_draws_file(protocol)) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:
