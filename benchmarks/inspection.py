@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter, label
 
 from splinecli import estimate_normals
 from splinecli.maths.derivatives import curvature_of_normals
-from splinecli.surface.relief import relief_of_normals
+from splinecli.surface.integration import relief_of_normals
 
 Floats = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splinecli.evaluation.light_noise import tilt_lights
+from splinecli.evaluation.trial_capture import tilt_lights
 from splinecli.maths.normals import angle_between_deg, unit
 
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from scenes import cap_directions, halfway
-from splinecli.fits.ia14 import fit, solve
-from splinecli.fits.quadratic_programme import minimise_nonnegative
+from splinecli.fits.ia14 import fit, minimise_nonnegative, solve
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import MethodOptions, make_estimator
 

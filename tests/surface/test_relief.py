@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splinecli.maths.normals import unit
-from splinecli.surface.relief import relief_of_normals
+from splinecli.surface.integration import relief_of_normals
 
 
 @pytest.mark.parametrize(("wave", "kept"), [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))])

@@ -173,7 +173,6 @@ def check_arrays(capture: Capture, *, intensities_measured: bool) -> list[Captur
 
 
 def _samples(capture: Capture) -> tuple[Sample, Sample]:
-    """Return a sample and a closeup of a capture."""
     sample = sample_observations(capture.observations, capture.mask)
     if capture.estimated_intensities is not None:
         # They were estimated under the lights that are in question.

@@ -69,12 +69,9 @@ def _shifts_against(
     inner: NDArray[np.float32],
 ) -> dict[int, tuple[int, int]]:
     """Return the shifts (right, down) of those images of (P, F) that some of them show to be shifted."""
-    found = {}
-    for place, predicted in enumerate(_predictions(values, predictors)):
-        shift = _shift(values[:, place], predicted, mask, inner)
-        if shift is not None:
-            found[place] = shift
-    return found
+    predictions = enumerate(_predictions(values, predictors))
+    shifts = {place: _shift(values[:, place], predicted, mask, inner) for place, predicted in predictions}
+    return {place: shift for place, shift in shifts.items() if shift is not None}
 
 
 def shift_warnings(shifts: Sequence[ImageShift], names: Sequence[str]) -> list[CaptureWarning]:

@@ -7,7 +7,6 @@ begin at another lamp, or run the other way round.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +35,6 @@ _WAYS = {
 """The step through the lamps of a ring, and the signs of x and y."""
 
 
-@dataclass(frozen=True)
-class _RingReading:
-    """One ring read in another way: its lights (indices in rising order), in words, and its directions (n, 3)."""
-
-    lights: NDArray[np.integer]
-    words: str
-    directions: Array
-
-
 def mend_rings(factors: Factors, lights: Array) -> tuple[str, Array, float]:
     """Return what mends the rings of lights (F, 3), in words (none if they fit), the mended lights and their misfit.
 
@@ -52,21 +42,21 @@ def mend_rings(factors: Factors, lights: Array) -> tuple[str, Array, float]:
     the rings stand to each other; most of them count as right.
     """
     rings = find_rings(lights)
-    trials = [(ring, reading) for ring, lamps in enumerate(rings) for reading in _readings(lamps, lights)]
-    mended, found = lights, dict[int, _RingReading]()
+    trials = [(ring, *reading) for ring, lamps in enumerate(rings) for reading in _readings(lights[lamps])]
+    mended, found = lights, dict[int, str]()
     misfit = float(factors.misfits(lights[None])[0])
     for _ in range(2 * len(rings)):
         stack = np.repeat(mended[None], len(trials), axis=0)
-        for row, (ring, reading) in enumerate(trials):
-            stack[row, rings[ring]] = reading.directions
+        for row, (ring, _, directions) in enumerate(trials):
+            stack[row, rings[ring]] = directions
         misfits = factors.misfits(stack)
         if misfits.min() > _MOST_LEFT * misfit:
             break
         # On a regular ring, several readings are the same. The first ones are the simplest.
         best = int(np.flatnonzero(misfits <= misfits.min() + _EQUAL * misfit)[0])
-        ring, reading = trials[best]
-        mended, misfit, found[ring] = stack[best], float(misfits[best]), reading
-    return _in_words([found[ring] for ring in sorted(found) if found[ring].words]), mended, misfit
+        ring, words, _ = trials[best]
+        mended, misfit, found[ring] = stack[best], float(misfits[best]), words
+    return _in_words([(rings[ring], found[ring]) for ring in sorted(found) if found[ring]]), mended, misfit
 
 
 def find_rings(lights: Array) -> list[NDArray[np.integer]]:
@@ -78,21 +68,20 @@ def find_rings(lights: Array) -> list[NDArray[np.integer]]:
     return [ring for ring in rings if len(ring) >= FEWEST_IN_RING] if len(rings) > 1 else []
 
 
-def _readings(ring: NDArray[np.integer], lights: Array) -> Iterator[_RingReading]:
-    """Yield the readings of a ring, the simplest first."""
-    given = lights[ring]
-    for steps in sorted(range(len(ring)), key=lambda steps: min(steps, len(ring) - steps)):
-        shift = "" if steps == 0 else f"shifted by {min(steps, steps - len(ring), key=abs):+d}"
+def _readings(given: Array) -> Iterator[tuple[str, Array]]:
+    """Yield the readings of a ring (n, 3), in words and directions (n, 3), the simplest first."""
+    for steps in sorted(range(len(given)), key=lambda steps: min(steps, len(given) - steps)):
+        shift = "" if steps == 0 else f"shifted by {min(steps, steps - len(given), key=abs):+d}"
         for way, (step, *signs) in _WAYS.items():
             directions = np.roll(given[::step], -steps, axis=0) * (*signs, 1)
-            yield _RingReading(ring, " and ".join(filter(None, (way, shift))), directions)
+            yield " and ".join(filter(None, (way, shift))), directions
 
 
-def _in_words(readings: Sequence[_RingReading]) -> str:
-    """Return words for mended rings, such as "with lights 9 to 16 shifted by +1"."""
+def _in_words(mended: Sequence[tuple[NDArray[np.integer], str]]) -> str:
+    """Return words for mended rings, from their lights and their words, such as "with lights 9 to 16 shifted by +1"."""
     parts: dict[str, list[str]] = {}
-    for reading in readings:
-        parts.setdefault(reading.words, []).append(_numbers(reading.lights + 1))
+    for lamps, words in mended:
+        parts.setdefault(words, []).append(_numbers(lamps + 1))
     named = "; ".join(f"lights {', '.join(lights)} {words}" for words, lights in parts.items())
     return f"with {named}" if named else ""
 

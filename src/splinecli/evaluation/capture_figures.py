@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,11 +74,18 @@ def capture_figures(
         for e in estimators
     }
     title = f"{printable(name)}, {heading(protocol)}{_listed(trial.lights)}"
-    figures = [_maps_figure(capture, estimates, stem, title)]
+    png = method_maps(
+        capture.ground_truth,
+        capture.mask,
+        {method: estimate.normal_map for method, estimate in estimates.items()},
+        {method: _errors(estimate) for method, estimate in estimates.items()},
+        title=title,
+    )
+    figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
     estimator = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
     # Under near lamps, each pixel has light directions of its own.
     if estimator is not None and capture.lamps is None:
-        whole = stored.capture if trial.as_stored else stored.restore(stored.estimate_intensities())
+        whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
         chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
         png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
@@ -102,18 +109,6 @@ def file_stems(names: Sequence[str]) -> list[str]:
             number += 1
         stems.append(stem)
     return stems
-
-
-def _maps_figure(capture: Capture, estimates: Mapping[str, NormalEstimate], stem: str, title: str) -> CaptureFigure:
-    assert capture.ground_truth is not None
-    png = method_maps(
-        capture.ground_truth,
-        capture.mask,
-        {method: estimate.normal_map for method, estimate in estimates.items()},
-        {method: _errors(estimate) for method, estimate in estimates.items()},
-        title=title,
-    )
-    return CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)
 
 
 def _errors(estimate: NormalEstimate) -> NDArray[np.float32]:

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splinecli.capture import CaptureSource, capture_name, open_capture
+from splinecli import __version__
+from splinecli.capture import CaptureSource, capture_name
 from splinecli.capture.lights.draws import Draw, DrawsFile, draw_lights, read_draws
 from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
+from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.capture_notes import capture_notes
+from splinecli.evaluation.capture_reading import CaptureReading, open_to_score
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
-from splinecli.evaluation.scored_pixels import scored_rows
 from splinecli.evaluation.statistics import AVERAGE
-from splinecli.evaluation.trial_capture import TrialSource
-from splinecli.evaluation.trials import Trial, TrialStore, plan_trials
+from splinecli.evaluation.trials import Trial, TrialStore
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 
 Unit = tuple[Trial, Estimator]
 """A trial and the method that it scores."""
-
-OnImage = Callable[[int, int], object]
-"""Called with the number of images read so far and their total."""
 
 
 @dataclass
@@ -39,14 +36,9 @@ class ProtocolTrials:
     failures: dict[str, SplinecliError] = field(default_factory=dict)
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, protocol: Protocol) -> ProtocolTrials:
-        """Return a protocol with its draws file read, without trials. Raises UsageError, InputError."""
-        return cls(*read_draws_file(protocol))
-
     def fail(self, capture: str, error: SplinecliError) -> None:
         """Record why a capture cannot be scored, and drop its trials."""
-        self.failures[capture] = error
+        self.failures.setdefault(capture, error)
         self.trials = {key: trials for key, trials in self.trials.items() if key[0] != capture}
 
     def evaluation(self, captures: Sequence[str], store: TrialStore) -> Evaluation:
@@ -82,7 +74,7 @@ class CaptureJob:
     """One capture with its trials under all protocols.
 
     Args:
-        folder: the capture's folder as it was given. Other processes open it again.
+        folder: the capture's folder as it was given.
         name: name of the capture in the tables.
         source: the opened capture.
         tasks: the protocols that can score it.
@@ -101,11 +93,12 @@ class CaptureJob:
     ) -> CaptureJob | None:
         """Return the job of a capture. Returns None if no protocol can score it; the tasks then contain the reasons."""
         try:
-            source = open_capture(folder, white_level=tasks[0].protocol.white_level)
-        except (InputError, UsageError, OSError) as error:
+            source = open_to_score(folder, tasks[0].protocol)
+        except (InputError, UsageError) as error:
             for task in tasks:
-                task.fail(name, as_input_error(error, folder))
+                task.fail(name, error)
             return None
+        made_of = [digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators]
         job = cls(folder, name, source, [], [])
         for task in tasks:
             try:
@@ -114,11 +107,13 @@ class CaptureJob:
                 task.fail(name, error)
                 continue
             job.tasks.append(task)
-            by_method = [plan_trials(name, source.stamp, e, draws, task.protocol) for e in estimators]
-            for estimator, trials in zip(estimators, by_method, strict=True):
-                task.trials[name, estimator.name] = trials
             # All methods of a draw come together: they share its capture, and the remaining time can be estimated.
-            job.draws += [list(zip(trials, estimators, strict=True)) for trials in zip(*by_method, strict=True)]
+            for number, draw in enumerate(draws):
+                job.draws.append([])
+                for estimator, made in zip(estimators, made_of, strict=True):
+                    trial = Trial(name, estimator.name, number, draw, task.protocol, made)
+                    task.trials.setdefault((name, estimator.name), []).append(trial)
+                    job.draws[-1].append((trial, estimator))
         return job if job.tasks else None
 
     def missing(self, store: TrialStore) -> list[list[Unit]]:
@@ -126,46 +121,31 @@ class CaptureJob:
         draws = [[unit for unit in draw if store.find(unit[0]) is None] for draw in self.draws]
         return [draw for draw in draws if draw]
 
-    def read(self, draws: Sequence[Sequence[Unit]], on_image: OnImage | None = None) -> TrialSource:
-        """Return the capture under all lights of these draws. Raises InputError, UsageError."""
+    def reading(self, draws: Sequence[Sequence[Unit]]) -> CaptureReading:
+        """Return what these draws need of the capture; without any, what the notes on it need: mask and truth."""
+        draws = draws or self.draws[:1]
+        protocols = tuple(task.protocol for task in self.tasks)
+        refines = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
+        whole = refines or any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw)
         lights = sorted(set().union(*(trial.lights for draw in draws for trial, _ in draw)))
-        n_read = 0
+        return CaptureReading(self.folder, self.name, protocols, tuple(lights), whole)
 
-        def count() -> None:
-            nonlocal n_read
-            n_read += 1
-            if on_image is not None:
-                on_image(n_read, len(lights))
+    def note(self, notes: Sequence[tuple[str, ...]]) -> None:
+        """Record the notes on the capture, by protocol."""
+        for task, of_protocol in zip(self.tasks, notes, strict=True):
+            task.notes[self.name] = of_protocol
 
-        try:
-            stored = self.source.read_stored(lights, count)
-        except OSError as error:
-            raise as_input_error(error, self.source.files.folder) from error
+    def fail(self, error: SplinecliError) -> None:
+        """Record why the capture cannot be scored."""
         for task in self.tasks:
-            task.notes[self.name] = capture_notes(stored.capture, self.name, task.protocol)
-        # All protocols of an evaluation score the same pixels.
-        protocol = self.tasks[0].protocol
-        rows = scored_rows(stored.capture, max_pixels=protocol.max_pixels, seed=protocol.seed)
-        as_stored = all(task.protocol.as_stored for task in self.tasks)
-        whole = any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw) or any(
-            task.protocol.light_error_deg is not None or task.protocol.finds_lights for task in self.tasks
-        )
-        return TrialSource.with_pixels(stored, rows, as_stored=as_stored, whole=whole)
-
-
-def as_input_error(error: SplinecliError | OSError, folder: Path) -> SplinecliError:
-    """Convert a system error to an InputError that names the file. Return other errors unchanged."""
-    if isinstance(error, SplinecliError):
-        return error
-    path = Path(error.filename) if error.filename else folder
-    return InputError(f"cannot be read ({error.strerror or error})", path=path)
+            task.fail(self.name, error)
 
 
 def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
     """Return the first trial of a capture, without a method. Raises what evaluate_all raises."""
     protocol, draws_file = read_draws_file(protocol)
     draw = draws_for(source, name, protocol, draws_file)[0]
-    return Trial.of(name, "", 0, draw, protocol, made_of="")
+    return Trial(name, "", 0, draw, protocol, "")
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:

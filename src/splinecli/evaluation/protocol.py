@@ -8,10 +8,13 @@ from pathlib import Path
 
 from splinecli.capture.lights.draws import check_draw_settings
 from splinecli.errors import UsageError
-from splinecli.evaluation.light_noise import LARGEST_SIGMA_DEG
 
 EVERY_CAPTURE = "*"
 """Key of `skip_first` for all captures that have no key of their own."""
+
+
+LARGEST_SIGMA_DEG = 30.0
+"""Largest standard deviation of the light noise that an evaluation accepts."""
 
 
 @dataclass(frozen=True)

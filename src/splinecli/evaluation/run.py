@@ -14,9 +14,9 @@ from threading import Lock
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.draws_elsewhere import DrawScores, DrawTask
 from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, Unit, check_skip_first, distinct_names
+from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, check_skip_first, distinct_names, read_draws_file
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
+from splinecli.evaluation.trial_capture import SharedDraw
 from splinecli.evaluation.trials import Trial, TrialStore
 from splinecli.methods import Estimator
 
@@ -65,10 +65,12 @@ def evaluate_all(
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
-    check_methods(estimators)
-    if not captures:
+    if not captures or not estimators:
         raise UsageError("there is nothing to score: give at least one capture and one method")
-    tasks = [ProtocolTrials.of(protocol) for protocol in protocols]
+    for method, count in Counter(estimator.name for estimator in estimators).items():
+        if count > 1:
+            raise UsageError(f"method {method} comes twice", hint="Name each method once")
+    tasks = [ProtocolTrials(*read_draws_file(protocol)) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:
@@ -80,25 +82,9 @@ def evaluate_all(
         run.run(jobs)
     else:
         run.run_elsewhere(elsewhere)
-    settings = {
-        e.name: {
-            "weights": e.weights,
-            "device": e.device,
-            "precision": e.precision,
-            "fingerprint": e.fingerprint,
-        }
-        for e in estimators
-    }
+    names_of_settings = ("weights", "device", "precision", "fingerprint")
+    settings = {e.name: {name: getattr(e, name) for name in names_of_settings} for e in estimators}
     return [replace(task.evaluation(names, store), settings=settings) for task in tasks]
-
-
-def check_methods(estimators: Sequence[Estimator]) -> None:
-    """Raise UsageError where there are no estimators, or two have the same name."""
-    if not estimators:
-        raise UsageError("there is nothing to score: give at least one capture and one method")
-    for method, count in Counter(estimator.name for estimator in estimators).items():
-        if count > 1:
-            raise UsageError(f"method {method} comes twice", hint="Name each method once")
 
 
 class _Run:
@@ -123,21 +109,21 @@ class _Run:
 
     def run_elsewhere(self, elsewhere: Elsewhere) -> None:
         """Let other processes score the trials. Raises what a trial raises."""
-        captures = {job.name: (job, draws) for job, draws in self._captures}
-        failed: set[str] = set()
-        for task, result in elsewhere([task for job, draws in self._captures for task in _tasks(job, draws)]):
-            job, draws = captures[task.name]
-            draw = [] if task.draw is None else draws[task.draw]
+        jobs = {job.name: job for job, _ in self._captures}
+        tasks = [
+            DrawTask(reading, tuple(trial for trial, _ in draw))
+            for reading, draws in ((job.reading(draws), draws) for job, draws in self._captures)
+            for draw in draws or [[]]
+        ]
+        for task, result in elsewhere(tasks):
+            job = jobs[task.reading.name]
             if result.error is not None:
-                for planned in job.tasks if task.name not in failed else ():
-                    planned.fail(job.name, result.error)
-                failed.add(task.name)
+                job.fail(result.error)
             else:
-                for planned, notes in zip(job.tasks, result.notes, strict=True):
-                    planned.notes[job.name] = notes
-                for (trial, _), score in zip(draw, result.scores, strict=True):
+                job.note(result.notes)
+                for trial, score in zip(task.trials, result.scores, strict=True):
                     self._store.add(trial, score)
-            self._progress.skip(len(draw))
+            self._progress.skip(len(task.trials))
 
     def _submit_all(self, workers: ThreadPoolExecutor, jobs: int) -> None:
         running: set[Future[None]] = set()
@@ -147,32 +133,20 @@ class _Run:
                 self._progress.note(f"reading {name}, image {n_read} of {n_images}")
 
             try:
-                # Also where no trial is missing: some notes on a capture need its mask and ground truth.
-                source = job.read(draws or job.draws[:1], show_image)
+                source, notes = job.reading(draws).read(job.source, show_image)
             except (InputError, UsageError) as error:
-                for task in job.tasks:
-                    task.fail(job.name, error)
+                job.fail(error)
                 self._progress.skip(sum(map(len, draws)))
                 continue
-            running = self._submit(workers, jobs, running, source, draws)
-            del source
+            job.note(notes)
+            for draw in draws:
+                shared = SharedDraw(source, draw[0][0])
+                for trial, estimator in draw:
+                    running.add(workers.submit(self._score, shared, trial, estimator))
+                    running = _wait(running, jobs)  # one trial waits, so that no core does
+                del shared
+            del source  # before the next capture is read
         _wait(running, 0)
-
-    def _submit(
-        self,
-        workers: ThreadPoolExecutor,
-        jobs: int,
-        running: set[Future[None]],
-        source: TrialSource,
-        draws: Sequence[Sequence[Unit]],
-    ) -> set[Future[None]]:
-        """Submit the trials of one capture. Returns those that still run."""
-        for draw in draws:
-            shared = SharedDraw(source, draw[0][0])
-            for trial, estimator in draw:
-                running.add(workers.submit(self._score, shared, trial, estimator))
-                running = _wait(running, jobs)  # one trial waits, so that no core does
-        return running
 
     def _score(self, shared: SharedDraw, trial: Trial, estimator: Estimator) -> None:
         self._store.add(trial, shared.score(estimator, self._progress.begin))
@@ -189,12 +163,10 @@ class _Progress:
         self._begun = 0
 
     def note(self, text: str) -> None:
-        """Show a text."""
         with self._lock:
             self._show(text)
 
     def skip(self, count: int) -> None:
-        """Count trials that are not computed."""
         with self._lock:
             self._finished += count
             self._show("")
@@ -222,14 +194,6 @@ class _Progress:
     def _show(self, text: str) -> None:
         if self._on_progress is not None:
             self._on_progress(self._finished + sum(self._running.values()), self._total, text)
-
-
-def _tasks(job: CaptureJob, draws: Sequence[Sequence[Unit]]) -> list[DrawTask]:
-    """Return the tasks of a capture: one for each draw, or one for the notes on it."""
-    numbers = {trial: (number, unit) for number, draw in enumerate(job.draws) for unit, (trial, _) in enumerate(draw)}
-    missing = tuple((numbers[draw[0][0]][0], tuple(numbers[trial][1] for trial, _ in draw)) for draw in draws)
-    positions: Sequence[int | None] = range(len(draws)) if draws else [None]
-    return [DrawTask(job.folder, job.name, missing, position) for position in positions]
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:

@@ -112,13 +112,12 @@ def p_in_words(p_value: float) -> str:
 
 def _compare_all(capture: str, maes_deg: dict[str, tuple[float, ...]]) -> list[Comparison]:
     pairs = combinations(maes_deg, 2)
-    compared = [_compare(capture, a, b, np.array(maes_deg[a]), np.array(maes_deg[b])) for a, b in pairs]
+    compared = [_compare(capture, a, b, np.subtract(maes_deg[a], maes_deg[b])) for a, b in pairs]
     corrected = iter(holm([c.p_value for c in compared if c.p_value is not None]))
     return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in compared]
 
 
-def _compare(capture: str, first: str, second: str, a: NDArray[np.float64], b: NDArray[np.float64]) -> Comparison:
-    differences = a - b
+def _compare(capture: str, first: str, second: str, differences: NDArray[np.float64]) -> Comparison:
     interval, p_value = _paired_test(differences)
     mean, std = float(differences.mean()), float(differences.std())
     return Comparison(capture, first, second, len(differences), mean, std, interval, p_value, None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
@@ -15,17 +15,17 @@ from splinecli.capture.lights.draws import NOISE_STREAM
 from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stored import StoredCapture
-from splinecli.evaluation.light_noise import tilt_lights
 from splinecli.evaluation.trials import Score, Trial
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.light.unknown_lights import find_lights
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.methods.near_light import find_surface
 from splinecli.system.progress import Progress
 
 _RETILTS = 100
+_LARGEST_TILT_DEG = 89.0
 
 
 @dataclass(frozen=True)
@@ -66,31 +66,30 @@ class TrialSource:
 
         It has the scored pixels, or with `whole` all of them. As in `infer`, all pixels refine or find lights.
         """
-        rows = None if whole else self.rows
-        if trial.light_error_deg is None and not trial.finds_lights:
-            return self._see(trial, rows)
-        capture = self._see(trial, None)
-        if trial.light_error_deg is not None:
-            known = self.stored.intensities_known
-            capture = refine_capture(capture, error_deg=trial.light_error_deg, intensities_known=known)
-        return capture if rows is None else capture.choose_pixels(rows)
-
-    def _see(self, trial: Trial, rows: NDArray[np.integer] | None) -> Capture:
-        position = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
-        seen = self.stored.choose_lights([position[light] for light in trial.lights])
-        if trial.light_noise_deg:
+        protocol, rows = trial.protocol, None if whole else self.rows
+        seen = self.stored.choose_lights(self.places(trial.lights))
+        if protocol.light_noise_deg:
             seen = replace(seen, capture=_with_noise(seen.capture, trial))
-        if trial.finds_lights:
+        if protocol.finds_lights:
             seen = seen.find_lights(partial(find_lights, refuse=False))
         # The intensities come from all pixels, so they are estimated before the scored ones are chosen.
-        intensities = None if trial.as_stored else seen.estimate_intensities()
-        if rows is None or seen.capture.lamps is None:
-            if rows is not None:
-                seen = seen.choose_pixels(rows)
-            return seen.capture if trial.as_stored else seen.restore(intensities)
+        intensities = None if protocol.as_stored else seen.estimate_intensities()
+        needs_all = protocol.finds_lights or protocol.light_error_deg is not None or seen.capture.lamps is not None
+        if rows is not None and not needs_all:
+            seen, rows = seen.choose_pixels(rows), None
+        capture = seen.capture if protocol.as_stored else seen.restore(intensities)
+        if protocol.light_error_deg is not None:
+            known = self.stored.intensities_known
+            capture = refine_capture(capture, error_deg=protocol.light_error_deg, intensities_known=known)
+        if rows is None:
+            return capture
         # Near lamps need the surface, which only all pixels together have.
-        capture = find_surface(seen.capture if trial.as_stored else seen.restore(intensities))
-        return capture.choose_pixels(rows)
+        return find_surface(capture).choose_pixels(rows)
+
+    def places(self, lights: Sequence[int]) -> list[int]:
+        """Return the places of lights among those that were read."""
+        place = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
+        return [place[light] for light in lights]
 
 
 class SharedDraw:
@@ -119,20 +118,17 @@ class SharedDraw:
     def _light_error_deg(self, capture: Capture) -> float | None:
         if capture.light_errors_deg is None:
             return None
-        whole = self._source.stored.capture
-        place = {light: place for place, light in enumerate(whole.light_indices)}
-        true = whole.light_directions[[place[light] for light in capture.light_indices]]
+        source = self._source
+        true = source.stored.capture.light_directions[source.places(capture.light_indices)]
         return float(angle_between_deg(capture.light_directions, true).mean())
 
     def _capture(self, *, whole: bool) -> Capture:
-        """Return the capture under the lights of the draw: the scored pixels, or all."""
         with self._lock:
             if whole not in self._captures:
                 self._captures[whole] = self._source.see(self._trial, whole=whole)
             return self._captures[whole]
 
     def _mean_error_deg(self, estimate: NormalEstimate) -> float:
-        """Return the mean error of an estimate over the scored pixels."""
         assert estimate.errors is not None and estimate.error_map_deg is not None  # or it would have no trials
         rows = self._source.rows
         if rows is None or estimate.capture.n_pixels == len(rows):
@@ -142,16 +138,31 @@ class SharedDraw:
 
 def _with_noise(capture: Capture, trial: Trial) -> Capture:
     """Return the capture with the trial's noise on its lights; near lamps keep their distances."""
-    directions = _tilted(capture.light_directions, trial)
+    generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
+    # Few lights and much noise can give lights in one plane. Such noise is drawn again.
+    for _ in range(_RETILTS):
+        directions = tilt_lights(capture.light_directions, trial.protocol.light_noise_deg, generator)
+        if not in_one_plane(directions):
+            break
     lamps = None if capture.lamps is None else capture.lamps.turned(directions)
     return replace(capture, light_directions=directions, lamps=lamps)
 
 
-def _tilted(light_directions: NDArray[np.float64], trial: Trial) -> NDArray[np.float64]:
-    generator = np.random.default_rng([NOISE_STREAM, trial.seed, trial.number])
-    # Few lights and much noise can give lights in one plane. Such noise is drawn again.
-    for _ in range(_RETILTS):
-        tilted = tilt_lights(light_directions, trial.light_noise_deg, generator)
-        if not in_one_plane(tilted):
-            break
+def tilt_lights(
+    light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return unit light directions (F, 3), each turned by an angle from N(0, sigma_deg) in a random direction.
+
+    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <= 0) is turned the
+    opposite way and stays above it, so that a capture may have any of the directions.
+    """
+    n_lights = len(light_directions)
+    angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG))
+    # A Gaussian vector without its part along the light: every perpendicular direction is equally likely.
+    across = generator.normal(size=(n_lights, 3))
+    along = np.einsum("fi,fi->f", across, light_directions)
+    across = unit(across - along[:, None] * light_directions)
+    sunk = np.cos(angle) * light_directions[:, 2] + np.sin(angle) * across[:, 2] <= 0
+    angle = np.where(sunk, -angle, angle)[:, None]
+    tilted: NDArray[np.float64] = unit(np.cos(angle) * light_directions + np.sin(angle) * across)
     return tilted

@@ -5,17 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from splinecli import __version__
 from splinecli.capture.lights.draws import Draw
-from splinecli.capture.stamp import digest
 from splinecli.evaluation.protocol import Protocol
-from splinecli.methods import Estimator
 from splinecli.system.files import parse_json, refusals_as_output_errors, write_text
 from splinecli.system.publishing import is_plain
 
@@ -31,7 +28,7 @@ class Trial:
         method: name of the method.
         number: number of the trial, from 0.
         lights: the draw.
-        light_noise_deg, seed, max_pixels, as_stored, light_error_deg, finds_lights: see Protocol.
+        protocol: what else decides the score.
         made_of: digest of the capture's files and of the method's settings.
     """
 
@@ -39,43 +36,39 @@ class Trial:
     method: str
     number: int
     lights: Draw
-    light_noise_deg: float
-    seed: int
-    max_pixels: int | None
-    as_stored: bool
+    protocol: Protocol
     made_of: str
-    light_error_deg: float | None = None
-    finds_lights: bool = False
 
-    @classmethod
-    def of(cls, capture: str, method: str, number: int, lights: Draw, protocol: Protocol, *, made_of: str) -> Trial:
-        """Return a trial of a protocol."""
-        return cls(
-            capture,
-            method,
-            number,
-            lights,
-            protocol.light_noise_deg,
-            protocol.seed,
-            protocol.max_pixels,
-            protocol.as_stored,
-            made_of,
-            protocol.light_error_deg,
-            protocol.finds_lights,
-        )
+    @property
+    def record(self) -> dict[str, Any]:
+        """The trial as JSON values."""
+        p = self.protocol
+        return {
+            "capture": self.capture,
+            "method": self.method,
+            "number": self.number,
+            "lights": self.lights,
+            "light_noise_deg": p.light_noise_deg,
+            "seed": p.seed,
+            "max_pixels": p.max_pixels,
+            "as_stored": p.as_stored,
+            "made_of": self.made_of,
+            "light_error_deg": p.light_error_deg,
+            "finds_lights": p.finds_lights,
+        }
 
     @property
     def key(self) -> str:
         """SHA-256 of what decides the score. The noise depends on seed and number, the pixels on the seed."""
-        values = asdict(self)
+        values = self.record
         del values["capture"]  # only a name in the tables: made_of has the files themselves
-        if self.light_error_deg is None:
+        if self.protocol.light_error_deg is None:
             del values["light_error_deg"]  # so that earlier trials stay valid
-        if not self.finds_lights:
+        if not self.protocol.finds_lights:
             del values["finds_lights"]  # likewise
-        if self.light_noise_deg == 0:
+        if self.protocol.light_noise_deg == 0:
             del values["number"]
-            if self.max_pixels is None:
+            if self.protocol.max_pixels is None:
                 del values["seed"]
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
@@ -95,6 +88,9 @@ class Score:
     seconds: float
     estimated_intensities: bool
     found_light_error_deg: float | None = None
+
+
+_FIELDS = [field.name for field in fields(Score)]
 
 
 class TrialStore:
@@ -119,15 +115,9 @@ class TrialStore:
         with refusals_as_output_errors(path):
             kept = []
             for line in _lines(path) if is_plain(path) and not fresh else ():
-                record = _read_line(line)
-                if record is not None:
+                if (read := _read_line(line)) is not None:
                     kept.append(line.rstrip("\n") + "\n")
-                    self._scores[record["key"]] = Score(
-                        record["mae_deg"],
-                        record["seconds"],
-                        record["estimated_intensities"],
-                        record.get("found_light_error_deg"),
-                    )
+                    self._scores.update((read,))
             # Anew, because the next lines would reach every other name of this file.
             if os.path.lexists(path):
                 write_text(path, "".join(kept))
@@ -142,19 +132,9 @@ class TrialStore:
             self._scores[trial.key] = score
             if self._path is None:
                 return
-            line = json.dumps({**asdict(trial), **asdict(score), "key": trial.key})
+            line = json.dumps({**trial.record, **asdict(score), "key": trial.key})
             with refusals_as_output_errors(self._path), self._path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
-
-
-def plan_trials(
-    capture: str, stamp: Sequence[Any], estimator: Estimator, draws: list[Draw], protocol: Protocol
-) -> list[Trial]:
-    """Return the trials of one method on one capture, given the stamp of the capture's files."""
-    made_of = digest([__version__, estimator.fingerprint, *stamp])
-    return [
-        Trial.of(capture, estimator.name, number, draw, protocol, made_of=made_of) for number, draw in enumerate(draws)
-    ]
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -164,12 +144,13 @@ def _lines(path: Path) -> Iterator[str]:
             yield line
 
 
-def _read_line(line: str) -> dict[str, Any] | None:
+def _read_line(line: str) -> tuple[str, Score] | None:
+    """Return the key and the score of a trial."""
     try:
         record = parse_json(line)
-        numbers, estimated = (record["mae_deg"], record["seconds"]), record["estimated_intensities"]
-    except (ValueError, TypeError, KeyError):
+        key, score = record["key"], Score(**{name: record.get(name) for name in _FIELDS})
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
-    usable = all(isinstance(number, float) for number in numbers) and isinstance(estimated, bool)
-    usable = usable and isinstance(record.get("found_light_error_deg"), float | None)
-    return dict(record) if usable and isinstance(record.get("key"), str) else None
+    usable = isinstance(key, str) and isinstance(score.mae_deg, float) and isinstance(score.seconds, float)
+    usable = usable and isinstance(score.estimated_intensities, bool)
+    return (key, score) if usable and isinstance(score.found_light_error_deg, float | None) else None

@@ -11,13 +11,11 @@ from math import comb
 import torch
 from torch import Tensor
 
-from splinecli.fits.quadratic_programme import minimise_nonnegative
 from splinecli.fits.shadows import lit_observations
-
-__all__ = ["fit", "solve"]
 
 DEGREE_OBSERVATION = 2  # N1 in the paper
 DEGREE_LIGHT = 4  # N2 in the paper
+SHADOW_SHARE = 0.2  # of the pixel's quantile UNSHADED; observations below it are left out as shadows
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
@@ -31,7 +29,6 @@ def fit(
     light_directions: Tensor,
     valid: Tensor | None = None,
     *,
-    shadow_share: float = 0.2,
     prior_weight: float = 0.01,
 ) -> tuple[Tensor, Tensor]:
     """Return normals (P, 3) of any length, and the polynomial's increments (P, N1, N2 + 1), which are not negative.
@@ -55,14 +52,12 @@ def fit(
         observations: (P, F), the largest of a pixel at most 1.
         light_directions: (F, 3) or (P, F, 3), unit length, z to the camera.
         valid: (P, F) bool. None means all are valid.
-        shadow_share: of the pixel's quantile UNSHADED; observations below it are left out as shadows, except the
-            three largest.
         prior_weight: a variance of 1 costs as much as a residual of sqrt(prior_weight) times the mean shading.
     """
     intensities, lights = observations.double(), light_directions.double()
     if valid is not None:
         intensities = torch.where(valid, intensities, 0)
-    used = lit_observations(intensities, shadow_share, valid) & (intensities > 0)
+    used = lit_observations(intensities, SHADOW_SHARE, valid) & (intensities > 0)
     intensities = torch.where(used, intensities, 0)
     directions = torch.where(used[..., None], lights, 0)
     basis = _increment_basis(intensities, lights[..., 2])
@@ -108,3 +103,46 @@ def _bernstein(values: Tensor, degree: int) -> Tensor:
     """Return the polynomials comb(degree, i) x^i (1 - x)^(degree - i) in a new last dimension, for x in [0, 1]."""
     terms = [comb(degree, i) * values**i * (1 - values) ** (degree - i) for i in range(degree + 1)]
     return torch.stack(terms, dim=-1)
+
+
+def minimise_nonnegative(hessian: Tensor, linear: Tensor, *, iterations: int = 100) -> Tensor:
+    """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for P programmes with a hessian H and a linear term q
+    each.
+
+    Block principal pivoting (Júdice and Pires 1994; the backup rule as in Kim and Park 2011, SIAM J. Sci. Comput.,
+    algorithm 2): guess which variables are free, solve for them with the others at zero, and exchange those that
+    violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum.
+
+    Args:
+        hessian: (P, K, K), symmetric and positive definite.
+        linear: (P, K).
+        iterations: a limit, because rounding errors may cause cycles if a hessian is nearly singular. The result is
+            then feasible and close to the optimum.
+    """
+    count, size = linear.shape
+    eye = torch.eye(size, dtype=hessian.dtype, device=hessian.device)
+    position = torch.arange(size, device=hessian.device)
+    tolerance = 100 * torch.finfo(hessian.dtype).eps
+    free = torch.ones_like(linear, dtype=torch.bool)
+    fewest_wrong = linear.new_full((count,), size + 1)
+    patience = linear.new_full((count,), 3)
+    x = torch.zeros_like(linear)
+    for _ in range(iterations):
+        system = torch.where(free[:, :, None] & free[:, None, :], hessian, eye)
+        right_side = torch.where(free, linear, 0)[..., None]
+        x = torch.cholesky_solve(right_side, torch.linalg.cholesky(system))[..., 0]
+        gradient = (hessian @ x[..., None])[..., 0] - linear
+        value = torch.where(free, x, gradient)
+        scale = torch.where(free, x.abs().amax(dim=1, keepdim=True), linear.abs().amax(dim=1, keepdim=True))
+        wrong = value < -tolerance * scale
+        wrong_count = wrong.sum(dim=1)
+        if not wrong_count.any():
+            break
+        fewer = wrong_count < fewest_wrong
+        fewest_wrong = torch.where(fewer, wrong_count, fewest_wrong)
+        patience = torch.where(fewer, 3, patience - 1)
+        # Exchanging all at once may cycle. After three exchanges without gain, exchange only the last one,
+        # which cannot.
+        last = torch.where(wrong, position, -1).amax(dim=1, keepdim=True)
+        free = free ^ torch.where(patience[:, None] < 0, wrong & (position == last), wrong)
+    return torch.where(free, x, 0).clamp(min=0)

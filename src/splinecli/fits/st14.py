@@ -46,37 +46,32 @@ TURNED_AWAY = 10.0
 """Cost, for each unit of cosine, of a normal that faces away from the view or from a light that reaches it."""
 
 
-def solve(
-    observations: Tensor,
-    light_directions: Tensor,
-    *,
-    shadow: float = 0.4,
-    share: float = 0.25,
-    fewest: int = 8,
-    spread: float = 0.1,
-    rounds: int = 5,
-    steps: int = 4,
-) -> Tensor:
-    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for dark pixels.
+SHADOW_SHARE = 0.4
+"""Observations below this share of the pixel's quantile UNSHADED are shadows."""
 
-    Args:
-        shadow: observations below this share of the pixel's quantile UNSHADED are shadows.
-        share, fewest: how many of the others are kept; see kept_count. share is T_low in the paper.
-        spread: standard deviation of the prior on the two linear coefficients, relative to the brightest kept
-            observation. It halves with each further degree.
-        rounds, steps: number of estimates of the noise, and of Levenberg-Marquardt steps for each.
-    """
+KEPT_SHARE, FEWEST_KEPT = 0.25, 8
+"""How many of the others are kept; see kept_count. The first is T_low in the paper."""
+
+SPREAD = 0.1
+"""Standard deviation of the prior on the two linear coefficients, relative to the brightest kept observation. It halves
+with each further degree."""
+
+_ROUNDS, _STEPS = 5, 4  # estimates of the noise, and Levenberg-Marquardt steps for each
+
+
+def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
+    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for dark pixels."""
     lights = light_directions.double()
     # The normal equations square the condition number, so single precision would not be exact enough.
-    problem = _select(observations.double(), lights, shadow=shadow, share=share, fewest=fewest, spread=spread)
+    problem = _select(observations.double(), lights)
     # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse normals.
     all_alike = torch.ones_like(observations, dtype=torch.float64)
     normals = normalize(weighted_least_squares(observations.double(), lights, all_alike)[0], dim=1)
     noise = torch.full_like(normals[:, 0], FIRST_NOISE**2)
     damping = torch.full_like(noise, 1e-2)
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         fit = _fit(problem, normals, noise)
-        for _ in range(steps):
+        for _ in range(_STEPS):
             trial = _fit(problem, fit.step(damping), noise)
             better = trial.cost < fit.cost
             damping = torch.where(better, damping * 0.2, damping * 5).clamp(1e-7, 1e4)
@@ -85,9 +80,9 @@ def solve(
     return normals.to(observations.dtype)
 
 
-def kept_count(lit: Tensor, *, share: float, fewest: int) -> Tensor:
-    """Return how many of `lit` observations are kept: the share, but at least `fewest`, or all if there are fewer."""
-    return torch.maximum((share * lit).ceil().long(), lit.clamp(max=fewest))
+def kept_count(lit: Tensor) -> Tensor:
+    """Return how many of `lit` observations are kept: KEPT_SHARE, but at least FEWEST_KEPT, or all of fewer."""
+    return torch.maximum((KEPT_SHARE * lit).ceil().long(), lit.clamp(max=FEWEST_KEPT))
 
 
 def coefficient_count(kept: Tensor) -> Tensor:
@@ -141,18 +136,16 @@ class _Fit(NamedTuple):
         return _Fit(*(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs))
 
 
-def _select(
-    observations: Tensor, lights: Tensor, *, shadow: float, share: float, fewest: int, spread: float
-) -> _Problem:
+def _select(observations: Tensor, lights: Tensor) -> _Problem:
     count = observations.shape[1]
     view = lights.new_tensor(VIEW)
     ordered, index = observations.sort(dim=1)
-    is_lit = lit_observations(observations, shadow, fewest=FEWEST_LIT) & (observations > 0)
+    is_lit = lit_observations(observations, SHADOW_SHARE, fewest=FEWEST_LIT) & (observations > 0)
     lit = is_lit.sum(dim=1)
-    kept = kept_count(lit, share=share, fewest=fewest)
+    kept = kept_count(lit)
 
     # Use as many places as a pixel without shadows needs, so that no pixel depends on the others in its batch.
-    most = int(kept_count(torch.tensor(count), share=share, fewest=fewest))
+    most = int(kept_count(torch.tensor(count)))
     rank = torch.arange(most, device=lights.device)
     place = (count - lit[:, None] + rank).clamp(max=count - 1)
     is_kept = rank < kept[:, None]
@@ -172,7 +165,7 @@ def _select(
         lights=kept_lights * is_kept[..., None],
         bisectors=bisectors,
         light_powers=_powers((kept_lights * bisectors).sum(dim=-1)),
-        precision=torch.where(degree > 0, (spread * 0.5 ** (degree - 1)) ** -2, 0),
+        precision=torch.where(degree > 0, (SPREAD * 0.5 ** (degree - 1)) ** -2, 0),
         ridge=torch.where(left_out, 1e9, 1e-12),
         facing=torch.cat((lights * is_lit[..., None], view.expand(len(observations), 1, 3)), dim=1),
     )

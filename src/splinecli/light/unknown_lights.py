@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.found_lights import FirstLight, FoundLights
-from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, LightFit, fit_near
+from splinecli.capture.restore.light_refinement import INTENSITY_ERROR, fit_near
 from splinecli.errors import InputError, check_one_of
 from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.networks.light_net import LightGuess, LightNet, network_inputs, square_images
@@ -108,7 +108,7 @@ def find_lights(
             "the images do not show one surface under different distant lights, so the lights cannot be found",
             hint="Check that camera and object stood still, and that all images show the same object",
         )
-    if fit is not None and _is_better(fit):
+    if fit is not None and fit.after < fit.before and (fit.directions[:, 2] > 0).all():
         directions, intensities = fit.directions, intensities * fit.intensities
         observations = np.asarray(observations / fit.intensities, np.float32)
     turn = turn_at_outline(observations, mask, directions)
@@ -124,10 +124,6 @@ def find_lights(
             " lights with 'splinecli calibrate'",
         )
     return FoundLights(directions, errors_deg, None if intensities_known else intensities / intensities.mean())
-
-
-def _is_better(fit: LightFit) -> bool:
-    return fit.after < fit.before and bool((fit.directions[:, 2] > 0).all())
 
 
 def _check_different(observations: NDArray[np.float32]) -> None:

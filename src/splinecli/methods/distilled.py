@@ -87,10 +87,9 @@ class DistilledEstimator:
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
-        refiner = refiner_of(teacher)
-        if refiner is not None and n_pixels > TURNED_PIXELS:
-            refiner = refiner.without_turns()
-        self.refiner = refiner
+        self.refiner = refiner_of(teacher)
+        if self.refiner is not None and n_pixels > TURNED_PIXELS:
+            self.refiner = self.refiner.without_turns()
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
@@ -229,8 +228,7 @@ def seconds_of_learning(light_directions: Directions, size: StudentSize, device:
     generator = torch.Generator().manual_seed(0)
     lights = torch.as_tensor(light_directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(device)
-    n_inputs = len(perceptron.mean)
-    inputs = torch.rand(BATCH, n_inputs, generator=generator).to(device)
+    inputs = torch.rand(BATCH, len(perceptron.mean), generator=generator).to(device)
     for steps in (2, 10):  # the first steps take longer
         started = time.perf_counter()
         perceptron.learn(inputs, inputs[:, -3:], inputs[:, :2], steps=steps, generator=generator)

@@ -104,20 +104,10 @@ class Refiner(Protocol):
         ...
 
 
-@runtime_checkable
-class RefiningEstimator(ConfidentEstimator, Protocol):
-    """An estimator whose map of normals can be corrected by what lies around each pixel.
-
-    refiner: does that; None if the weights or the method leave it out.
-    """
-
-    @property
-    def refiner(self) -> Refiner | None: ...
-
-
 def refiner_of(estimator: Estimator) -> Refiner | None:
-    """Return what corrects the estimator's map of normals, if anything does."""
-    return estimator.refiner if isinstance(estimator, RefiningEstimator) else None
+    """Return what corrects the estimator's map of normals by what lies around each pixel, if anything does."""
+    refiner: Refiner | None = getattr(estimator, "refiner", None)
+    return refiner
 
 
 def tells_confidence(estimator: Estimator) -> TypeGuard[ConfidentEstimator]:

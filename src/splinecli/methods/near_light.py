@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
-
-Floats = NDArray[np.floating]
 
 ROUNDS = 2
 """Fits on the way. An error of the surface counts only as a share of the distance of the lamps, so few are enough."""
@@ -44,15 +41,11 @@ def find_surface(capture: Capture) -> Capture:
         points = surface_points(lamps, *blocks.centres(), depth[blocks.mask])
         light = LampLight.of(observations, replace(lamps, points=points))
         normals = light.in_frame_of_capture(estimator.estimate(light.observations, light.directions))
-        depth = _integrate(normals, blocks, lamps.camera_matrix)
+        normal_map = np.zeros((*blocks.mask.shape, 3))
+        normal_map[blocks.mask] = normals
+        depth = integrate_normals(normal_map, blocks.mask, blocks.shrink_camera(lamps.camera_matrix))
+        if lamps.camera_matrix is None:
+            depth *= blocks.step  # from blocks to pixels
     rows, columns = (places.astype(np.float64) for places in np.nonzero(capture.mask))
     points = surface_points(lamps, rows, columns, blocks.interpolate(depth, capture.mask))
     return replace(capture, lamps=replace(lamps, points=points))
-
-
-def _integrate(normals: Floats, blocks: Blocks, camera_matrix: Floats | None) -> Floats:
-    """Return the depth map (h, w) of normals (p, 3), in pixels of the capture as integrate_normals gives it."""
-    normal_map = np.zeros((*blocks.mask.shape, 3))
-    normal_map[blocks.mask] = normals
-    depth = integrate_normals(normal_map, blocks.mask, blocks.shrink_camera(camera_matrix))
-    return depth * blocks.step if camera_matrix is None else depth

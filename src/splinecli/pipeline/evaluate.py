@@ -187,7 +187,7 @@ def evaluate_captures(
     jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
     elsewhere: Elsewhere | None = None
     if (cluster := options.cluster and options.cluster.on_cores()) is not None:
-        elsewhere = partial(score_on_workers, estimators, options.method_options, protocols, cluster, output, observer)
+        elsewhere = partial(score_on_workers, estimators, options.method_options, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(

@@ -11,7 +11,6 @@ from pathlib import Path
 from splinecli.capture import open_capture
 from splinecli.errors import ModelError
 from splinecli.evaluation.draws_elsewhere import DrawScorer, DrawScores, DrawTask
-from splinecli.evaluation.protocol import Protocol
 from splinecli.methods import Estimator, MethodOptions, make_estimator
 from splinecli.pipeline.capture_memory import source_bytes
 from splinecli.pipeline.connection import ClusterOptions
@@ -25,13 +24,11 @@ class _Settings:
     methods: tuple[str, ...]
     method_options: MethodOptions
     fingerprints: tuple[str, ...]
-    protocols: tuple[Protocol, ...]
 
 
 def score_on_workers(
     estimators: Sequence[Estimator],
     method_options: MethodOptions,
-    protocols: Sequence[Protocol],
     cluster: ClusterOptions,
     output: Path,
     observer: Observer,
@@ -41,7 +38,6 @@ def score_on_workers(
 
     Args:
         estimators, method_options: the methods.
-        protocols: those of the evaluation.
         cluster: where draws are scored.
         output: a folder that all workers see.
         observer: receives messages.
@@ -56,7 +52,6 @@ def score_on_workers(
         tuple(estimator.name for estimator in estimators),
         method_options,
         tuple(estimator.fingerprint for estimator in estimators),
-        tuple(protocols),
     )
     lost: LostError | None = None
     with distributor(partial(_score, settings), output, cluster, observer) as workers:
@@ -72,9 +67,10 @@ def score_on_workers(
 def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
     folder, memory = None, 0.0
     for draw in draws:
-        if draw.folder != folder:
-            folder, memory = draw.folder, source_bytes(lambda: open_capture(draw.folder))  # noqa: B023 - called here
-        yield Item((draw,), draw.name, memory)
+        if draw.reading.folder != folder:
+            folder = draw.reading.folder
+            memory = source_bytes(lambda: open_capture(folder))  # noqa: B023 - called here
+        yield Item((draw,), draw.reading.name, memory)
 
 
 _scorers: dict[str, DrawScorer] = {}  # that of the command that this worker serves
@@ -91,5 +87,5 @@ def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
                     hint="Use the same weight file everywhere, and the same --precision",
                 )
         _scorers.clear()
-        _scorers[settings.command] = DrawScorer(estimators, settings.protocols)
+        _scorers[settings.command] = DrawScorer(estimators)
     return _scorers[settings.command].score(draw)

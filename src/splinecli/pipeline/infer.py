@@ -34,8 +34,8 @@ from splinecli.results.albedo import albedo_map
 from splinecli.results.clock import Clock
 from splinecli.results.page import result_page
 from splinecli.results.report import report_of
+from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
-from splinecli.surface.relief import relief_of_normals
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.publishing import Content, held_folder, refuse_link
 

@@ -92,6 +92,8 @@ class BilateralEquations:
         The weights (E,) are half the second derivative of the sum of squares by the gap of a pair, and the flows (E,)
         half the first derivative. Pairs along the rows come first, then those along the columns.
         """
+        from scipy.special import expit
+
         weights, flows = [], []
         for slant, (near, far) in zip(self.slants, self.pairs, strict=True):
             gap = heights[far] - heights[near]
@@ -101,7 +103,7 @@ class BilateralEquations:
             residuals = [self.facing[pixels] * gap + slant[pixels] for pixels in (near, far)]
             for pixels, residual in zip((near, far), residuals, strict=True):
                 largest[pixels] = np.maximum(largest[pixels], np.abs(residual))
-            share_ahead = _sigmoid(stiffness * self.facing**2 * (behind**2 - ahead**2))
+            share_ahead = expit(stiffness * self.facing**2 * (behind**2 - ahead**2))
             share_ahead = 0.5 - (share_ahead - 0.5) * np.expm1(-((largest / CONTRADICTION) ** 2))
             weight, flow = np.zeros_like(gap), np.zeros_like(gap)
             shares = share_ahead[near], 1 - share_ahead[far]
@@ -116,10 +118,3 @@ class BilateralEquations:
 def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:
     both = (near >= 0) & (far >= 0)
     return near[both], far[both]
-
-
-def _sigmoid(values: Floats) -> Floats:
-    from scipy.special import expit
-
-    shares: Floats = expit(values)
-    return shares

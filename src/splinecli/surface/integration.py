@@ -38,6 +38,9 @@ _CORRELATED = 0.3  # slopes of prior and normals
 _LEAST_STEEP, _MOST_STEEP = 0.02, 5.0  # times the normals' slopes; a blurred prior is flatter
 _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
 
+RELIEF_WIDTH = 64.0
+"""Waves of this width in pixels keep half of their height; the normals' small errors over wider ones do not count."""
+
 Progress = Callable[[float], object]
 """Called with the share of the work that was just done."""
 
@@ -90,6 +93,27 @@ def integrate_normals(
     if known is not None:
         _check_prior(surface)
     return _depth_map(_integrate(surface, stiffness, progress), mask, camera_matrix, known)
+
+
+def relief_of_normals(
+    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], width: float = RELIEF_WIDTH
+) -> NDArray[np.float32]:
+    """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask.
+
+    Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals, pulled to
+    height zero. Of a wave of k radians per pixel, this share is kept:
+    k^2 / (k^2 + (2 pi / width)^2).
+
+    Args:
+        normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
+        mask: (H, W).
+        width: see RELIEF_WIDTH.
+
+    Raises:
+        InputError: the mask is empty.
+    """
+    flat = np.zeros(mask.shape)
+    return integrate_normals(normal_map, mask, stiffness=0, prior=flat, prior_detail=width).astype(np.float32)
 
 
 class _Surface(NamedTuple):

@@ -75,7 +75,7 @@ class LaplacianSolver:
         change: Floats
         change, _ = cg(
             matrix,
-            self._divergence(flows) - pull * distance,
+            self._sum(flows, self._near) - self._sum(flows, self._far) - pull * distance,
             rtol=precision,
             maxiter=_MAX_STEPS,
             M=self._preconditioner,
@@ -91,9 +91,6 @@ class LaplacianSolver:
         diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
         return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
-
-    def _divergence(self, flows: Floats) -> Floats:
-        return self._sum(flows, self._near) - self._sum(flows, self._far)
 
     def _sum(self, of_pairs: Floats, pixels: Pixels) -> Floats:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

@@ -13,22 +13,17 @@ if TYPE_CHECKING:
 
     from splinecli.surface.mesh import SurfaceMesh
 
-MESH_FILES = {
+SURFACE_FILES = {
     "glb": ("mesh.glb",),
     "ply": ("mesh.ply",),
     "obj": ("mesh.obj", "mesh.mtl", "mesh.png"),
     "stl": ("mesh.stl",),
-}
-"""The file names of each format of a mesh; mesh.png is the texture of an OBJ file, if there are colours."""
-
-SURFACE_FILES = {
-    **MESH_FILES,
     "npy": ("depth.npy",),
     "tiff": ("depth.tiff",),
     "png": ("depth.png",),
     "exr": ("depth.exr",),
 }
-"""The file names of each format."""
+"""The file names of each format; mesh.png is the texture of an OBJ file, if there are colours."""
 
 SURFACE_REPORT = "surface.json"
 """The report that `integrate` writes beside them."""
