@@ -46,6 +46,8 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
         (("--json",), "--json prints one list at the end, and watch has none"),
         (("-o", "sphere"), "the results would lie among the captures"),
         (("--methd", "ls"), "no option --methd"),
+        (("--method", "lss"), "no method named 'lss'"),
+        (("--overwrite", "--update"), "contradict each other"),
     ],
 )
 def test_wrong_options_are_refused(run, capture, options: tuple[str, ...], problem: str) -> None:

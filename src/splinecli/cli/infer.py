@@ -163,7 +163,7 @@ def infer(
         messages = Messages(quiet=quiet)
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"
         batch = infer_batch(
-            captures,
+            captures or [],  # none of watch, which only wants the options to be checked
             options,
             messages,
             redo=redo,

@@ -41,6 +41,7 @@ def watch(
         raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
     if output.absolute() == folder.absolute():
         raise UsageError("the results would lie among the captures", path=output, hint="Give another -o OUT")
+    infer.callback(**{**given, "captures": []})  # refuses wrong options now, not when the first capture arrives
     arrivals = Arrivals(folder, marker=marker, seconds=settle, without=output)
     messages = Messages(quiet=given["quiet"])
     messages.say(f"{folder}: waiting for captures; Ctrl-C ends")

@@ -152,7 +152,7 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
         f"the results of {capture.n_pixels} pixels take",
         folder,
         hint="Mask the object, or use --scale or --crop"
-        + (", or leave --surface out" if options.surface else "")
+        + (", or leave --surface out" if options.surface else ", or relief in --maps" if surface else "")
         + (", or neither albedo in --maps nor --html" if albedo else ""),
     )
     if options.surface:

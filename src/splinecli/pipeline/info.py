@@ -247,7 +247,7 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
 
 def _seconds(summary: CaptureSummary) -> float:
     """Return the time of spline-net on a capture, distilled from the size where `infer` does so."""
-    count, lamps = summary.n_pixels, summary.source.lamps
-    if count < AUTOMATIC_FROM or (lamps is not None and lamps.used):
+    count = summary.n_pixels
+    if count < AUTOMATIC_FROM:
         return count / PIXELS_PER_SECOND
     return student_sizes(count)[0].sample / LEARNED_PER_SECOND + count / DISTILLED_PER_SECOND
