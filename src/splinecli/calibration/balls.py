@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
-from splinecli.calibration.view import View, find_view
+from splinecli.calibration.view import View, find_view, unit_rays
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
@@ -158,7 +158,7 @@ def calibrate_ball(
             )
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
-            check_in_front(direction[0], view.rays(point)[0])
+            check_in_front(direction[0], unit_rays(point, view.matrix)[0])
         except InputError as error:
             raise InputError(error.problem, path=path, hint=error.hint) from None
         highlights.append(highlight)

@@ -48,17 +48,20 @@ def calibration_report(
         "balls": [_ball(ball) for ball in lights.balls],
         "light_directions": _rows(lights.directions),
         "light_intensities": None if intensities is None else _rows(intensities),
-        "lamp_positions": None if lamps is None else _positions(lamps),
+        "lamp_positions": None
+        if lamps is None
+        else {
+            "known": lamps.known,
+            "positions": _rows(lamps.positions),
+            # Infinite where a lamp may be at any distance.
+            "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
+            "pixel_size": _round(lamps.pixel_size, 6),
+        },
         "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg, "mean", "largest"),
         "compared": None
         if known_directions is None
         else _mean_and_largest(angle_between_deg(known_directions, lights.directions), "mean_deg", "largest_deg"),
-        "warnings": [
-            *_outline_warnings(lights, picture),
-            *_distance_warnings(lamps),
-            *([] if lamps is not None and lamps.known else _disagreement_warnings(lights, picture)),
-            *_comparison_warnings(lights, known_directions),
-        ],
+        "warnings": _warnings(lights, known_directions, picture, lamps),
     }
 
 
@@ -88,16 +91,6 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _positions(lamps: LampPositions) -> dict[str, Any]:
-    return {
-        "known": lamps.known,
-        "positions": _rows(lamps.positions),
-        # Infinite where a lamp may be at any distance.
-        "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
-        "pixel_size": _round(lamps.pixel_size, 6),
-    }
-
-
 def _lamp_line(lamps: dict[str, Any]) -> str:
     """Return the line on triangulated lamps, from the report."""
     if not lamps["known"]:
@@ -109,21 +102,6 @@ def _lamp_line(lamps: dict[str, Any]) -> str:
         f" ({'pixels' if lamps['pixel_size'] == 1 else 'in the unit of --ball-diameter'}),"
         f" uncertain by {shares.mean():.0f} % on average, at most {shares.max():.0f} %"
     )
-
-
-def _distance_warnings(lamps: LampPositions | None) -> list[str]:
-    """Warn of lamps whose distances the balls do not tell."""
-    if lamps is None or lamps.known:
-        return []
-    if lamps.view.known:
-        return [
-            "The rays from the balls are too parallel to tell the lamps' distances. If the lamps are near, put the"
-            " balls farther apart."
-        ]
-    return [
-        "The lamps' distances are unknown, because the camera is: it counts as distant, and a near camera makes the"
-        " rays from the balls too parallel. If the lamps are near, add --camera-matrix."
-    ]
 
 
 def _ball(ball: BallCalibration) -> dict[str, Any]:
@@ -143,38 +121,40 @@ def _ball(ball: BallCalibration) -> dict[str, Any]:
     }
 
 
-def _outline_warnings(lights: CalibratedLights, picture: str) -> list[str]:
-    return [
+def _warnings(
+    lights: CalibratedLights, known: NDArray[np.float64] | None, picture: str, lamps: LampPositions | None
+) -> list[str]:
+    warnings = [
         f"{ball.files.folder}: the outline of the ball is uncertain ({100 * ball.circle.visible:.0f} % of it visible,"
         f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green circle is wrong, give --mask or"
         " --circle."
         for ball in lights.balls
         if ball.circle.visible < UNSURE_VISIBLE or ball.circle.spread > UNSURE_SPREAD * ball.circle.radius
     ]
-
-
-def _disagreement_warnings(lights: CalibratedLights, picture: str) -> list[str]:
+    if lamps is not None and not lamps.known:
+        warnings.append(
+            "The rays from the balls are too parallel to tell the lamps' distances. If the lamps are near, put the"
+            " balls farther apart."
+            if lamps.view.known
+            else "The lamps' distances are unknown, because the camera is: it counts as distant, and a near camera"
+            " makes the rays from the balls too parallel. If the lamps are near, add --camera-matrix."
+        )
     worst = int(lights.disagreement_deg.argmax())
     largest = lights.disagreement_deg[worst]
-    if largest <= DISAGREEMENT_DEG:
-        return []
-    return [
-        f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1} (counted from 1)."
-        f" Check {picture}."
-    ]
-
-
-def _comparison_warnings(lights: CalibratedLights, known: NDArray[np.float64] | None) -> list[str]:
-    if known is None:
-        return []
-    difference = angle_between_deg(known, lights.directions).mean()
-    from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
-    if difference <= MISTAKEN_DEG or from_normals >= difference / 3:
-        return []
-    return [
-        "The compared file contains the normals of the ball at the highlights instead of the light directions: each"
-        " lies half-way between the view and the light. Use the file written here."
-    ]
+    if largest > DISAGREEMENT_DEG and not (lamps is not None and lamps.known):
+        warnings.append(
+            f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1} (counted from 1)."
+            f" Check {picture}."
+        )
+    if known is not None:
+        difference = angle_between_deg(known, lights.directions).mean()
+        from_normals = np.mean([angle_between_deg(known, ball.normals).mean() for ball in lights.balls])
+        if difference > MISTAKEN_DEG and from_normals < difference / 3:
+            warnings.append(
+                "The compared file contains the normals of the ball at the highlights instead of the light directions:"
+                " each lies half-way between the view and the light. Use the file written here."
+            )
+    return warnings
 
 
 def _mean_and_largest(angles: NDArray[np.float64], mean: str, largest: str) -> dict[str, float]:

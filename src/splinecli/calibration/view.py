@@ -63,10 +63,6 @@ class View:
         matrix[:2, :2] *= factor
         return matrix
 
-    def rays(self, points: Floats) -> Floats:
-        """Return the unit vectors (N, 3) from the camera through image points (N, 2)."""
-        return unit_rays(points, self.matrix)
-
 
 def unit_rays(points: Floats, matrix: Floats) -> Floats:
     """Return the unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""

@@ -104,23 +104,16 @@ def white_level(level: WhiteLevel | None) -> CaptureWarning | None:
 
 
 def saturated(share: float) -> CaptureWarning | None:
-    """Warn of too many saturated observations."""
-    text = "of the observations are saturated; a shorter exposure gives better normals."
-    return _large_share(SATURATED, share, SATURATED_SHARE, text)
+    """Warn of too large a share of saturated observations."""
+    text = f"{100 * share:.1f} % of the observations are saturated; a shorter exposure gives better normals."
+    return CaptureWarning(SATURATED, text) if share > SATURATED_SHARE else None
 
 
 def black_pixels(share: float) -> CaptureWarning | None:
-    """Warn of too many pixels that no light reaches."""
-    text = (
-        "of the pixels are black under every light; they get the normal (0, 0, 1). Leave them out with a mask or with"
-        " --auto-mask."
-    )
-    return _large_share(BLACK_PIXELS, share, BLACK_SHARE, text)
-
-
-def _large_share(code: str, share: float, limit: float, text: str) -> CaptureWarning | None:
-    """Return a warning that begins with the share in percent, or None for a share up to the limit."""
-    return CaptureWarning(code, f"{100 * share:.1f} % {text}") if share > limit else None
+    """Warn of too large a share of pixels that no light reaches."""
+    text = f"{100 * share:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
+    warning = CaptureWarning(BLACK_PIXELS, f"{text} Leave them out with a mask or with --auto-mask.")
+    return warning if share > BLACK_SHARE else None
 
 
 def eight_bit() -> CaptureWarning:
@@ -128,10 +121,8 @@ def eight_bit() -> CaptureWarning:
 
 
 def ground_truth_upside_down() -> CaptureWarning:
-    return CaptureWarning(
-        GROUND_TRUTH_UPSIDE_DOWN,
-        "The rows of the ground truth are in the wrong order; the map was turned upside down.",
-    )
+    text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
+    return CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text)
 
 
 def estimated_intensities(intensities: NDArray[np.float64]) -> CaptureWarning:
@@ -174,7 +165,6 @@ def ambient_subtracted(ambient: str) -> CaptureWarning:
 
 
 def display_decoded(by: str, curve: TransferCurve) -> CaptureWarning:
-    """Warn of images whose values are decoded with the curve that they state."""
     how = "sRGB" if curve is None else "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}"
     text = f"The images say that they are display-encoded ({by}) and are read as {how}."
     return CaptureWarning(DISPLAY_DECODED, f"{text} Add --transfer linear if their values are linear.")
@@ -191,7 +181,6 @@ def profile_unread(image: str) -> CaptureWarning:
 
 
 def exif_orientation(orientation: int) -> CaptureWarning:
-    """Warn of images that viewers turn."""
     return CaptureWarning(
         EXIF_ORIENTATION,
         f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
@@ -200,7 +189,6 @@ def exif_orientation(orientation: int) -> CaptureWarning:
 
 
 def not_distilled(angle_deg: float, expected_deg: float) -> CaptureWarning:
-    """Warn of a capture that a perceptron could not learn, so that it took longer than expected."""
     return CaptureWarning(
         NOT_DISTILLED,
         f"The network estimated every pixel. A small one learned from a sample, but was {angle_deg:.1f} degrees away"
@@ -213,7 +201,6 @@ def different_sizes(n_sizes: int) -> CaptureWarning:
 
 
 def saturated_images(n_images: int, worst: str, worst_share: float) -> CaptureWarning:
-    """Warn of images with too many saturated pixels; the worst is named."""
     return CaptureWarning(
         SATURATED,
         f"Images saturated in more than {100 * SATURATED_SHARE:.0f} % of the pixels: {n_images}, most of all {worst}"
@@ -222,7 +209,6 @@ def saturated_images(n_images: int, worst: str, worst_share: float) -> CaptureWa
 
 
 def dark_images(n_images: int, example: str, share: float) -> CaptureWarning:
-    """Warn of images that use less than a share of the range."""
     return CaptureWarning(
         DARK_IMAGES,
         f"Images that use less than {100 * share:.0f} % of the range: {n_images}, such as {example};"
@@ -248,8 +234,5 @@ def few_lights(n_lights: int, enough: int) -> CaptureWarning:
 
 
 def high_lights(limit_deg: float) -> CaptureWarning:
-    """Warn of lights that are all close to the camera axis."""
-    return CaptureWarning(
-        HIGH_LIGHTS,
-        f"All lights are within {limit_deg:.0f} degrees of the camera axis; lower lights give better normals.",
-    )
+    text = f"All lights are within {limit_deg:.0f} degrees of the camera axis; lower lights give better normals."
+    return CaptureWarning(HIGH_LIGHTS, text)

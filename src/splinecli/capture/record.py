@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,14 @@ COPLANAR_RATIO = 1e-3
 """Lights (F, 3) count as coplanar if their smallest singular value is below this share of the largest."""
 
 _UNIT_TOLERANCE = 1e-3
+_DTYPES = {
+    "observations": np.float32,
+    "light_directions": np.float64,
+    "mask": np.bool_,
+    "ground_truth": np.float32,
+    "estimated_intensities": np.float64,
+    "restored": np.bool_,
+}
 _BLOCK = 1 << 20  # rows checked at a time, so that a check needs no second copy of a large capture
 
 
@@ -70,20 +79,14 @@ class Capture:
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not copied.
-        object.__setattr__(self, "observations", np.asarray(self.observations, np.float32))
-        object.__setattr__(self, "light_directions", np.asarray(self.light_directions, np.float64))
+        for name, dtype in _DTYPES.items():
+            values = getattr(self, name)
+            object.__setattr__(self, name, None if values is None else np.asarray(values, dtype))
         object.__setattr__(self, "light_indices", tuple(operator.index(i) for i in self.light_indices))
-        object.__setattr__(self, "mask", np.asarray(self.mask, np.bool_))
         object.__setattr__(self, "warnings", tuple(self.warnings))
-        if self.estimated_intensities is not None:
-            object.__setattr__(self, "estimated_intensities", np.asarray(self.estimated_intensities, np.float64))
-        if self.restored is not None:
-            object.__setattr__(self, "restored", np.asarray(self.restored, np.bool_))
         self._check_lights()
         self._check_observations()
-        if self.ground_truth is not None:
-            object.__setattr__(self, "ground_truth", np.asarray(self.ground_truth, np.float32))
-            self._check_ground_truth(self.ground_truth)
+        self._check_ground_truth()
 
     @property
     def n_lights(self) -> int:
@@ -143,10 +146,7 @@ class Capture:
                 f"{self.name}: {len(lights)} lights, expected at least {MIN_LIGHTS}",
                 hint="A normal has three unknowns, so three images under different lights are the fewest",
             )
-        if self.estimated_intensities is not None and self.estimated_intensities.shape != (len(lights),):
-            raise InputError(
-                f"{self.name}: light intensities of shape {self.estimated_intensities.shape}, expected ({len(lights)},)"
-            )
+        self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
         if not np.isfinite(lights).all():
             raise InputError(f"{self.name}: a light direction is not finite")
         if (np.abs(np.linalg.norm(lights, axis=1) - 1) > _UNIT_TOLERANCE).any():
@@ -170,23 +170,20 @@ class Capture:
         n_pixels = int(np.count_nonzero(self.mask))
         if n_pixels == 0:
             raise InputError(f"{self.name}: the mask is empty")
-        expected = (n_pixels, self.n_lights)
-        if self.observations.shape != expected:
-            raise InputError(
-                f"{self.name}: observations of shape {self.observations.shape}, expected (pixels, lights) = {expected}"
-            )
-        if self.restored is not None and self.restored.shape != expected:
-            raise InputError(
-                f"{self.name}: restored flags of shape {self.restored.shape}, expected (pixels, lights) = {expected}"
-            )
+        self._check_shape("observations", self.observations, (n_pixels, self.n_lights), "(pixels, lights) = ")
+        self._check_shape("restored flags", self.restored, (n_pixels, self.n_lights), "(pixels, lights) = ")
         if not all(np.isfinite(block).all() for block in _blocks(self.observations)):
             raise InputError(f"{self.name}: an observation is not finite")
 
-    def _check_ground_truth(self, normals: NDArray[np.float32]) -> None:
-        expected = (*self.mask.shape, 3)
-        if normals.shape != expected:
-            raise InputError(f"{self.name}: ground truth of shape {normals.shape}, expected (H, W, 3) = {expected}")
-        for block in _blocks(normals.reshape(-1, 3)):
+    def _check_shape(self, what: str, array: NDArray[Any] | None, shape: tuple[int, ...], meaning: str = "") -> None:
+        if array is not None and array.shape != shape:
+            raise InputError(f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}")
+
+    def _check_ground_truth(self) -> None:
+        if self.ground_truth is None:
+            return
+        self._check_shape("ground truth", self.ground_truth, (*self.mask.shape, 3), "(H, W, 3) = ")
+        for block in _blocks(self.ground_truth.reshape(-1, 3)):
             length = np.linalg.norm(block, axis=1)
             # In this form, NaN fails the check, too.
             if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():

@@ -26,16 +26,6 @@ def shadow_weights(observations: Array) -> Array:
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
-def predict(observations: Array, weights: Array, light_directions: Array) -> Array:
-    """Return what matte pixels would show (P, F): I = l . b, where b minimises the weighted squared residuals.
-
-    Args:
-        observations, weights: (P, F).
-        light_directions: (F, 3) or (P, F, 3), of any length.
-    """
-    return shade(fit_scaled_normals(observations, weights, light_directions), light_directions)
-
-
 def shade(scaled_normals: Array, light_directions: Array) -> Array:
     """Return I = l . b (P, F) of scaled normals (P, 3) under lights (F, 3) or (P, F, 3)."""
     if light_directions.ndim == 2:
@@ -46,7 +36,10 @@ def shade(scaled_normals: Array, light_directions: Array) -> Array:
 def fit_scaled_normals(observations: Array, weights: Array, light_directions: Array, *, prior: float = _PRIOR) -> Array:
     """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared residuals of I = l . b.
 
-    The arguments are those of predict. `prior` pulls b towards 0.
+    Args:
+        observations, weights: (P, F).
+        light_directions: (F, 3) or (P, F, 3), of any length.
+        prior: pulls b towards 0.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)

@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings
 from splinecli.capture.capture_size import check_capture, common_size
 from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
+from splinecli.capture.formats.image_size import ExpectedSize
+from splinecli.capture.formats.images import read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.read_ahead import read_ahead
 from splinecli.capture.layouts.capture_files import CaptureFiles
@@ -22,7 +25,6 @@ from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.linearise import AS_STORED, PixelReader, RadiometricCalibration
-from splinecli.capture.masks import read_capture_mask
 from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
@@ -167,11 +169,21 @@ class CaptureSource:
         """Return the mask (H, W) of what is read of images of this shape. Raises InputError."""
         if self.automatic_mask is not None:
             return self.automatic_mask
-        mask = self.window.of(read_capture_mask(self.files, shape))
+        files, mask = self.files, np.ones(shape, np.bool_)
+        expected = ExpectedSize(shape, files.images[0].name, "a mask")
+        if files.boundaries:  # of CyclesPS
+            mask = np.any([decode_image(path, expected).max(axis=2) > 0 for path in files.boundaries], axis=0)
+            if not mask.any():
+                names = " and ".join(path.name for path in files.boundaries)
+                problem = f"the mask is empty: every pixel of {names} is zero"
+                raise InputError(problem, path=files.boundaries[0].parent)
+        elif files.mask is not None:
+            mask = read_mask(files.mask, expected)
+        mask = self.window.of(mask)
         if not mask.any():
             raise InputError(
                 "the mask has no pixel in the part that is read",
-                path=self.files.mask or self.files.folder,
+                path=files.mask or files.folder,
                 hint="Choose another --crop, or a larger --scale",
             )
         return mask

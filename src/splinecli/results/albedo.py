@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource
-from splinecli.capture.masks import take_pixels
+from splinecli.capture.linearise import take_pixels
 from splinecli.capture.observations import StoredPixels
 
 LIT = 0.15  # a light counts for a pixel if n.l is above this

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import read_lines
+from splinecli.capture.formats.text import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
 
@@ -20,7 +20,6 @@ DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
 """First numbers of the seeds, so that draws, light noise and the choice of pixels are independent."""
 
 _REDRAWS = 1000
-_SEPARATORS = re.compile(r"[\s,;]+")
 _INDEX = re.compile(r"[0-9]{1,9}")
 
 
@@ -90,23 +89,15 @@ class DrawsFile:
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
             if max(draw) >= available:
-                raise InputError(
-                    f"found light index {max(draw)}, expected 0 to {available - 1}: the capture has {available} lights",
-                    path=self.path,
-                    line=line,
-                )
-            if min(draw) < skipped:
-                raise InputError(
-                    f"found light index {min(draw)}; the first {skipped} images are to be skipped",
-                    path=self.path,
-                    line=line,
-                )
-            if in_one_plane(light_directions[list(draw)]):
-                raise InputError(
-                    "the lights of this draw lie in one plane, so no normal can be found",
-                    path=self.path,
-                    line=line,
-                )
+                problem = f"found light index {max(draw)}, expected 0 to {available - 1}"
+                problem += f": the capture has {available} lights"
+            elif min(draw) < skipped:
+                problem = f"found light index {min(draw)}; the first {skipped} images are to be skipped"
+            elif in_one_plane(light_directions[list(draw)]):
+                problem = "the lights of this draw lie in one plane, so no normal can be found"
+            else:
+                continue
+            raise InputError(problem, path=self.path, line=line)
 
 
 def read_draws(path: Path) -> DrawsFile:
@@ -121,13 +112,10 @@ def read_draws(path: Path) -> DrawsFile:
     draws: list[Draw] = []
     lines: list[int] = []
     for line, text in enumerate(read_lines(path), start=1):
-        words = [word for word in _SEPARATORS.split(text.partition("#")[0]) if word]
-        if not words:
-            continue
-        draw = tuple(_light_index(word, path, line) for word in words)
-        _check_draw(draw, draws[0] if draws else draw, path, line)
-        draws.append(draw)
-        lines.append(line)
+        words = split_words(text.partition("#")[0])
+        if words:
+            draws.append(_read_draw(words, len(draws[0]) if draws else len(words), path, line))
+            lines.append(line)
     if not draws:
         raise InputError("the file contains no draws, expected a line of light indices for each", path=path)
     return DrawsFile(path, tuple(draws), tuple(lines))
@@ -146,21 +134,17 @@ def _draw(light_directions: NDArray[np.float64], n_lights: int, trial: int, seed
     )
 
 
-def _light_index(word: str, path: Path, line: int) -> int:
-    if _INDEX.fullmatch(word) is None:
-        raise InputError(f'found "{word[:40]}", expected a light index from 0', path=path, line=line)
-    return int(word)
-
-
-def _check_draw(draw: Draw, first: Draw, path: Path, line: int) -> None:
+def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
+    for word in words:
+        if _INDEX.fullmatch(word) is None:
+            raise InputError(f'found "{word[:40]}", expected a light index from 0', path=path, line=line)
+    draw = tuple(map(int, words))
     for position, index in enumerate(draw):
         if index in draw[:position]:
             raise InputError(f"light index {index} comes twice", path=path, line=line, hint="Name each light once")
     if len(draw) < MIN_LIGHTS:
         raise InputError(f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line)
-    if len(draw) != len(first):
-        raise InputError(
-            f"found {len(draw)} light indices, expected {len(first)} as in the first draw",
-            path=path,
-            line=line,
-        )
+    if len(draw) != n_lights:
+        problem = f"found {len(draw)} light indices, expected {n_lights} as in the first draw"
+        raise InputError(problem, path=path, line=line)
+    return draw

@@ -169,15 +169,13 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         return None
     folders = [folder, *([] if positions is None else [positions.parent])]
     matrix_file = _path(options.camera_matrix) or _find(folders, CAMERA_MATRIX)
-    pixel_file, pixel_size = None, options.pixel_size
-    if pixel_size is None and options.object_width is None:
-        pixel_file = _find(folders, PIXEL_SIZE)
-    read = (positions, pixel_file, matrix_file)
-    stamp = tuple(stamp_content(path) for path in read if path is not None)
-    if pixel_size is None and options.object_width is None:
-        pixel_size = None if pixel_file is None else _read_pixel_size(pixel_file)
-        if pixel_size is None and used and positions in (find_lights(folder), _path(options.positions)):
-            raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
+    scaled = options.pixel_size is not None or options.object_width is not None
+    pixel_file = None if scaled else _find(folders, PIXEL_SIZE)
+    scaled = scaled or pixel_file is not None
+    stamp = tuple(stamp_content(path) for path in (positions, pixel_file, matrix_file) if path is not None)
+    pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
+    if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
+        raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
     return LampFiles(
         positions,
         options.distance,
@@ -185,7 +183,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         options.object_width,
         None if matrix_file is None else read_camera_matrix(matrix_file),
         stamp,
-        used and (pixel_size is not None or options.object_width is not None),
+        used and scaled,
     )
 
 

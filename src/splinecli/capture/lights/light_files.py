@@ -28,7 +28,7 @@ from splinecli.capture.lights.light_angles import (
     refuse_angles,
 )
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.light_rows import read_light_rows
+from splinecli.capture.lights.light_rows import LightRows, read_light_rows
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
 
@@ -57,26 +57,23 @@ def read_light_directions(
             vector or a light below the horizon; also where the count disagrees with the count line or with
             n_images, and for angles that are read as vectors.
     """
-    path = Path(path)
+    return directions_of(read_light_table(Path(path), n_images, form).numbers, n_images, frame, form)
+
+
+def read_light_table(path: Path, n_images: int | None, form: RowForm) -> LightRows:
+    """Return the rows of a text file or of a file of matrices. Raises InputError; see read_light_directions."""
     if path.suffix.lower() in SUFFIXES:
-        return directions_of(read_array_file(path, n_images), n_images, frame, form)
+        return LightRows(read_array_file(path, n_images))
     meaning = COLUMNS[form]
-    rows = read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
-    return directions_of(rows.numbers, n_images, frame, form)
+    return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
 
 
 def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
-    table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
+    table, vectors, transposed = _vectors(table, n_images, form)
     if form in ("azel", "slant-tilt"):
-        vectors, transposed = _one_light_a_row(table, COLUMNS[form], "lights", n_images)
         check_angles(table, form)
         vectors = directions_from_angles(vectors, form)
-    else:
-        if form == "xyz":
-            refuse_angles(table)
-        what = "lamp positions" if form == "positions" else "light directions"
-        vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
     return unit_directions(
         vectors @ frame.matrix.T + 0.0,  # no -0
         table.path,
@@ -87,14 +84,14 @@ def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, fo
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
-    """Return the positions of lamps (F, 3) float64 from a text file, which has the form of light directions.
+    """Return the positions of lamps (F, 3) float64 from a file, which has the form of light directions.
 
     Raises:
         InputError: as read_light_directions, which checks the same numbers as directions from the origin; also for
             rows that name their images.
     """
-    read_light_directions(path, n_images, frame, "positions")
-    rows = read_light_rows(Path(path), expected=_FILE.format("x y z"), n_numbers=3)
+    rows = read_light_table(Path(path), n_images, "positions")
+    directions_of(rows.numbers, n_images, frame, "positions")
     if rows.names is not None:
         raise InputError(
             f"found the name {rows.names[0]!r}, expected x y z",
@@ -102,9 +99,16 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
             line=rows.numbers.lines[0],
             hint="Positions have a line for each image, in the order of the images",
         )
-    table = _sort_by_count(_drop_count_line(rows.numbers, n_images), 3, n_images)
-    positions, _ = _one_light_a_row(table, {3: "x y z"}, "lamp positions", n_images)
-    return np.asarray(positions @ frame.matrix.T)
+    return np.asarray(_vectors(rows.numbers, n_images, "positions")[1] @ frame.matrix.T)
+
+
+def _vectors(table: NumberRows, n_images: int | None, form: RowForm) -> tuple[NumberRows, NDArray[np.float64], bool]:
+    """Return the table without counts, its vectors or angles, and whether the file has one light in each column."""
+    table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
+    if form == "xyz":
+        refuse_angles(table)
+    what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
+    return table, *_one_light_a_row(table, COLUMNS[form], what, n_images)
 
 
 def unit_directions(

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights import array_files
-from splinecli.capture.lights.light_angles import COLUMNS, RowForm
-from splinecli.capture.lights.light_files import directions_of, read_light_directions, unit_directions
+from splinecli.capture.lights.light_angles import RowForm
+from splinecli.capture.lights.light_files import directions_of, read_light_table, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.light_rows import image_name, read_light_rows
+from splinecli.capture.lights.light_rows import image_name
 from splinecli.errors import InputError
 from splinecli.system.files import parse_json
 
@@ -92,28 +91,18 @@ def read_lights(
 ) -> NamedLights | Array:
     """Return the lights of any light file: directions (F, 3) in the order of the images, or lights that name theirs.
 
+    Args:
+        frame: the frame of the file. That of a JSON file is relative to AliceVision's, which has y down and z away.
+
     Raises:
         InputError: see read_light_directions.
     """
     if path.suffix.lower() in SUFFIXES:
-        return read_named_lights(path, frame)
-    if path.suffix.lower() not in array_files.SUFFIXES:
-        meaning = COLUMNS[form]
-        expected = f"a text file with a line {next(iter(meaning.values()))} for each image"
-        rows = read_light_rows(path, expected=expected, n_numbers=min(meaning))
-        if rows.names is not None:
-            directions = directions_of(rows.numbers, None, frame, form)
-            return NamedLights(path, rows.names, rows.numbers.lines, directions)
-    return read_light_directions(path, n_images, frame, form)
-
-
-def read_named_lights(path: Path, frame: LightFrame = USUAL_FRAME) -> NamedLights:
-    """Return the lights of an .lp or AliceVision JSON file; the suffix decides which. Raises InputError.
-
-    Args:
-        frame: the frame of an .lp file. That of a JSON file is relative to AliceVision's, which has y down and z away.
-    """
-    return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)
+        return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)
+    rows = read_light_table(path, n_images, form)
+    if rows.names is None:
+        return directions_of(rows.numbers, n_images, frame, form)
+    return NamedLights(path, rows.names, rows.numbers.lines, directions_of(rows.numbers, None, frame, form))
 
 
 def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
@@ -152,8 +141,6 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
     """Read AliceVision's format.
 
     {"lights": [{"viewId", "type": "directional", "direction": [x, y, z], "intensity": [r, g, b]}]}.
-
-    In the file, y points down and z away from the camera.
     """
     try:
         document = parse_json("\n".join(read_lines(path)))

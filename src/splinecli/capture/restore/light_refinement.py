@@ -9,7 +9,7 @@ intensities are known, nothing else is open. If not, a prior on them holds the g
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,19 +59,25 @@ _FIRST_FITS, _FITS_PER_ROUND = 8, 2
 _CONVERGED = 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedLights:
-    """Lights (F, 3) that fit the images better.
+class LightFit(NamedTuple):
+    """Lights that fit the images best near given ones.
 
-    Args:
+    Attributes:
         directions: (F, 3), unit.
-        intensities: (F,), relative to the given ones.
-        fit_ratio: the median residual, as a share of that under the given lights.
+        intensities: (F,), relative to those of the observations.
+        before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
+            observation.
     """
 
     directions: Array
     intensities: Array
-    fit_ratio: float
+    before: float
+    after: float
+
+    @property
+    def fit_ratio(self) -> float:
+        """The median residual, as a share of that under the given lights."""
+        return self.after / max(self.before, 1e-12)
 
 
 def refine_capture(capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True) -> Capture:
@@ -89,10 +95,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
     check_light_error(error_deg, refines=True)
     found = refine_lights(
-        capture.observations,
-        capture.light_directions,
-        error_deg=error_deg,
-        intensities_known=intensities_known,
+        capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
         return replace(capture, warnings=(*capture.warnings, capture_warnings.kept_lights(_why_kept(capture))))
@@ -112,7 +115,7 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
 
 def would_refine(
     observations: NDArray[np.floating], factors: Factors | None, light_directions: Array
-) -> RefinedLights | None:
+) -> LightFit | None:
     """Return the lights that refinement would give if they fit observations (P, F) much better, or None.
 
     It is cheap where the given lights (F, 3) fit well.
@@ -159,7 +162,7 @@ def refine_lights(
     *,
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
-) -> RefinedLights | None:
+) -> LightFit | None:
     """Return refined lights; None where the images do not tell, or the given lights fit about as well.
 
     Args:
@@ -176,25 +179,8 @@ def refine_lights(
     )
     if fit is None:
         return None
-    ratio = fit.after / max(fit.before, 1e-12)
-    better = fit.after < MAX_MISFIT and ratio < BETTER_FIT and bool((fit.directions[:, 2] > 0).all())
-    return RefinedLights(fit.directions, fit.intensities, ratio) if better else None
-
-
-class LightFit(NamedTuple):
-    """Lights that fit the images best near given ones.
-
-    Attributes:
-        directions: (F, 3), unit.
-        intensities: (F,), relative to those of the observations.
-        before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
-            observation.
-    """
-
-    directions: Array
-    intensities: Array
-    before: float
-    after: float
+    better = fit.after < MAX_MISFIT and fit.fit_ratio < BETTER_FIT and bool((fit.directions[:, 2] > 0).all())
+    return fit if better else None
 
 
 def fit_near(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.robust_fit import absolute_weights, predict, shadow_weights
+from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, shade, shadow_weights
 
 ITERATIONS = 16
 """Fits to a pixel. More change the restored values by less than the fit's own error."""
@@ -76,7 +76,7 @@ def _restored(
     lit = shadow_weights(lowest)
     weights = lit
     for _ in range(ITERATIONS):
-        predicted = predict(values, weights, lights)
+        predicted = shade(fit_scaled_normals(values, weights, lights), lights)
         residuals = predicted - lowest
         raised = saturated & (residuals > 0)
         values = np.where(raised, np.minimum(predicted, MAX_BRIGHTENING), lowest)

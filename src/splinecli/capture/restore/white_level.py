@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +63,13 @@ class WhiteLevel:
     origin: Origin
 
 
-def _nothing() -> NDArray[np.int64]:
-    return np.empty(0, np.int64)
+_NOTHING = np.empty(0, np.int64)
 
 
-@dataclass(frozen=True, eq=False)
-class _ImageValues:
+class _ImageValues(NamedTuple):
     """What decides whether observations of one image are saturated.
 
-    Args:
+    Attributes:
         full_scale: the largest value that the file can store; None for floating-point images.
         stated: the white level that the file states; None where it states none.
         saturated: the pixels at the given white level or above, or at full scale where none is given.
@@ -83,11 +81,11 @@ class _ImageValues:
 
     full_scale: int | None = None
     stated: int | None = None
-    saturated: NDArray[np.integer] = field(default_factory=_nothing)
+    saturated: NDArray[np.integer] = _NOTHING
     maximum: int = 0
-    at_maximum: NDArray[np.integer] = field(default_factory=_nothing)
-    below: NDArray[np.int64] = field(default_factory=_nothing)
-    counts: NDArray[np.int64] = field(default_factory=_nothing)
+    at_maximum: NDArray[np.integer] = _NOTHING
+    below: NDArray[np.int64] = _NOTHING
+    counts: NDArray[np.int64] = _NOTHING
 
 
 _NOT_ADDED = _ImageValues()
@@ -123,8 +121,7 @@ class Saturation:
         if not any(len(pixels) for pixels in saturated):
             return None
         rows = slice(None) if self.rows is None else self.rows
-        n_rows = self.n_pixels if self.rows is None else len(self.rows)
-        flags = np.zeros((n_rows, len(saturated)), np.bool_)
+        flags = np.zeros((self.n_pixels if self.rows is None else len(self.rows), len(saturated)), np.bool_)
         for position, pixels in enumerate(saturated):
             column = np.zeros(self.n_pixels, np.bool_)
             column[pixels] = True
@@ -155,7 +152,7 @@ class Saturation:
             return None, saturated
         maximum = max(image.maximum for image in self.images)
         if maximum not in (0, _FULL_SCALE_16_BIT) and not any(len(pixels) for pixels in saturated):
-            at_maximum = [image.at_maximum if image.maximum == maximum else _nothing() for image in self.images]
+            at_maximum = [image.at_maximum if image.maximum == maximum else _NOTHING for image in self.images]
             stated = self._stated_level(maximum)
             if stated is not None:
                 return WhiteLevel(stated, "file"), at_maximum if maximum >= stated else saturated
@@ -221,24 +218,23 @@ class SaturationFinder:
             InputError: the white level that the user gave is above the image's full scale.
         """
         full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
+        if self.given is not None and full_scale is not None and self.given > full_scale:
+            raise InputError(
+                f"the white level is {self.given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
+                path=path,
+                hint="Lower the white level, or leave it out",
+            )
+        found = _ImageValues(full_scale, stated)
         if self.given is not None:
-            if full_scale is not None and self.given > full_scale:
-                raise InputError(
-                    f"the white level is {self.given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
-                    path=path,
-                    hint="Lower the white level, or leave it out",
-                )
-            above = in_any_channel(pixels >= self.given)
-            self._images[position] = _ImageValues(full_scale, stated, _indices(above))
-            return
-        if pixels.dtype != np.uint16 or not pixels.size:
-            self._images[position] = _ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
-            return
-        maximum = int(pixels.max())
-        at_maximum = _indices(in_any_channel(pixels == maximum)) if maximum else _nothing()
-        saturated = at_maximum if maximum == full_scale else _nothing()
-        below, counts = _largest_values(pixels, maximum)
-        self._images[position] = _ImageValues(full_scale, stated, saturated, maximum, at_maximum, below, counts)
+            found = found._replace(saturated=_indices(in_any_channel(pixels >= self.given)))
+        elif pixels.dtype != np.uint16 or not pixels.size:
+            found = found._replace(saturated=_indices(find_saturated(pixels)))
+        elif maximum := int(pixels.max()):
+            at_maximum = _indices(in_any_channel(pixels == maximum))
+            saturated = at_maximum if maximum == full_scale else _NOTHING
+            below, counts = _largest_values(pixels, maximum)
+            found = _ImageValues(full_scale, stated, saturated, maximum, at_maximum, below, counts)
+        self._images[position] = found
 
     def finish(self) -> Saturation:
         """Return the white level and the saturated observations. Images that were not added have none."""
