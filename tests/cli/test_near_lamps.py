@@ -61,6 +61,8 @@ def test_files_and_options_mean_the_same(run, near: Path) -> None:
     np.savetxt("lamps.txt", BUMP_LAMPS)
     for scale in (("--pixel-size", 2), ("--object-width", BUMP_MM)):
         assert mean_error(infer(run, "--light-positions", "lamps.txt", *scale)) < 0.1
+    np.save("lamps.npy", BUMP_LAMPS)
+    assert mean_error(infer(run, "--light-positions", "lamps.npy", "--pixel-size", 2)) < 0.1
     # The same file as directions: distant lights, and without a scale nothing to warn of.
     assert mean_error(infer(run, "--lights", "lamps.txt")) > 5
 
