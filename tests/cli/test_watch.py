@@ -17,7 +17,7 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
     (parts / "bad/done").touch()
 
     def copy_first() -> None:
-        shutil.copytree(capture, parts / "first")
+        shutil.copytree(capture, parts / "-first 1")
 
     def look(steps: list) -> None:
         def sleep(seconds: float) -> None:
@@ -27,17 +27,17 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
 
         monkeypatch.setattr(watch.time, "sleep", sleep)
 
-    look([copy_first, lambda: (parts / "first/done").touch()])
+    look([copy_first, lambda: (parts / "-first 1/done").touch()])
     command = ("watch", parts, "--marker", "done", "--", "--method", "ls", "--jsonl", "-o", "out")
     result = run(*command)
     assert result.code == 130
     failed, done = map(json.loads, result.out.splitlines())
     assert (failed["capture"], failed["exit_code"]) == ("bad", 3)
-    assert (done["capture"], done["method"]) == ("first", "ls")
-    before = Path("out/first/report.json").stat()
+    assert (done["capture"], done["method"]) == ("-first 1", "ls")
+    before = Path("out/-first 1/report.json").stat()
     look([])
-    assert "out/first: already done, skipped" in run(*command).err
-    assert Path("out/first/report.json").stat() == before
+    assert "out/-first 1: already done, skipped" in run(*command).err
+    assert Path("out/-first 1/report.json").stat() == before
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ def put(path: Path, content: str = "image") -> None:
 
 def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path) -> None:
     clock = Clock()
-    arrivals = Arrivals(tmp_path, marker=None, seconds=5, without=tmp_path / "out", clock=clock)
-    for name in ("part10/1.png", "part9/images/1.png", "out/part1/normals.png", ".hidden/1.png", "loose.png"):
+    arrivals = Arrivals(tmp_path, marker=None, seconds=5, without=tmp_path / "out/results", clock=clock)
+    for name in ("part10/1.png", "part9/images/1.png", "out/results/part1/normals.png", ".hidden/1.png", "loose.png"):
         put(tmp_path / name)
     (tmp_path / "empty").mkdir()
     assert arrivals.take() == []

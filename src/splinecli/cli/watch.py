@@ -34,8 +34,9 @@ def watch(
     """
     from splinecli.pipeline.arrivals import Arrivals
 
+    options = options or []
     infer: Any = context.parent.command.get_command(context.parent, "infer")  # type: ignore[union-attr]
-    given = infer.make_context("infer", [str(folder), *(options or [])], parent=context.parent).params
+    given = infer.make_context("infer", [*options, "--", str(folder)], parent=context.parent).params
     output = given["output"].expanduser()
     if given["as_json"]:
         raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
@@ -49,7 +50,7 @@ def watch(
         ready = arrivals.take()
         if ready:
             infer.main(
-                [*map(str, ready), *(options or [])],
+                [*options, "--", *map(str, ready)],
                 prog_name="splinecli infer",
                 standalone_mode=False,
                 parent=context.parent,

@@ -80,7 +80,7 @@ class Arrivals:
                 folders = [Path(entry.path) for entry in entries if entry.is_dir() and entry.name[0] != "."]
         except OSError as error:
             raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
-        return [folder for folder in folders if folder.absolute() != self._without]
+        return [folder for folder in folders if folder.absolute() not in (self._without, *self._without.parents)]
 
 
 def _stamp(folder: Path) -> Stamp:
