@@ -44,7 +44,9 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
     ("options", "problem"),
     [
         (("--json",), "--json prints one list at the end, and watch has none"),
-        (("-o", "sphere"), "the results would lie among the captures"),
+        (("--shard", "1/2"), "--shard splits a list of captures"),
+        (("other",), "found other after the dashes, expected options of infer"),
+        (("-o", "sphere/../sphere"), "the results would lie among the captures"),
         (("--methd", "ls"), "no option --methd"),
         (("--method", "lss"), "no method named 'lss'"),
         (("--overwrite", "--update"), "contradict each other"),

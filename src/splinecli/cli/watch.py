@@ -40,7 +40,13 @@ def watch(
     output = given["output"].expanduser()
     if given["as_json"]:
         raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
-    if output.absolute() == folder.absolute():
+    if given["shard"] is not None:
+        raise UsageError(
+            "--shard splits a list of captures, and watch has none", hint="Watch one folder for each shard"
+        )
+    if len(given["captures"]) > 1:
+        raise UsageError(f"found {given['captures'][0]} after the dashes, expected options of infer")
+    if output.resolve() == folder.resolve():
         raise UsageError("the results would lie among the captures", path=output, hint="Give another -o OUT")
     infer.callback(**{**given, "captures": []})  # refuses wrong options now, not when the first capture arrives
     arrivals = Arrivals(folder, marker=marker, seconds=settle, without=output)

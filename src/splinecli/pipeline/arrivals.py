@@ -47,7 +47,7 @@ class Arrivals:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.folder, self.marker, self.seconds = folder, marker, seconds
-        self._without = without.absolute()
+        self._without = without.resolve()
         self._clock = clock
         self._seen: dict[Path, _Seen] = {}
 
@@ -80,7 +80,7 @@ class Arrivals:
                 folders = [Path(entry.path) for entry in entries if entry.is_dir() and entry.name[0] != "."]
         except OSError as error:
             raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
-        return [folder for folder in folders if folder.absolute() not in (self._without, *self._without.parents)]
+        return [folder for folder in folders if folder.resolve() not in (self._without, *self._without.parents)]
 
 
 def _stamp(folder: Path) -> Stamp:
@@ -92,5 +92,5 @@ def _stamp(folder: Path) -> Stamp:
                 status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
             except OSError:
                 continue
-            count, size, newest = count + 1, size + status.st_size, max(newest, status.st_mtime_ns)
+            count, size, newest = count + 1, size + status.st_size, max(newest, status.st_mtime_ns, status.st_ctime_ns)
     return count, size, newest
