@@ -40,6 +40,18 @@ def test_captures_are_computed_as_they_arrive_and_only_once(run, capture, make_c
     assert Path("out/-first 1/report.json").stat() == before
 
 
+def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    Path("parts").mkdir()
+    capture.rename("parts/sphere")
+    monkeypatch.setattr("splinecli.pipeline.batch.run_member", interrupt)
+    result = run("watch", "parts", "--settle", 0, "--", "--method", "ls")
+    assert result.code == 130
+    assert "interrupted" in result.err
+
+
 @pytest.mark.parametrize(
     ("options", "problem"),
     [

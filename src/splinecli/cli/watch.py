@@ -36,8 +36,8 @@ def watch(
 
     options = options or []
     infer: Any = context.parent.command.get_command(context.parent, "infer")  # type: ignore[union-attr]
-    given = infer.make_context("infer", [*options, "--", str(folder)], parent=context.parent).params
-    output = given["output"].expanduser()
+    run = infer.make_context("infer", [*options, "--", str(folder)], parent=context.parent)
+    given, output = run.params, run.params["output"].expanduser()
     if given["as_json"]:
         raise UsageError("--json prints one list at the end, and watch has none", hint="Give --jsonl")
     if given["shard"] is not None:
@@ -48,18 +48,15 @@ def watch(
         raise UsageError(f"found {given['captures'][0]} after the dashes, expected options of infer")
     if output.resolve() == folder.resolve():
         raise UsageError("the results would lie among the captures", path=output, hint="Give another -o OUT")
-    infer.callback(**{**given, "captures": []})  # refuses wrong options now, not when the first capture arrives
+    given["captures"] = []
+    infer.invoke(run)  # refuses wrong options now, not when the first capture arrives
     arrivals = Arrivals(folder, marker=marker, seconds=settle, without=output)
     messages = Messages(quiet=given["quiet"])
     messages.say(f"{folder}: waiting for captures; Ctrl-C ends")
     while True:
         ready = arrivals.take()
         if ready:
-            infer.main(
-                [*options, "--", *map(str, ready)],
-                prog_name="splinecli infer",
-                standalone_mode=False,
-                parent=context.parent,
-            )
+            run.params["captures"] = ready
+            infer.invoke(run)
         else:
             time.sleep(_LOOK_SECONDS)
