@@ -88,7 +88,7 @@ def capture_from_arrays(
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
-        lamps = NearLamps.of(positions, pixel_size, (shape[0], shape[1]), equal=not known)
+        lamps = NearLamps.of(positions, pixel_size, shape, equal=not known)
         warnings = (*capture.warnings, *check_distances(lamps, inside, None))
         capture = replace(capture, lamps=lamps, warnings=warnings)
     stored = StoredCapture(capture, found.saturation, intensities_known=known)

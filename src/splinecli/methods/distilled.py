@@ -25,6 +25,7 @@ from splinecli.methods.estimator import (
     ConfidentEstimator,
     Directions,
     Observations,
+    directions_at,
     refiner_of,
 )
 from splinecli.methods.least_squares import TOWARDS_CAMERA
@@ -119,15 +120,14 @@ class DistilledEstimator:
         unlike = np.empty(len(observations), np.bool_)
         for start in range(0, len(observations), _TILE):
             rows = slice(start, start + _TILE)
-            lights = light_directions if light_directions.ndim == 2 else light_directions[rows]
-            normals[rows], errors[rows], unlike[rows] = self._apply(observations[rows], lights)
+            found = self._apply(observations[rows], directions_at(light_directions, rows))
+            normals[rows], errors[rows], unlike[rows] = found
             if progress is not None:
                 progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
-            lights = light_directions if light_directions.ndim == 2 else light_directions[unlike]
             normals[unlike], errors[unlike] = self._teacher.estimate_with_error(
-                observations[unlike], lights, progress=progress
+                observations[unlike], directions_at(light_directions, unlike), progress=progress
             )
         return normals, errors
 
@@ -168,9 +168,9 @@ def distil(
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     light = light_of(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
-    lit = (light.observations > 0).any(axis=1)
+    lit = np.flatnonzero((light.observations > 0).any(axis=1))
     candidates = light.observations[lit]
-    directions = light.directions if light.directions.ndim == 2 else light.directions[lit]
+    directions = directions_at(light.directions, lit)
     if len(candidates) // 2 < FEWEST_PIXELS:  # the sample is at most half of them
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
     lights = torch.as_tensor(directions, dtype=torch.float32)
@@ -180,8 +180,7 @@ def distil(
         rare_share = min(_RARE_SHARE, _RARE_PER_SAMPLE * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         rows = sample.rows.numpy()
-        seen = directions if directions.ndim == 2 else directions[rows]
-        taught = teacher.estimate_with_error(candidates[rows], seen, progress=progress)
+        taught = teacher.estimate_with_error(candidates[rows], directions_at(directions, rows), progress=progress)
         inputs = inputs[sample.rows.to(inputs.device)]
         normals, errors = (torch.as_tensor(np.asarray(values, np.float32), device=inputs.device) for values in taught)
         held = round(_HELD_OUT * len(inputs))  # the first pixels are an even sample of all

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,11 @@ Observations = NDArray[np.float32]
 Directions = NDArray[np.floating]
 """(F, 3), or (P, F, 3) where near lamps give each pixel its own: unit vectors towards the lights; x right, y up, z to
 the camera."""
+
+
+def directions_at(light_directions: Directions, rows: slice | NDArray[Any]) -> Directions:
+    """Return the light directions of some pixels: those that all pixels share, or the pixels' own."""
+    return light_directions if light_directions.ndim == 2 else light_directions[rows]
 
 
 class Estimator(Protocol):

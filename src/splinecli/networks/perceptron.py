@@ -26,7 +26,7 @@ class Perceptron(nn.Module):
         generator: draws the weights.
     """
 
-    solve: Tensor
+    solve: Tensor | None
     mean: Tensor
     spread: Tensor
 
@@ -34,8 +34,7 @@ class Perceptron(nn.Module):
         super().__init__()
         near = light_directions.ndim == 3
         n_inputs = light_directions.shape[-2] + (6 if near else 3)
-        shared = light_directions.new_zeros(0, 3) if near else light_directions
-        self.register_buffer("solve", torch.linalg.pinv(shared.double()).T.float())
+        self.register_buffer("solve", None if near else torch.linalg.pinv(light_directions.double()).T.float())
         self.register_buffer("mean", torch.zeros(n_inputs))
         self.register_buffer("spread", torch.ones(n_inputs))
         with torch.random.fork_rng(devices=[]):  # the layers draw weights that are replaced below
@@ -53,7 +52,7 @@ class Perceptron(nn.Module):
         Between them stands the mean direction (P, 3) of lights (P, F, 3), because it says where a pixel is.
         """
         scaled = observations / map_scale(observations)
-        if light_directions.ndim == 2:
+        if self.solve is not None:
             return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
         fitted, _ = weighted_least_squares(scaled, light_directions, torch.ones_like(scaled))
         return torch.cat((scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1)

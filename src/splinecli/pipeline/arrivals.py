@@ -33,7 +33,7 @@ class Arrivals:
         folder: the captures are its subfolders.
         marker: the name of the file; None to wait for `seconds` without a change.
         seconds: see marker.
-        without: a folder that is no capture, such as that of the results.
+        without: a folder, such as that of the results, that is no capture and lies in none.
         clock: a clock that never goes back, in seconds.
     """
 
@@ -47,7 +47,7 @@ class Arrivals:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.folder, self.marker, self.seconds = folder, marker, seconds
-        self._without = without.resolve()
+        self._left_out = {without.resolve(), *without.resolve().parents}
         self._clock = clock
         self._seen: dict[Path, _Seen] = {}
 
@@ -80,7 +80,7 @@ class Arrivals:
                 folders = [Path(entry.path) for entry in entries if entry.is_dir() and entry.name[0] != "."]
         except OSError as error:
             raise InputError(f"the folder cannot be read ({error.strerror})", path=self.folder) from error
-        return [folder for folder in folders if folder.resolve() not in (self._without, *self._without.parents)]
+        return [folder for folder in folders if folder.resolve() not in self._left_out]
 
 
 def _stamp(folder: Path) -> Stamp:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 from splinecli.capture import open_capture
@@ -73,19 +73,19 @@ def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
         yield Item((draw,), draw.reading.name, memory)
 
 
-_scorers: dict[str, DrawScorer] = {}  # that of the command that this worker serves
-
-
 def _score(settings: _Settings, draw: DrawTask) -> DrawScores:
-    if settings.command not in _scorers:
-        estimators = [make_estimator(name, settings.method_options) for name in settings.methods]
-        for estimator, expected in zip(estimators, settings.fingerprints, strict=True):
-            if estimator.fingerprint != expected:
-                raise ModelError(
-                    f"{estimator.name} is {estimator.fingerprint} here, expected {expected} as on the machine of the"
-                    " command",
-                    hint="Use the same weight file everywhere, and the same --precision",
-                )
-        _scorers.clear()
-        _scorers[settings.command] = DrawScorer(estimators)
-    return _scorers[settings.command].score(draw)
+    return _scorer(settings).score(draw)
+
+
+@lru_cache(maxsize=1)
+def _scorer(settings: _Settings) -> DrawScorer:
+    """Return the scorer of the command that this worker serves."""
+    estimators = [make_estimator(name, settings.method_options) for name in settings.methods]
+    for estimator, expected in zip(estimators, settings.fingerprints, strict=True):
+        if estimator.fingerprint != expected:
+            raise ModelError(
+                f"{estimator.name} is {estimator.fingerprint} here, expected {expected} as on the machine of the"
+                " command",
+                hint="Use the same weight file everywhere, and the same --precision",
+            )
+    return DrawScorer(estimators)
