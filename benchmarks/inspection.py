@@ -1,6 +1,7 @@
 """Detection of dents and scratches on a printed, glossy plate, by `--maps relief` and `--maps curvature`.
 
     python benchmarks/inspection.py
+    python benchmarks/inspection.py --picture docs/pictures/inspection.png
 
 Each plate is slightly curved, rough, printed in two tones, and has four defects. Ten lights, noise of 0.4 % of white. A
 defect is found where a map exceeds the largest value on plates without defects, so print and noise do not count.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,8 @@ from scipy.ndimage import gaussian_filter, label
 
 from splinecli import estimate_normals
 from splinecli.maths.derivatives import curvature_of_normals
+from splinecli.pictures.maps import signed_picture
+from splinecli.pictures.png import encode_png
 from splinecli.surface.integration import relief_of_normals
 
 Floats = NDArray[np.float64]
@@ -56,15 +60,32 @@ def photograph(size: int, kind: str, depth: float, seed: int) -> tuple[NDArray[n
 
 
 def maps_of(images: NDArray[np.float32], method: str) -> dict[str, NDArray[np.float32]]:
-    """Return the size of relief and mean curvature, (H, W) each."""
+    """Return relief and mean curvature, (H, W) each."""
     estimate = estimate_normals(images, LIGHTS, light_intensities=np.ones(len(LIGHTS)), method=method)
+    whole = np.ones(images.shape[1:], bool)
+    return {
+        "relief": relief_of_normals(estimate.normal_map, whole),
+        "curvature": curvature_of_normals(estimate.normal_map, whole)[..., 0],
+    }
+
+
+def sizes_of(images: NDArray[np.float32], method: str) -> dict[str, NDArray[np.float32]]:
+    """Return how far relief and mean curvature are from their medians, (H, W) each; 0 at the edge."""
     mask = np.zeros(images.shape[1:], bool)
     mask[BORDER:-BORDER, BORDER:-BORDER] = True
-    found = {
-        "relief": relief_of_normals(estimate.normal_map, np.ones_like(mask)),
-        "curvature": curvature_of_normals(estimate.normal_map, np.ones_like(mask))[..., 0],
-    }
-    return {name: np.abs(values - np.median(values)) * mask for name, values in found.items()}
+    return {name: np.abs(values - np.median(values)) * mask for name, values in maps_of(images, method).items()}
+
+
+def picture_of(size: int, depth: float, method: str) -> bytes:
+    """Return a PNG picture: a plate with dents, and one with scratches below; photograph, relief and curvature."""
+    rows = []
+    for kind in ("dent", "scratch"):
+        images, _ = photograph(size, kind, depth, 200)
+        maps = maps_of(images, method)
+        photo = np.rint(255 * (images[0] / images[0].max()) ** (1 / 2.2)).astype(np.uint8)
+        curvature = signed_picture(maps["curvature"], 0.02)
+        rows.append(np.hstack((photo, signed_picture(maps["relief"], 0.5), curvature)))
+    return encode_png(np.vstack(rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -73,8 +94,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--plates", type=int, default=2)
     parser.add_argument("--depths", type=float, nargs="+", default=(0.05, 0.1, 0.2, 0.5))
     parser.add_argument("--method", default="spline-net")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="write a picture of plates, and measure nothing")
     args = parser.parse_args(arguments)
-    flat = [maps_of(photograph(args.size, "dent", 0, 100 + plate)[0], args.method) for plate in range(args.plates)]
+    if args.picture is not None:
+        args.picture.write_bytes(picture_of(args.size, 0.2, args.method))
+        return
+    flat = [sizes_of(photograph(args.size, "dent", 0, 100 + plate)[0], args.method) for plate in range(args.plates)]
     limits = {name: max(float(maps[name].max()) for maps in flat) for name in flat[0]}
     print("| defect | depth in pixels | relief | curvature |\n|---|---:|---:|---:|")
     for kind in ("dent", "scratch"):
@@ -82,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             found, count = dict.fromkeys(limits, 0), 0
             for plate in range(args.plates):
                 images, defects = photograph(args.size, kind, depth, 200 + plate)
-                maps, (numbers, n_defects) = maps_of(images, args.method), label(defects)
+                maps, (numbers, n_defects) = sizes_of(images, args.method), label(defects)
                 count += n_defects
                 for name, limit in limits.items():
                     found[name] += len(set(numbers[maps[name] > limit]) - {0})

@@ -312,6 +312,22 @@ def test_gradient_and_curvature(capture, truth, run):
     assert (picture[~inside] == 128).all()
 
 
+def test_scales_of_pictures(capture, run):
+    assert run("infer", capture, "--method", "ls", "--maps", "relief:0.5, curvature:0.1").code == 0
+    for name, scale in (("relief", 0.5), ("curvature", 0.1)):
+        values = np.atleast_3d(np.load(f"out/{capture.name}/{name}.npy"))[..., 0]
+        picture = cv2.imread(f"out/{capture.name}/{name}.png", cv2.IMREAD_UNCHANGED)
+        expected = 127.5 + 127.5 * np.clip(np.nan_to_num(values) / scale, -1, 1)
+        np.testing.assert_allclose(picture, expected, atol=0.51)
+
+
+@pytest.mark.parametrize("maps", ["albedo:2", "relief:", "relief:dark", "relief:0", "curvature:inf", "curvature:nan"])
+def test_scales_that_are_none(capture, run, maps):
+    result = run("infer", capture, "--method", "ls", "--maps", maps)
+    assert (result.code, result.out) == (2, "")
+    assert maps.split(":")[0] in result.err
+
+
 def test_relief(capture, run):
     assert run("infer", capture, "--method", "ls", "--maps", "relief").code == 0
     relief = np.load(f"out/{capture.name}/relief.npy")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from typer import Argument, Option
 
 from splinecli.capture.capture_warnings import PROBABLY_WRONG
+from splinecli.capture.formats.text import is_number
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.documents import printed_documents
@@ -28,7 +29,7 @@ from splinecli.cli.values import (
 )
 from splinecli.errors import UsageError, printable
 from splinecli.methods import method_names
-from splinecli.results.files import MAPS, NORMALS
+from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
 from splinecli.results.index import HEADER, INDEX, Row, row_of
 
 if TYPE_CHECKING:
@@ -95,7 +96,8 @@ def infer(
     maps: str | None = Option(
         None,
         metavar="LIST",
-        help=f"Further maps to write: any of {listed(MAPS)}. preview is a shaded image.",
+        help=f"Further maps to write: any of {listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
+        " pixels that is white in the picture, curvature:0.1 the mean curvature per pixel.",
         autocompletion=complete_list(MAPS),
     ),
     html: bool = Option(
@@ -158,7 +160,7 @@ def infer(
             seed=seed if n_lights is not None else 0,
             light_indices=None if light_indices is None else parse_indices(light_indices, "--light-indices"),
             formats=split_commas(formats, "--format", NORMALS),
-            maps=() if maps is None else split_commas(maps, "--maps", MAPS),
+            **_split_maps(maps),
         )
         messages = Messages(quiet=quiet)
         redo: Redo = "all" if overwrite else "changed" if update else "nothing"
@@ -171,6 +173,23 @@ def infer(
             cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
         )
         return _show_all(batch, output, messages, document, summaries=not (quiet or as_json or as_json_lines))
+
+
+def _split_maps(text: str | None) -> dict[str, Any]:
+    """Return the fields of InferOptions for a list such as "albedo,relief:2". Raises UsageError."""
+    if text is None:
+        return {"maps": ()}
+    fields: dict[str, Any] = {}
+    names = []
+    for item in text.split(","):
+        name, colon, scale = (part.strip() for part in item.partition(":"))
+        names.append(name)
+        if colon:
+            if name not in SCALED_MAPS or not is_number(scale):
+                expected = " or ".join(f"{name}:NUMBER" for name in SCALED_MAPS)
+                raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}")
+            fields[f"{name}_scale"] = float(scale)
+    return {**fields, "maps": split_commas(",".join(names), "--maps", MAPS)}
 
 
 def _show_all(

@@ -38,7 +38,7 @@ def preview_picture(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) ->
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
-CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # white in a picture: mean curvature in 1/pixel, relief in pixels
+CURVATURE_SCALE, RELIEF_SCALE = 0.05, 1.0  # by default white in a picture: mean curvature in 1/pixel, relief in pixels
 
 
 def signed_picture(values: NDArray[np.float32], scale: float) -> Picture:

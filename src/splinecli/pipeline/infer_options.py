@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, Literal, get_args
 
 from splinecli.capture.lights.draws import check_draw_settings
@@ -12,9 +12,10 @@ from splinecli.capture.record import check_light_indices
 from splinecli.errors import UsageError, check_one_of
 from splinecli.maths.normals import Convention
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, check_method
+from splinecli.pictures.maps import CURVATURE_SCALE, RELIEF_SCALE
 from splinecli.pipeline.reading import Reading
 from splinecli.pipeline.surface import check_pixel_size
-from splinecli.results.files import MAPS, NORMALS
+from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.system.exr import check_exr
 
@@ -41,6 +42,7 @@ class InferOptions(Reading):
         output: results go to `output`/<capture name>/.
         formats: names of `splinecli.results.files.NORMALS`. With exr, albedo and depth are EXR files, too.
         maps: names of `splinecli.results.files.MAPS`.
+        curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
         html: also write page.html. surface: also write the depth map and the mesh; pixel_size, in millimetres, then
             scales it, too. stiffness: how easily that surface tears; see integrate_normals.
         convention: direction of the green channel in PNG files.
@@ -63,6 +65,8 @@ class InferOptions(Reading):
     output: str = field(default="out", compare=False)
     formats: tuple[str, ...] = ("png", "npy")
     maps: tuple[str, ...] = ()
+    curvature_scale: float = CURVATURE_SCALE
+    relief_scale: float = RELIEF_SCALE
     html: bool = False
     surface: bool = False
     stiffness: float = STIFFNESS
@@ -91,6 +95,10 @@ class InferOptions(Reading):
             check_one_of("format", name, NORMALS)
         for name in self.maps:
             check_one_of("map", name, MAPS)
+        for name in SCALED_MAPS:
+            scale = getattr(self, f"{name}_scale")
+            if not 0 < scale < inf:
+                raise UsageError(f"the scale of the map {name} is {scale:g}, expected a number above 0")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the options as JSON values."""

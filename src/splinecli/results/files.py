@@ -16,8 +16,6 @@ from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normal
 from splinecli.maths.normals import Convention, describe, encode_picture
 from splinecli.pictures.error_map import error_map_picture
 from splinecli.pictures.maps import (
-    CURVATURE_SCALE,
-    RELIEF_SCALE,
     albedo_picture,
     confidence_picture,
     preview_picture,
@@ -64,6 +62,9 @@ MAPS = {
     "relief": (RELIEF_PICTURE, RELIEF),
 }
 """The files of each optional map."""
+
+SCALED_MAPS = ("curvature", "relief")
+"""Maps whose picture has a fixed scale, which the user may choose."""
 
 OWN_FILES = (
     *NORMALS.values(),
@@ -206,7 +207,7 @@ def albedo_files(albedo: NDArray[np.float32], mask: NDArray[np.bool_], *, exr: b
     yield ALBEDO_PICTURE, encode_png(albedo_picture(albedo, mask))
 
 
-def map_files(estimate: NormalEstimate, maps: Sequence[str]) -> Files:
+def map_files(estimate: NormalEstimate, maps: Sequence[str], curvature_scale: float) -> Files:
     """Yield those of the maps that follow from the normals alone: float32 NPY files, and pictures."""
     normal_map, mask = estimate.normal_map, estimate.capture.mask
     if "confidence" in maps and estimate.confidence_map is not None:
@@ -218,13 +219,13 @@ def map_files(estimate: NormalEstimate, maps: Sequence[str]) -> Files:
         yield GRADIENT, gradient_of_normals(normal_map, mask)
     if "curvature" in maps:
         curvature = curvature_of_normals(normal_map, mask)
-        scale = f"mean curvature, black {-CURVATURE_SCALE}, gray 0, white {CURVATURE_SCALE} per pixel"
+        words = f"mean curvature, black {-curvature_scale}, gray 0, white {curvature_scale} per pixel"
         yield CURVATURE, curvature
-        yield CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], CURVATURE_SCALE), {"curvature": scale})
+        yield CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], curvature_scale), {"curvature": words})
 
 
-def relief_files(relief: NDArray[np.float32]) -> Files:
+def relief_files(relief: NDArray[np.float32], scale: float) -> Files:
     """Yield a relief (H, W) as a float32 NPY file and as a gray picture."""
-    scale = f"height, black {-RELIEF_SCALE}, gray 0, white {RELIEF_SCALE} pixels"
+    words = f"height, black {-scale}, gray 0, white {scale} pixels"
     yield RELIEF, relief
-    yield RELIEF_PICTURE, encode_png(signed_picture(relief, RELIEF_SCALE), {"relief": scale})
+    yield RELIEF_PICTURE, encode_png(signed_picture(relief, scale), {"relief": words})
