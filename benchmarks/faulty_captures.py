@@ -27,7 +27,7 @@ from splinecli.light.lamp_light import LightOf
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
-from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh

@@ -18,7 +18,7 @@ from splinecli.methods.estimator import UNKNOWN_ERROR, confidence, refiner_of, t
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.methods.student_size import StudentSize, student_sizes
 from splinecli.networks.refine_net import RefineNet
-from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.refinement.refiner import NetworkRefiner
 
 Floats = NDArray[np.floating]
 LIGHTS = spiral_lights(8, 50)
@@ -165,19 +165,14 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_its_map_is_refined_by_the_net_of_its_teacher_with_turns_where_it_is_small(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_its_map_is_refined_by_its_teacher() -> None:
     normals, observations = glossy(3000)
     teacher = Teacher(observations, normals, np.tile(log_median(2), (3000, 1)))
     assert refiner_of(distil(teacher, distant(observations), len(observations), SMALL)) is None
     teacher.refiner = NetworkRefiner(RefineNet(), "float32")  # type: ignore[attr-defined]
-    for most, turns in ((3000, 4), (2999, 1)):
-        monkeypatch.setattr("splinecli.methods.distilled.TURNED_PIXELS", most)
-        refiner = refiner_of(distil(teacher, distant(observations), len(observations), SMALL))
-        assert refiner is not None
-        assert refiner.network is teacher.refiner.network  # type: ignore[attr-defined]
-        assert refiner.turns == turns
+    refiner = refiner_of(distil(teacher, distant(observations), len(observations), SMALL))
+    assert refiner is not None
+    assert refiner is teacher.refiner  # type: ignore[attr-defined]
 
 
 def test_too_few_pixels() -> None:

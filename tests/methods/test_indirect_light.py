@@ -21,7 +21,7 @@ from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, LightOf
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods import make_estimator
-from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
 
 SIZE = 64

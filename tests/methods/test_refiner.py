@@ -21,8 +21,8 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.refine_net import REACH, RefineNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
-from splinecli.refinement import tiles as refiner
-from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.refinement import refiner
+from splinecli.refinement.refiner import NetworkRefiner
 
 LIGHTS = spiral_lights(6, 60)
 

@@ -13,7 +13,7 @@ from splinecli.light.lamp_light import LampLight
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import MethodOptions, make_estimator
 from splinecli.methods.estimator import refiner_of
-from splinecli.refinement.tiles import MARGIN, NetworkRefiner
+from splinecli.refinement.refiner import MARGIN, NetworkRefiner
 
 SIZE = 48
 AZIMUTH = np.arange(10) * np.radians(36)

@@ -33,10 +33,16 @@ def photographed(truth: Tensor, noise: float, lights: Tensor = LIGHTS, *, seen: 
     return features.T.reshape(CHANNELS, SIDE, SIDE)
 
 
+def restored(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
+    """What restore_detail makes of refined normals and features."""
+    normals = features[channels("normal")]
+    return restore_detail(refined, normals, normals + features[channels("plain")], features[channels("noise")], mask)
+
+
 @pytest.mark.parametrize(("noise", "least", "most"), [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)])
 def test_grooves_come_back_where_they_exceed_the_noise(noise: float, least: float, most: float) -> None:
     """All of x comes back. Its share of the unit vector is smaller by the cosine, because z is no detail."""
-    found = restore_detail(FLAT, photographed(GROOVES, noise), EVERYWHERE)
+    found = restored(FLAT, photographed(GROOVES, noise), EVERYWHERE)
     middle = slice(REACH, -REACH)  # near the border, the mean around a pixel has more of one side
     assert least < float((found[0] / GROOVES[0])[:, middle].mean()) < most
 
@@ -44,7 +50,7 @@ def test_grooves_come_back_where_they_exceed_the_noise(noise: float, least: floa
 def test_nothing_comes_back_that_least_squares_does_not_show() -> None:
     """SPLINE-Net has seen the opposite of the grooves."""
     features = photographed(GROOVES, 0.005, seen=torch.roll(GROOVES, 1, dims=-1))
-    torch.testing.assert_close(restore_detail(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
+    torch.testing.assert_close(restored(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("creased", [False, True])
@@ -57,7 +63,7 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
     noisy = photographed(truth, 0.03, lights)
     noisy[:3] += noisy[channels("plain")]  # SPLINE-Net has the noise of least squares
     noisy[channels("plain")] = 0
-    found = restore_detail(truth, noisy, EVERYWHERE)
+    found = restored(truth, noisy, EVERYWHERE)
     assert (found - truth).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
 
@@ -67,7 +73,7 @@ def test_the_more_noise_the_less_comes_back(noise: float, least: float, most: fl
     noisy = photographed(GROOVES, noise)
     noisy[:3] += noisy[channels("plain")]
     noisy[channels("plain")] = 0
-    found = restore_detail(FLAT, noisy, EVERYWHERE)
+    found = restored(FLAT, noisy, EVERYWHERE)
     assert least < float((found[0] * GROOVES[0]).mean() / GROOVES[0].square().mean()) < most
 
 
@@ -79,20 +85,20 @@ def test_black_pixels_change_nothing_beside_them() -> None:
     noisy[:3] += noisy[channels("plain")]
     noisy[channels("plain")] = 0
     noisy[:, :, black] = 0
-    found = restore_detail(FLAT, noisy, EVERYWHERE)
+    found = restored(FLAT, noisy, EVERYWHERE)
     torch.testing.assert_close(found[..., black], FLAT[..., black])
     assert (found - FLAT).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
 
 def test_what_was_not_removed_stays() -> None:
-    torch.testing.assert_close(restore_detail(GROOVES, photographed(GROOVES, 0.02), EVERYWHERE), GROOVES)
+    torch.testing.assert_close(restored(GROOVES, photographed(GROOVES, 0.02), EVERYWHERE), GROOVES)
 
 
 def test_outside_of_the_mask_is_outside_of_the_image() -> None:
     wide = (9, 3, 4, 8)
     mask = torch.rand(1, SIDE, SIDE, generator=torch.Generator().manual_seed(6)) < 0.9
     maps = FLAT * mask, photographed(GROOVES, 0.05) * mask, mask.float()
-    alone, within = restore_detail(*maps), restore_detail(*(pad(values, wide) for values in maps))
+    alone, within = restored(*maps), restored(*(pad(values, wide) for values in maps))
     assert (alone - FLAT * mask).abs().mean() > 0.03
     torch.testing.assert_close(within, pad(alone, wide), atol=1e-5, rtol=0)
 
@@ -101,7 +107,7 @@ def test_nothing_beyond_the_reach_counts() -> None:
     features = photographed(GROOVES, 0.02)
     changed = features.clone()
     changed[:3, :, -1] += 0.5
-    before, after = (restore_detail(FLAT, values, EVERYWHERE) for values in (features, changed))
+    before, after = (restored(FLAT, values, EVERYWHERE) for values in (features, changed))
     difference = (before - after).abs().amax(dim=(0, 1))
     assert difference[: SIDE - 1 - REACH].max() == 0
     assert difference[SIDE - 2] > 0

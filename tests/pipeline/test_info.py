@@ -5,7 +5,7 @@ from splinecli.pipeline.info import ORIGINS
 
 
 def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
-    from splinecli.refinement.tiles import MARGIN, TILE
+    from splinecli.refinement.refiner import MARGIN, TILE
 
     assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
 

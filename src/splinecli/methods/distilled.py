@@ -36,8 +36,6 @@ from splinecli.networks.perceptron import BATCH, Perceptron
 from splinecli.system.progress import Progress
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
-TURNED_PIXELS = 500_000
-"""The most pixels of a capture whose map is refined in all turns. On more, the turns would take most of the time."""
 
 _HELD_OUT = 1 / 8  # of the sample
 _TILE = 2048  # pixels whose hidden layers stay in a processor's cache
@@ -82,15 +80,12 @@ class DistilledEstimator:
         perceptron: Perceptron,
         sample: PixelSample,
         found: Distillation,
-        n_pixels: int,
     ) -> None:
         self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
         self.distillation = found
         self.n_unlike = 0
         self.name, self.weights = teacher.name, teacher.weights
         self.refiner = refiner_of(teacher)
-        if self.refiner is not None and n_pixels > TURNED_PIXELS:
-            self.refiner = self.refiner.without_turns()
         self.device, self.precision = teacher.device, teacher.precision
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
@@ -212,7 +207,7 @@ def distil(
         p95_deg=float(np.quantile(angles, 0.95)),
         expected_deg=float(median_error_deg(errors[:held]).mean()),
     )
-    return DistilledEstimator(teacher, perceptron, sample, found, n_pixels)
+    return DistilledEstimator(teacher, perceptron, sample, found)
 
 
 def _inputs(

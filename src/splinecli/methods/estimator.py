@@ -91,10 +91,6 @@ class ConfidentEstimator(Estimator, Protocol):
 class Refiner(Protocol):
     """Corrects a map of normals by what lies around each pixel."""
 
-    def without_turns(self) -> Refiner:
-        """Return the refiner that sees the map once, for captures whose pixels are estimated quickly."""
-        ...
-
     def refine(
         self,
         mask: NDArray[np.bool_],

@@ -15,7 +15,7 @@ from splinecli.methods.batched import estimate_in_batches
 from splinecli.methods.estimator import UNKNOWN_ERROR, Directions, Observations
 from splinecli.networks.spline_net import Rotation
 from splinecli.networks.weights import LoadedNetwork
-from splinecli.refinement.tiles import NetworkRefiner
+from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.system.progress import Progress
 
 Precision = Literal["float32", "bfloat16"]
@@ -71,7 +71,7 @@ class NetworkEstimator:
         self.refiner = NetworkRefiner(refine_net, self.precision) if refines and refine_net is not None else None
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.refiner is not None:
-            self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, with detail"
+            self.fingerprint += f", without indirect light, refined in {self.refiner.turns} turns, halved, with detail"
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
 
     def estimate(

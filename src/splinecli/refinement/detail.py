@@ -6,11 +6,12 @@ light intensities, and say nothing about detail. Real detail agrees between two 
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import avg_pool2d, normalize
 
 from splinecli.networks.gaussian import gaussian_sum, reach_of
-from splinecli.networks.refine_channels import channels
+from splinecli.refinement.halving import enlarge
 
 FINE = 1.5
 """Detail is what a Gaussian filter with this sigma in pixels removes."""
@@ -31,7 +32,7 @@ all."""
 _TINY = 1e-12
 
 
-def restore_detail(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
+def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, mask: Tensor) -> Tensor:
     """Add detail to refined normals that the refinement net removed although it is real.
 
     It is the detail of SPLINE-Net's normals. It counts as real where the detail that least squares has in addition is
@@ -39,29 +40,63 @@ def restore_detail(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
     pixel for example, look the same as detail.
 
     Args:
-        refined: (3, H, W), unit.
-        features: (CHANNELS, H, W) of at least FEWEST_LIGHTS lights, see refine_features.
+        refined, estimated, least_squares: (3, H, W), unit normals. At least FEWEST_LIGHTS lights gave the last ones.
+        noise: (1, H, W), of least squares; see fits/two_halves.py.
         mask: (1, H, W), 1 inside, else 0. The other maps are zero outside.
 
     Returns:
         Unit normals (3, H, W), zero outside the mask. Black pixels stay as they are.
     """
-    normals, least_squares = features[:3], features[:3] + features[channels("plain")]
     mask = mask * least_squares.any(dim=0)  # black pixels show nothing
-    removed, missing, noise = (
-        _detail(maps, mask) for maps in (normals - refined, least_squares - refined, features[channels("noise")])
+    removed, missing, noise = (_detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise))
+    alike = _energy(removed, missing) / (_energy(removed, removed) * _energy(missing, missing)).sqrt()
+    return normalize(refined + _real_share(missing, noise) * alike * removed, dim=0)
+
+
+def restore_octave(
+    enlarged: Tensor, estimated: Tensor, least_squares: Tensor, noise: Tensor, largest: Tensor, mask: Tensor
+) -> Tensor:
+    """Add detail to normals from half the resolution: that of SPLINE-Net's normals where it is real.
+
+    Detail is what is lost when normals are halved, as HalfCapture does, and enlarged again (Burt and Adelson, The
+    Laplacian pyramid as a compact image code, 1983). It counts as real where the detail of least squares is clearly
+    larger than its noise.
+
+    Args:
+        enlarged: (3, H, W), unit, from half the resolution.
+        estimated, least_squares, noise, mask: see restore_detail. The maps begin at even rows and columns.
+        largest: (1, H, W), the largest observation of each pixel. Bright pixels show more than dark ones.
+
+    Returns:
+        Unit normals (3, H, W), zero outside the mask.
+    """
+    mask = mask * least_squares.any(dim=0)
+    largest = largest * mask
+    detail, missing = (
+        (maps - normalize(_without_octave(maps, largest), dim=0)) * mask for maps in (estimated, least_squares)
     )
+    noise = (noise - _without_octave(noise, largest)) * mask
+    return normalize(enlarged + _real_share(missing * largest, noise * largest) * detail, dim=0)
 
-    def energy(one: Tensor, other: Tensor) -> Tensor:
-        return gaussian_sum((one * other).sum(dim=0), WINDOW).clamp(min=_TINY)
 
-    real = 1 - energy(noise, noise) / energy(missing, missing)
-    real = ((real - _LEAST_REAL) / (_SURELY_REAL - _LEAST_REAL)).clamp(0, 1)
-    alike = energy(removed, missing) / (energy(removed, removed) * energy(missing, missing)).sqrt()
-    return normalize(refined + real * alike * removed, dim=0)
+def _real_share(missing: Tensor, noise: Tensor) -> Tensor:
+    """Return which share (H, W) of missing detail (3, H, W) comes back, by the noise (1, H, W) in it."""
+    real = 1 - _energy(noise, noise) / _energy(missing, missing)
+    return ((real - _LEAST_REAL) / (_SURELY_REAL - _LEAST_REAL)).clamp(0, 1)
+
+
+def _energy(one: Tensor, other: Tensor) -> Tensor:
+    return gaussian_sum((one * other).sum(dim=0), WINDOW).clamp(min=_TINY)
 
 
 def _detail(maps: Tensor, mask: Tensor) -> Tensor:
     """Return the detail of maps (C, H, W), zero outside the mask, whatever they are there."""
     maps = maps * mask
     return maps - gaussian_sum(maps, FINE) / gaussian_sum(mask, FINE).clamp(min=_TINY) * mask
+
+
+def _without_octave(maps: Tensor, weights: Tensor) -> Tensor:
+    """Return maps (C, H, W) after weighted means of 2 x 2 pixels, enlarged again."""
+    height, width = maps.shape[-2:]
+    sums = avg_pool2d(torch.cat((maps * weights, weights))[None], 2, ceil_mode=True)[0]
+    return enlarge(sums[:-1] / sums[-1:].clamp(min=_TINY), sums[-1] > 0)[:, :height, :width]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splinecli.fits.lambertian import SHADOW_SHARE, fit_lambertian
-from splinecli.fits.two_halves import compare_halves
+from splinecli.fits.two_halves import TwoHalves, compare_halves
 from splinecli.fits.weighted_least_squares import weighted_sum
 from splinecli.maths.observation_map import dot, map_scale
 from splinecli.networks.refine_channels import MEDIAN_OFFSET, TENSOR, VECTORS, WIDTHS
@@ -42,8 +42,7 @@ def refine_features(
     observed = observations / scale
     count = observed.shape[1]
     robust = torch.nn.functional.normalize(fit_lambertian(observed, light_directions), dim=-1)
-    halves = compare_halves(observed.double(), light_directions.double(), signs)
-    plain, change, noise = (found.to(observed) for found in halves)
+    plain, change, noise = two_halves(observed, light_directions, signs)
     cosine = dot(normals, light_directions).clamp_(min=0)
     # Products with ones are faster than sums over so few columns.
     mean = observed.new_full((count, 1), 1 / count)
@@ -72,6 +71,12 @@ def refine_features(
         "noise": noise.clamp(-1, 1),
     }
     return torch.cat([features[name] for name in WIDTHS], dim=1)
+
+
+def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
+    """Return what compare_halves finds in double precision, from observations (P, F) with a largest value of 1."""
+    found = compare_halves(observed.double(), light_directions.double(), signs)
+    return TwoHalves(*(values.to(observed) for values in found))
 
 
 def brightness(observations: Tensor) -> float:

@@ -1,0 +1,118 @@
+"""A capture at half the resolution, and what was found there at the full one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
+from splinecli.maths.normals import unit
+from splinecli.refinement.tiles import Box, pixels_before
+
+Floats = NDArray[np.float32]
+
+_DARK = 1e-6
+"""Weight of a pixel that is dark under every light, beside lit ones of the capture's brightness."""
+
+
+@dataclass(frozen=True, eq=False)
+class HalfCapture:
+    """A capture whose pixels are the means of blocks of 2 x 2 pixels of another one, as far as these are in its mask.
+
+    Args:
+        mask: (H / 2, W / 2), with Q true pixels.
+        observations: (Q, F).
+        normals, errors: (Q, 3), unit, and (Q, 2), in the capture's frame.
+        members: (Q,), the row of one pixel of each block in the other capture. Its light directions hold for the block.
+        whole: gives the light of the other capture's pixels.
+    """
+
+    mask: NDArray[np.bool_]
+    observations: Floats
+    normals: Floats
+    errors: Floats
+    members: Rows
+    whole: LightOf
+
+    @classmethod
+    def of(
+        cls, mask: NDArray[np.bool_], light_of: LightOf, normals: Floats, errors: Floats, reference: float
+    ) -> HalfCapture:
+        """Return half of a capture.
+
+        Args:
+            mask: (H, W), both even, with P true pixels.
+            light_of: gives the observations and light directions of some pixels.
+            normals, errors: (P, 3) and (P, 2), in the capture's frame.
+            reference: the brightness of the capture.
+        """
+        half = np.asarray(_blocks(mask).any(axis=(1, 3)), np.bool_)
+        rows_above, done_above = pixels_before(mask), pixels_before(half)
+        members = np.empty(done_above[-1], np.int32)
+        means = np.empty((len(members), light_of(np.arange(1)).observations.shape[1] + 5), np.float32)
+        step = max(1, LIT_AT_ONCE // (2 * mask.shape[1]))  # rows of blocks
+        for first in range(0, len(half), step):
+            last = min(first + step, len(half))
+            seen, kept = mask[2 * first : 2 * last], half[first:last]
+            rows = np.arange(rows_above[2 * first], rows_above[2 * last], dtype=np.int32)
+            if not len(rows):
+                continue
+            observations = light_of(rows).observations
+            largest = observations.max(axis=1, keepdims=True)
+            equal = np.where(largest > 0, np.float32(1), np.float32(_DARK))
+            # A block's observations tell most about the normals of its brightest pixels.
+            weights = np.maximum(largest, np.float32(_DARK * reference))
+            values = np.zeros((*seen.shape, means.shape[1] + 2), np.float32)
+            values[seen] = np.hstack(
+                (observations * equal, normals[rows] * weights, errors[rows] * weights, equal, weights)
+            )
+            sums = _blocks(values).sum(axis=(1, 3))[kept]
+            numbers = np.zeros(seen.shape, np.int32)
+            numbers[seen] = rows
+            found = slice(done_above[first], done_above[last])
+            means[found, :-5] = sums[:, :-7] / sums[:, -2:-1]
+            means[found, -5:] = sums[:, -7:-2] / sums[:, -1:]
+            members[found] = _blocks(numbers).max(axis=(1, 3))[kept]
+        return cls(half, means[:, :-5].copy(), unit(means[:, -5:-2]), means[:, -2:].copy(), members, light_of)
+
+    def light_of(self, rows: Rows) -> LampLight:
+        """Return the observations and light directions of some pixels."""
+        return replace(self.whole(self.members[rows]), observations=self.observations[rows])
+
+    def enlarged(self, box: Box) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return normals (3, h, w), not of unit length, and errors (2, h, w) in a box of the other capture's map.
+
+        They are interpolated bilinearly between pixels of the mask.
+
+        Args:
+            box: between even rows and columns.
+        """
+        rows, columns = (slice(max(0, side.start // 2 - 1), side.stop // 2 + 1) for side in box)
+        mask = self.mask[rows]
+        numbers = mask.cumsum(dtype=np.int32).reshape(mask.shape) + (np.count_nonzero(self.mask[: rows.start]) - 1)
+        mask, numbers = mask[:, columns], numbers[:, columns]
+        values = np.zeros((*mask.shape, 5), np.float32)
+        some = numbers[mask]
+        values[mask] = np.hstack((self.normals[some], self.errors[some]))
+        maps = enlarge(torch.from_numpy(values).permute(2, 0, 1), torch.from_numpy(mask))
+        top, left = box[0].start - 2 * rows.start, box[1].start - 2 * columns.start
+        maps = maps[:, top : top + box[0].stop - box[0].start, left : left + box[1].stop - box[1].start]
+        return maps[:3], maps[3:]
+
+
+def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Return maps (C, h, w) at twice the resolution, interpolated bilinearly between the pixels of a mask (h, w)."""
+    weights = mask.to(maps)[None]
+    weighed = torch.cat((maps * weights, weights))[None]
+    found = torch.nn.functional.interpolate(weighed, scale_factor=2, mode="bilinear")[0]
+    return found[:-1] / found[-1:].clamp(min=1e-6)
+
+
+def _blocks(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values (H, W, ...) as (H / 2, 2, W / 2, 2, ...)."""
+    height, width = values.shape[:2]
+    return values.reshape(height // 2, 2, width // 2, 2, *values.shape[2:])

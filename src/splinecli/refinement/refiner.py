@@ -1,0 +1,284 @@
+"""The refinement net on a whole capture: in tiles, and on large captures at a lower resolution.
+
+The net learned from objects of a hundred to three hundred pixels a side. On larger maps it sees less of the object, and
+its results are worse. So a large capture is halved until the net is at home, and comes back octave by octave with the
+detail that is real; see detail.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splinecli.fits.two_halves import alternating_signs
+from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
+from splinecli.maths.observation_map import map_scale
+from splinecli.networks.refine_channels import CHANNELS, channels
+from splinecli.networks.refine_net import COARSEST, Part, RefineNet
+from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave
+from splinecli.refinement.detail import REACH as DETAIL_REACH
+from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
+from splinecli.refinement.halving import HalfCapture
+from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
+from splinecli.system.memory import return_freed_memory
+from splinecli.system.progress import Progress
+
+MARGIN = 64
+"""Pixels around a tile that are seen, a multiple of COARSEST.
+
+The net can see further (REACH), but what lies beyond the margin turns no normal by more than 0.01 degrees.
+"""
+
+TILE = 608
+"""Side of the part of the map that is refined at once, a multiple of COARSEST. Its margin comes on top.
+
+Larger tiles take less time, because their margins are smaller in all, and more memory.
+"""
+
+MOST_PIXELS = 150_000
+"""The most pixels of a capture that the net sees as they are."""
+
+_DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
+
+Floats = NDArray[np.float32]
+
+
+Maps = tuple[torch.Tensor, torch.Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class _Capture:
+    """A capture to be refined, or a half of one.
+
+    Args:
+        mask: (H, W), with P true pixels.
+        observations: (P, F). light_of: gives the light of some pixels.
+        normals, errors: (P, 3) and (P, 2), which are replaced.
+        reference, signs: of the whole capture; see refine_features.
+    """
+
+    mask: NDArray[np.bool_]
+    observations: Floats
+    light_of: LightOf
+    normals: Floats
+    errors: Floats
+    reference: float
+    signs: torch.Tensor
+
+    def halved(self, half: HalfCapture) -> _Capture:
+        return replace(
+            self,
+            mask=around_object(half.mask),
+            observations=half.observations,
+            light_of=half.light_of,
+            normals=half.normals,
+            errors=half.errors,
+        )
+
+
+class NetworkRefiner:
+    """Corrects the normals of a capture, and the distributions of their errors, by what lies around each pixel.
+
+    Args:
+        network: the refinement net, on its device.
+        precision: the number format of the convolutions.
+        turns: the results of this many quarter turns of the map are averaged. Mirror images gain nothing beside them.
+        tile, margin: see TILE and MARGIN. With a margin of REACH, tiles change nothing.
+        most_pixels: see MOST_PIXELS. Captures of fewer than FEWEST_LIGHTS do not show which detail is real; the net
+            sees their maps as they are, on more pixels once rather than in all turns.
+    """
+
+    def __init__(
+        self,
+        network: RefineNet,
+        precision: str,
+        *,
+        turns: int = 4,
+        tile: int = TILE,
+        margin: int = MARGIN,
+        most_pixels: int = MOST_PIXELS,
+    ) -> None:
+        assert tile % COARSEST == 0 == margin % COARSEST
+        assert tile >= margin, "the margin of a tile must be within its neighbours"
+        self.network = network
+        self.precision = precision
+        self.turns = turns
+        self.tile, self.margin = tile, margin
+        self.most_pixels = most_pixels
+
+    @torch.inference_mode()
+    def refine(
+        self,
+        mask: NDArray[np.bool_],
+        observations: Floats,
+        light_of: LightOf,
+        normals: Floats,
+        errors: Floats,
+        *,
+        progress: Progress | None = None,
+    ) -> None:
+        """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
+
+        A pixel that is dark under every light stays as it is. See networks/error_head.py for the distributions.
+
+        Args:
+            mask: (H, W), with P true pixels.
+            observations: (P, F); only their brightness counts here.
+            light_of: gives the observations and the light directions of some pixels.
+            normals, errors: of the estimator, in the capture's frame.
+            progress: called after each tile with the number of its pixels.
+        """
+        device = self.network.enter.weight.device
+        middle = light_of(np.array([len(normals) // 2])).directions  # as one pixel sees the lights
+        directions = torch.as_tensor(middle, dtype=torch.float32, device=device).view(-1, 3)
+        capture = _Capture(
+            around_object(mask),
+            observations,
+            light_of,
+            normals,
+            errors,
+            brightness(torch.from_numpy(observations)),
+            alternating_signs(directions),
+        )
+        self._refine(capture, progress)
+
+    def _refine(self, capture: _Capture, progress: Progress | None = None) -> None:
+        """Refine a capture in place."""
+        half, turns, margin = None, self.turns, self.margin
+        if len(capture.normals) > self.most_pixels:
+            turns = 1
+            if len(capture.signs) >= FEWEST_LIGHTS:
+                half = HalfCapture.of(
+                    capture.mask, capture.light_of, capture.normals, capture.errors, capture.reference
+                )
+                margin = _DETAIL_MARGIN
+                self._refine(capture.halved(half))
+        lit = capture.observations.max(axis=1) > 0
+        above = Band(slice(0, 0), capture.normals, capture.errors)
+        for pixels, tiles in rows_of_tiles(capture.mask, self.tile, margin):
+            return_freed_memory()  # what the tiles above left is in pieces
+            band = Band(pixels, capture.normals, capture.errors)
+            for tile in tiles:
+                own = tile.rows[tile.inner][tile.mask[tile.inner]]
+                seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
+                if half is None:
+                    maps = self._see(capture, tile, seen, turns)
+                else:
+                    maps = self._enlarge(capture, tile, seen, half)
+                refined, refined_errors = (
+                    values[:, *inner].permute(1, 2, 0).cpu().numpy()[tile.mask[tile.inner]] for values in maps
+                )
+                _turn_back(refined, own, capture.light_of)
+                # Nothing is known of a pixel that is dark under every light.
+                known = lit[own]
+                band.put(own[known], refined[known], refined_errors[known])
+                if progress is not None:
+                    progress(len(own))
+            # These tiles needed the pixels above as they were. The tiles below need these tiles' pixels.
+            above.write()
+            above = band
+        above.write()
+
+    def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
+        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile, as the net sees them."""
+
+        def features_of(rows: Rows, light: LampLight, _: slice) -> torch.Tensor:
+            return refine_features(
+                self._tensor(light.observations),
+                self._tensor(light.directions),
+                self._tensor(light.in_frame_of_pixels(capture.normals[rows])),
+                self._tensor(capture.errors[rows]),
+                capture.reference,
+                capture.signs,
+            )
+
+        features = self._maps(tile, CHANNELS, capture.light_of, features_of)
+        mask = self._tensor(tile.mask)[None]
+        normals, errors = self._average_turns(features, mask, seen, turns)
+        if len(capture.signs) >= FEWEST_LIGHTS:
+            features = features[:, *seen]
+            estimated = features[channels("normal")]
+            least_squares = estimated + features[channels("plain")]
+            normals = restore_detail(normals, estimated, least_squares, features[channels("noise")], mask[:, *seen])
+        return normals, errors
+
+    def _enlarge(self, capture: _Capture, tile: Tile, seen: Part, half: HalfCapture) -> Maps:
+        """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: those of the half capture, with detail."""
+        smooth, errors = half.enlarged(tile.box)
+        inside = smooth[:, torch.from_numpy(tile.mask)].T.numpy()
+        errors = errors[:, *seen].to(self._device)
+
+        def values_of(rows: Rows, light: LampLight, part: slice) -> torch.Tensor:
+            normals = (light.in_frame_of_pixels(values) for values in (inside[part], capture.normals[rows]))
+            observations, directions = map(self._tensor, (light.observations, light.directions))
+            scale = map_scale(observations)
+            fit = two_halves(observations / scale, directions, capture.signs)
+            values = (fit.normals, fit.noise.clamp(-1, 1), scale / capture.reference)
+            return torch.cat((*map(self._tensor, normals), *values), dim=1)
+
+        maps = self._maps(tile, 11, capture.light_of, values_of)[:, *seen]
+        smooth, estimated, least_squares, noise, largest = torch.split(maps, [3, 3, 3, 1, 1])
+        smooth = torch.nn.functional.normalize(smooth, dim=0)
+        mask = self._tensor(tile.mask)[None, *seen]
+        return restore_octave(smooth, estimated, least_squares, noise, largest, mask), errors
+
+    def _maps(
+        self, tile: Tile, columns: int, light_of: LightOf, values_of: Callable[[Rows, LampLight, slice], torch.Tensor]
+    ) -> torch.Tensor:
+        """Return maps (columns, h, w) of values of a tile's pixels, zero outside the mask.
+
+        Args:
+            values_of: gives the values (N, columns) of rows of the capture, from their light and their slice of the
+                tile's pixels.
+        """
+        maps = torch.zeros(*tile.mask.shape, columns, device=self._device)
+        rows, places = tile.rows[tile.mask], torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
+        for start in range(0, len(rows), LIT_AT_ONCE):
+            part = slice(start, start + LIT_AT_ONCE)
+            maps.view(-1, columns)[places[part]] = values_of(rows[part], light_of(rows[part]), part)
+        return maps.permute(2, 0, 1)
+
+    def _average_turns(self, features: torch.Tensor, mask: torch.Tensor, wanted: Part, turns: int) -> Maps:
+        """Return normals (3, h, w) and errors (2, h, w) of a part of the map, averaged over the turns of the map."""
+        normals = errors = torch.zeros((), device=mask.device)
+        for turn in map(Turn, range(turns)):
+            turned, turned_mask = turn_features(features, turn), turn_maps(mask, turn)
+            part = turned_part(wanted, mask.shape[-2:], turn.quarters)
+            with torch.autocast(mask.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
+                found, found_errors = self.network(turned[None], turned_mask[None], part)
+            normals = normals + turn_maps(found[0], turn.back, vectors=((0, 1),))
+            errors = errors + turn_maps(found_errors[0], turn.back)
+        return torch.nn.functional.normalize(normals, dim=0), errors / turns
+
+    @property
+    def _device(self) -> torch.device:
+        return self.network.enter.weight.device
+
+    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=torch.float32, device=self._device)
+
+
+def _turn_back(normals: Floats, rows: Rows, light_of: LightOf) -> None:
+    """Turn normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in place."""
+    for start in range(0, len(rows), LIT_AT_ONCE):
+        part = slice(start, start + LIT_AT_ONCE)
+        light = light_of(rows[part])
+        if light.turns is None:
+            break
+        normals[part] = light.in_frame_of_capture(normals[part])
+
+
+def _with_neighbours(part: Part, shape: Sequence[int]) -> tuple[Part, Part]:
+    """Return a part of a map of this shape with all pixels that its detail depends on, and where the part is in it."""
+    grown, within = [], []
+    for side, length in zip(part, shape, strict=True):
+        start, stop, _ = side.indices(length)
+        first = max(0, start - _DETAIL_MARGIN)
+        grown.append(slice(first, min(stop + _DETAIL_MARGIN, length)))
+        within.append(slice(start - first, stop - first))
+    return (grown[0], grown[1]), (within[0], within[1])
