@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize
+from torch.nn.functional import avg_pool2d
 
 from splinecli.networks.gaussian import gaussian_sum, reach_of
 from splinecli.refinement.halving import enlarge
@@ -50,7 +50,7 @@ def restore_detail(refined: Tensor, estimated: Tensor, least_squares: Tensor, no
     mask = mask * least_squares.any(dim=0)  # black pixels show nothing
     removed, missing, noise = (_detail(maps, mask) for maps in (estimated - refined, least_squares - refined, noise))
     alike = _energy(removed, missing) / (_energy(removed, removed) * _energy(missing, missing)).sqrt()
-    return normalize(refined + _real_share(missing, noise) * alike * removed, dim=0)
+    return unit_maps(refined + _real_share(missing, noise) * alike * removed)
 
 
 def restore_octave(
@@ -72,11 +72,14 @@ def restore_octave(
     """
     mask = mask * least_squares.any(dim=0)
     largest = largest * mask
-    detail, missing = (
-        (maps - normalize(_without_octave(maps, largest), dim=0)) * mask for maps in (estimated, least_squares)
-    )
+    detail, missing = ((maps - unit_maps(_without_octave(maps, largest))) * mask for maps in (estimated, least_squares))
     noise = (noise - _without_octave(noise, largest)) * mask
-    return normalize(enlarged + _real_share(missing * largest, noise * largest) * detail, dim=0)
+    return unit_maps(enlarged + _real_share(missing * largest, noise * largest) * detail)
+
+
+def unit_maps(maps: Tensor) -> Tensor:
+    """Return maps of vectors (3, H, W) at unit length; zero vectors stay. Many times as fast as torch's normalize."""
+    return maps * maps.square().sum(dim=0, keepdim=True).clamp_(min=_TINY**2).rsqrt_()
 
 
 def _real_share(missing: Tensor, noise: Tensor) -> Tensor:

@@ -50,10 +50,17 @@ class HalfCapture:
             normals, errors: (P, 3) and (P, 2), in the capture's frame.
             reference: the brightness of the capture.
         """
-        half = np.asarray(_blocks(mask).any(axis=(1, 3)), np.bool_)
+        half = _over_blocks(np.logical_or, mask)
         rows_above, done_above = pixels_before(mask), pixels_before(half)
-        members = np.empty(done_above[-1], np.int32)
-        means = np.empty((len(members), light_of(np.arange(1)).observations.shape[1] + 5), np.float32)
+        n_half = int(done_above[-1])
+        small = cls(
+            half,
+            np.empty((n_half, light_of(np.arange(1)).observations.shape[1]), np.float32),
+            np.empty((n_half, 3), np.float32),
+            np.empty((n_half, 2), np.float32),
+            np.empty(n_half, np.int32),
+            light_of,
+        )
         step = max(1, LIT_AT_ONCE // (2 * mask.shape[1]))  # rows of blocks
         for first in range(0, len(half), step):
             last = min(first + step, len(half))
@@ -66,18 +73,19 @@ class HalfCapture:
             equal = np.where(largest > 0, np.float32(1), np.float32(_DARK))
             # A block's observations tell most about the normals of its brightest pixels.
             weights = np.maximum(largest, np.float32(_DARK * reference))
-            values = np.zeros((*seen.shape, means.shape[1] + 2), np.float32)
-            values[seen] = np.hstack(
-                (observations * equal, normals[rows] * weights, errors[rows] * weights, equal, weights)
-            )
-            sums = _blocks(values).sum(axis=(1, 3))[kept]
+            found = np.hstack((normals[rows], errors[rows])) * weights
+            values = np.hstack((observations * equal, equal, found, weights))
+            maps = np.zeros((*seen.shape, values.shape[1]), np.float32)
+            maps[seen] = values
+            sums = _over_blocks(np.add, maps)[kept]
             numbers = np.zeros(seen.shape, np.int32)
             numbers[seen] = rows
-            found = slice(done_above[first], done_above[last])
-            means[found, :-5] = sums[:, :-7] / sums[:, -2:-1]
-            means[found, -5:] = sums[:, -7:-2] / sums[:, -1:]
-            members[found] = _blocks(numbers).max(axis=(1, 3))[kept]
-        return cls(half, means[:, :-5].copy(), unit(means[:, -5:-2]), means[:, -2:].copy(), members, light_of)
+            done = slice(done_above[first], done_above[last])
+            small.observations[done] = sums[:, :-7] / sums[:, -7:-6]
+            small.normals[done] = unit(sums[:, -6:-3])
+            small.errors[done] = sums[:, -3:-1] / sums[:, -1:]
+            small.members[done] = _over_blocks(np.maximum, numbers)[kept]
+        return small
 
     def light_of(self, rows: Rows) -> LampLight:
         """Return the observations and light directions of some pixels."""
@@ -112,7 +120,7 @@ def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     return found[:-1] / found[-1:].clamp(min=1e-6)
 
 
-def _blocks(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values (H, W, ...) as (H / 2, 2, W / 2, 2, ...)."""
-    height, width = values.shape[:2]
-    return values.reshape(height // 2, 2, width // 2, 2, *values.shape[2:])
+def _over_blocks(function: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
+    """Return a function of the four values (H, W, ...) in each block of 2 x 2, (H / 2, W / 2, ...)."""
+    rows = function(values[::2], values[1::2])
+    return np.asarray(function(rows[:, ::2], rows[:, 1::2]))

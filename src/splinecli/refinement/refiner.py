@@ -20,7 +20,7 @@ from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale
 from splinecli.networks.refine_channels import CHANNELS, channels
 from splinecli.networks.refine_net import COARSEST, Part, RefineNet
-from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave
+from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave, unit_maps
 from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
 from splinecli.refinement.halving import HalfCapture
@@ -223,9 +223,8 @@ class NetworkRefiner:
 
         maps = self._maps(tile, 11, capture.light_of, values_of)[:, *seen]
         smooth, estimated, least_squares, noise, largest = torch.split(maps, [3, 3, 3, 1, 1])
-        smooth = torch.nn.functional.normalize(smooth, dim=0)
         mask = self._tensor(tile.mask)[None, *seen]
-        return restore_octave(smooth, estimated, least_squares, noise, largest, mask), errors
+        return restore_octave(unit_maps(smooth), estimated, least_squares, noise, largest, mask), errors
 
     def _maps(
         self, tile: Tile, columns: int, light_of: LightOf, values_of: Callable[[Rows, LampLight, slice], torch.Tensor]
@@ -253,7 +252,7 @@ class NetworkRefiner:
                 found, found_errors = self.network(turned[None], turned_mask[None], part)
             normals = normals + turn_maps(found[0], turn.back, vectors=((0, 1),))
             errors = errors + turn_maps(found_errors[0], turn.back)
-        return torch.nn.functional.normalize(normals, dim=0), errors / turns
+        return unit_maps(normals), errors / turns
 
     @property
     def _device(self) -> torch.device:
