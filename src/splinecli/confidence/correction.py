@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from splinecli.capture import Capture
 from splinecli.confidence.features import capture_features
 from splinecli.light.indirect_light import PixelPlaces
-from splinecli.light.lamp_light import LightOf, parts_of_rows
+from splinecli.light.lamp_light import LightOf, Rows, parts_of_rows
 from splinecli.methods.estimator import Estimator
+from splinecli.system.side_by_side import side_by_side
 
 Floats = NDArray[np.float32]
 
@@ -39,13 +40,16 @@ def correct_errors(capture: Capture, estimator: Estimator, light_of: LightOf, no
     features, scale = found
     whole = torch.tensor(astuple(features), dtype=torch.float32)
     places = PixelPlaces(capture.mask)
-    with torch.inference_mode():
-        for rows in parts_of_rows(len(normals)):
-            brightness = capture.observations[rows].mean(axis=1)
-            rows, brightness = rows[brightness > 0], brightness[brightness > 0]
-            pixels = scale.features(brightness, normals[rows], *places.places(rows))
-            own = torch.from_numpy(errors[rows])
-            errors[rows] = head(own, torch.from_numpy(pixels.astype(np.float32)), whole).numpy()
+
+    def correct(rows: Rows) -> None:
+        brightness = capture.observations[rows].mean(axis=1)
+        rows, brightness = rows[brightness > 0], brightness[brightness > 0]
+        pixels = scale.features(brightness, normals[rows], *places.places(rows))
+        own = torch.from_numpy(errors[rows])
+        errors[rows] = head(own, torch.from_numpy(pixels.astype(np.float32)), whole).numpy()
+
+    for _ in side_by_side(correct, parts_of_rows(len(normals))):
+        pass
     return True
 
 

@@ -12,6 +12,7 @@ enough. Attached shadows show both. Under a light behind its tangent plane, a pi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from splinecli.light.lamp_light import LampLight, LightOf, Rows, parts_of_rows
 from splinecli.maths.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.integration import integrate_normals
+from splinecli.system.side_by_side import side_by_side
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -112,9 +114,8 @@ def find_indirect_light(
         normals: (P, 3) unit, in the capture's frame.
     """
     pixels = PixelPlaces(mask)
-    albedo = np.empty(len(normals), np.float32)
-    for rows in parts_of_rows(len(normals)):
-        albedo[rows] = _albedo(light_of(rows), normals[rows])
+    parts = partial(parts_of_rows, len(normals))
+    albedo = np.concatenate([*side_by_side(lambda rows: _albedo(light_of(rows), normals[rows]), parts())])
     total = float(albedo.sum(dtype=np.float64))
     if total <= 0:
         return None
@@ -124,15 +125,17 @@ def find_indirect_light(
     object_mask = mask.copy()
     object_mask[mask] = lit
     blocks = Blocks.over(object_mask, _BLOCKS)
-    sums = np.zeros((np.count_nonzero(blocks.mask), 4 + observations.shape[1]))
-    for rows in parts_of_rows(len(normals)):
+    n_blocks = np.count_nonzero(blocks.mask)
+
+    def sum_up(rows: Rows) -> Doubles:
         rows = rows[lit[rows]]
         most = _MOST_RADIANCE * albedo[rows, None]
         sent = observations[rows] * (most / light_of(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
         values = np.hstack((np.ones((len(rows), 1)), normals[rows], sent))
-        for column, summed in zip(values.T, sums.T, strict=True):
-            summed += np.bincount(number, column, len(sums))
+        return np.stack([np.bincount(number, column, n_blocks) for column in values.T], axis=1)
+
+    sums = sum(side_by_side(sum_up, parts()), np.zeros(()))
     count = sums[:, :1]
     covered = count[:, 0] / blocks.step**2
     arriving = _exchange(blocks, covered, unit(sums[:, 1:4]), sums[:, 4:] / count)

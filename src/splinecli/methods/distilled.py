@@ -1,10 +1,9 @@
 """An estimator made for one capture: a perceptron that learned a network's normals on a sample of the pixels.
 
 One capture has one set of lights and a few materials, so most of its pixels say the same. Under near lamps, the lights
-change smoothly over the image. The network estimates a
-sample of them, the perceptron learns it and estimates the rest at some 80 times the speed. What the perceptron does
-not follow is mostly the network's noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network,
-arXiv 1503.02531).
+change smoothly over the image. The network estimates a sample of them, the perceptron learns it and estimates the rest
+at some 80 times the speed. What the perceptron does not follow is mostly the network's noise (Hinton, Vinyals and Dean,
+Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize
 from splinecli.networks.error_head import median_error_deg
 from splinecli.networks.perceptron import BATCH, Perceptron
 from splinecli.system.progress import Progress
+from splinecli.system.side_by_side import side_by_side
 
 _CANDIDATES = 100_000  # pixels that the sample is drawn from
 
@@ -113,10 +113,14 @@ class DistilledEstimator:
         normals = np.empty((len(observations), 3), np.float32)
         errors = np.empty((len(observations), 2), np.float32)
         unlike = np.empty(len(observations), np.bool_)
-        for start in range(0, len(observations), _TILE):
-            rows = slice(start, start + _TILE)
+
+        def apply(rows: slice) -> slice:
             found = self._apply(observations[rows], directions_at(light_directions, rows))
             normals[rows], errors[rows], unlike[rows] = found
+            return rows
+
+        tiles = (slice(start, start + _TILE) for start in range(0, len(observations), _TILE))
+        for rows in side_by_side(apply, tiles):
             if progress is not None:
                 progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
@@ -126,7 +130,6 @@ class DistilledEstimator:
             )
         return normals, errors
 
-    @torch.inference_mode()
     def _apply(
         self, observations: Observations, light_directions: Directions
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:

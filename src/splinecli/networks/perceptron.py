@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from splinecli.fits.weighted_least_squares import weighted_least_squares
 from splinecli.maths.observation_map import map_scale
+from splinecli.system.side_by_side import one_thread_each
 
 BATCH = 256
 _LEARNING_RATE = 3e-3
@@ -70,6 +71,7 @@ class Perceptron(nn.Module):
         found = self.last(hidden.to(inputs.dtype))
         return nn.functional.normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
 
+    @one_thread_each()
     def learn(
         self,
         inputs: Tensor,

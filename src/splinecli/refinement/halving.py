@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.normals import unit
 from splinecli.refinement.tiles import Box, pixels_before
+from splinecli.system.side_by_side import side_by_side
 
 Floats = NDArray[np.float32]
 
@@ -62,12 +63,13 @@ class HalfCapture:
             light_of,
         )
         step = max(1, LIT_AT_ONCE // (2 * mask.shape[1]))  # rows of blocks
-        for first in range(0, len(half), step):
+
+        def halve(first: int) -> None:
             last = min(first + step, len(half))
             seen, kept = mask[2 * first : 2 * last], half[first:last]
             rows = np.arange(rows_above[2 * first], rows_above[2 * last], dtype=np.int32)
             if not len(rows):
-                continue
+                return
             observations = light_of(rows).observations
             largest = observations.max(axis=1, keepdims=True)
             equal = np.where(largest > 0, np.float32(1), np.float32(_DARK))
@@ -85,6 +87,9 @@ class HalfCapture:
             small.normals[done] = unit(sums[:, -6:-3])
             small.errors[done] = sums[:, -3:-1] / sums[:, -1:]
             small.members[done] = _over_blocks(np.maximum, numbers)[kept]
+
+        for _ in side_by_side(halve, range(0, len(half), step)):
+            pass
         return small
 
     def light_of(self, rows: Rows) -> LampLight:

@@ -27,6 +27,7 @@ from splinecli.refinement.halving import HalfCapture
 from splinecli.refinement.tiles import Band, Tile, around_object, rows_of_tiles, turned_part
 from splinecli.system.memory import return_freed_memory
 from splinecli.system.progress import Progress
+from splinecli.system.side_by_side import side_by_side
 
 MARGIN = 64
 """Pixels around a tile that are seen, a multiple of COARSEST.
@@ -160,23 +161,26 @@ class NetworkRefiner:
                 self._refine(capture.halved(half))
         lit = capture.observations.max(axis=1) > 0
         above = Band(slice(0, 0), capture.normals, capture.errors)
+
+        def refine(tile: Tile) -> tuple[Rows, Floats, Floats]:
+            own = tile.rows[tile.inner][tile.mask[tile.inner]]
+            seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
+            maps = self._see(capture, tile, seen, turns) if half is None else self._enlarge(capture, tile, seen, half)
+            refined, errors = (
+                values[:, *inner].permute(1, 2, 0).cpu().numpy()[tile.mask[tile.inner]] for values in maps
+            )
+            _turn_back(refined, own, capture.light_of)
+            return own, refined, errors
+
+        # The net's layers are large enough for all cores.
+        run = map if half is None else side_by_side
         for pixels, tiles in rows_of_tiles(capture.mask, self.tile, margin):
             return_freed_memory()  # what the tiles above left is in pieces
             band = Band(pixels, capture.normals, capture.errors)
-            for tile in tiles:
-                own = tile.rows[tile.inner][tile.mask[tile.inner]]
-                seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
-                if half is None:
-                    maps = self._see(capture, tile, seen, turns)
-                else:
-                    maps = self._enlarge(capture, tile, seen, half)
-                refined, refined_errors = (
-                    values[:, *inner].permute(1, 2, 0).cpu().numpy()[tile.mask[tile.inner]] for values in maps
-                )
-                _turn_back(refined, own, capture.light_of)
+            for own, refined, errors in run(refine, tiles):
                 # Nothing is known of a pixel that is dark under every light.
                 known = lit[own]
-                band.put(own[known], refined[known], refined_errors[known])
+                band.put(own[known], refined[known], errors[known])
                 if progress is not None:
                     progress(len(own))
             # These tiles needed the pixels above as they were. The tiles below need these tiles' pixels.

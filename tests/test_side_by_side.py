@@ -1,0 +1,57 @@
+"""Parts of a computation on all cores."""
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from splinecli.system.side_by_side import one_thread_each, side_by_side
+
+
+@pytest.fixture(params=[1, 3], autouse=True)
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def test_results_come_in_order_and_parts_run_at_the_same_time(threads: int) -> None:
+    together = threading.Barrier(threads, timeout=60)
+
+    def square(number: int) -> int:
+        together.wait()
+        time.sleep(0.01 * (number % 3))
+        assert torch.get_num_threads() == 1 and torch.is_inference_mode_enabled()
+        return number**2
+
+    assert list(side_by_side(square, range(12))) == [number**2 for number in range(12)]
+    assert torch.get_num_threads() == threads
+
+
+def test_few_results_wait(threads: int) -> None:
+    begun: list[int] = []
+    results = side_by_side(begun.append, range(100))
+    for done, _ in enumerate(results, 1):
+        assert len(begun) <= done + threads
+
+
+def test_an_error_comes_in_its_turn_and_ends_the_rest(threads: int) -> None:
+    def refuse(number: int) -> int:
+        if number == 5:
+            raise ValueError(f"part {number}")
+        return number
+
+    results = side_by_side(refuse, range(1000))
+    assert [next(results) for _ in range(5)] == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="part 5"):
+        next(results)
+    assert torch.get_num_threads() == threads
+
+
+def test_an_error_restores_the_number_of_threads(threads: int) -> None:
+    with pytest.raises(ValueError, match="within"), one_thread_each():
+        raise ValueError("within")
+    assert torch.get_num_threads() == threads
