@@ -24,7 +24,7 @@ class MethodOptions:
 
     weights: a shipped name or a file.
     rotations: number of rotations of the lights whose normals a network averages.
-    batch_size: pixels per batch.
+    batch_size: pixels per batch. A processor computes a batch on each core.
     device: where to compute; "auto" is a CUDA GPU if there is one.
     precision: number format of a network; "auto" is bfloat16 where the device computes natively in it.
 
@@ -88,11 +88,10 @@ class _Solver:
 
 @dataclass(frozen=True)
 class _Network:
-    """A network: its default weights, averaged rotations and batch size, and whether it refines the map."""
+    """A network: its default weights and averaged rotations, and whether it refines the map."""
 
     weights: str
     rotations: int
-    batch_size: int
     refines: bool = True
 
     def __call__(self, name: str, options: MethodOptions) -> Estimator:
@@ -109,18 +108,21 @@ class _Network:
             precision=choose_precision(options.precision, device),
             refines=self.refines,
             rotations=self.rotations if options.rotations is None else options.rotations,
-            batch_size=self.batch_size if options.batch_size is None else options.batch_size,
+            batch_size=_BATCH[device.type] if options.batch_size is None else options.batch_size,
         )
 
 
+_BATCH = {"cpu": 256, "cuda": 1024}
+"""Pixels in a network's batch. Processors compute a batch on each core."""
+
 _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
-    "spline-net": _Network("spline-net", rotations=1, batch_size=1024),
-    "cnn-ps": _Network("cnn-ps", rotations=10, batch_size=512),
+    "spline-net": _Network("spline-net", rotations=1),
+    "cnn-ps": _Network("cnn-ps", rotations=10),
     "ls": _least_squares,
     "ls-trimmed": _Solver("trimmed_least_squares", 8192),
     "l1": _Solver("least_absolute", 8192),
     "iw12": _Solver("iw12", 8192),
     "st14": _Solver("st14", 1024),
     "ia14": _Solver("ia14", 1024),
-    "spline-net-pixelwise": _Network("spline-net", rotations=1, batch_size=1024, refines=False),
+    "spline-net-pixelwise": _Network("spline-net", rotations=1, refines=False),
 }

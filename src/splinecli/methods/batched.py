@@ -15,6 +15,7 @@ from splinecli.maths.observation_map import map_scale
 from splinecli.methods.estimator import Directions, Observations
 from splinecli.methods.least_squares import TOWARDS_CAMERA
 from splinecli.system.progress import Progress
+from splinecli.system.side_by_side import side_by_side
 
 Solve = Callable[[Tensor, Tensor], Tensor]
 """(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) -> normals (P, 3).
@@ -77,7 +78,6 @@ class BatchedEstimator:
         )
 
 
-@torch.inference_mode()
 def estimate_in_batches(
     solve: Solve,
     observations: Observations,
@@ -89,7 +89,7 @@ def estimate_in_batches(
     columns: int = 3,
     progress: Progress | None = None,
 ) -> NDArray[np.float32]:
-    """Call `solve` on batches of observations and return its results (P, columns) as float32.
+    """Call `solve` on batches of observations, side by side, and return its results (P, columns) as float32.
 
     Args:
         solve: returns unit normals in its first three columns. Zero vectors are replaced by (0, 0, 1).
@@ -100,13 +100,17 @@ def estimate_in_batches(
     """
     shared = torch.as_tensor(light_directions, dtype=dtype, device=device) if light_directions.ndim == 2 else None
     results = np.empty((len(observations), columns), np.float32)
-    for start in range(0, len(observations), batch_size):
+
+    def solve_batch(start: int) -> int:
         batch = torch.as_tensor(observations[start : start + batch_size]).to(device, dtype)
         own = light_directions[start : start + batch_size]
         lights = torch.as_tensor(own, dtype=dtype, device=device) if shared is None else shared
         solved = solve(batch, lights)
         solved[~solved[:, :3].any(dim=1), :3] = solved.new_tensor(TOWARDS_CAMERA)
         results[start : start + batch_size] = solved.cpu().numpy()
+        return len(batch)
+
+    for count in side_by_side(solve_batch, range(0, len(observations), batch_size)):
         if progress is not None:
-            progress(len(batch))
+            progress(count)
     return results
