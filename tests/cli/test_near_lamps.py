@@ -110,12 +110,33 @@ def test_wrong_files_are_named(run, near: Path) -> None:
         ("light_positions.txt", "1 2 -3\n" * 7, "light_positions.txt:1: found a lamp behind the object"),
         ("light_positions.txt", "0 0 0\n" * 7, "found a zero vector, expected a lamp position"),
         ("light_positions.txt", "1 2 3\n" * 5, "found 5 lamp positions, expected 7"),
+        ("light_lobes.txt", "0 0 -1 2\n" * 3, "light_lobes.txt: found 3 lines, expected 1 or 7"),
+        ("light_lobes.txt", "# LEDs\n0 0 -1\n", 'light_lobes.txt:2: found "0 0 -1", expected x y z mu'),
+        ("light_lobes.txt", "0 0 -1 -2\n", 'light_lobes.txt:1: found "0 0 -1 -2", expected x y z mu'),
+        ("light_lobes.txt", "0 0 -1 2\n" * 6 + "0 0 1 2\n", "light_lobes.txt:7: lamp 7 shines away from the object"),
     ):
         (near / "pixel_size.txt").write_text("2\n")
+        np.savetxt(near / "light_positions.txt", BUMP_LAMPS)
         (near / name).write_text(text)
         result = run("infer", "bump", "--method", "ls")
         assert (result.code, message in result.err) == (3, True), result.err
         (near / name).unlink()
+
+
+def test_a_file_of_lobes(run, near: Path) -> None:
+    """One line is for all lamps. The frame of the positions is that of the lobes, too."""
+    without = infer(run)
+    (near / "light_lobes.txt").write_text("0 0.2 -1 0\n")
+    assert "other input files" in run("infer", "bump", "--method", "ls").err
+    even = infer(run)
+    assert even["near_lamps"]["lobes"] == [pytest.approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
+    assert mean_error(even) == pytest.approx(mean_error(without), abs=1e-3)
+    (near / "light_lobes.txt").write_text("0 0.2 -1 5\n")
+    narrow = infer(run)
+    assert mean_error(narrow) > mean_error(without) + 0.1
+    np.savetxt(near / "light_positions.txt", BUMP_LAMPS * (1, -1, 1))
+    (near / "light_lobes.txt").write_text("0 -0.2 -1 5\n")
+    assert mean_error(infer(run, "--light-frame", "y-down")) == mean_error(narrow)
 
 
 @pytest.mark.parametrize("command", ["infer", "info"])

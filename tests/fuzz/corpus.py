@@ -113,6 +113,7 @@ def light_files(folder: Path) -> None:
     (folder / "commas.txt").write_text("\n".join(rows).replace(".", ",").replace(" ", ";"))
     (folder / "named.csv").write_text("\n".join(f"{number}.png;{row}" for number, row in enumerate(rows)))
     np.savetxt(folder / "positions.txt", 60 * LIGHTS)
+    np.savetxt(folder / "light_lobes.txt", np.column_stack((-LIGHTS, np.full(len(LIGHTS), 2))))
     (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
 
 

@@ -99,6 +99,29 @@ def test_intensities_hold_at_the_origin() -> None:
     assert error_deg(estimate) < 0.2
 
 
+@pytest.mark.parametrize("equal", [True, False])
+def test_lamps_that_shine_in_lobes(equal: bool) -> None:
+    """LEDs that miss the middle of the object by up to 30 degrees, of equal power or measured at the origin."""
+    points, normals, mask = surface("dome")
+    positions = LIGHTS * np.linspace(3, 6, 10)[:, None]
+    axes = unit(0.4 * np.random.default_rng(0).normal(size=(10, 3)) - LIGHTS)
+    exponents = np.linspace(0, 6, 10)
+
+    def strengths(places: Floats) -> Floats:
+        rays = unit(places[:, None] - positions)
+        return np.einsum("pfc,fc->pf", rays, axes).clip(0) ** exponents
+
+    shown = strengths(points)
+    if not equal:
+        shown = shown * np.square(np.linalg.norm(positions, axis=1)) / strengths(np.zeros((1, 3)))
+    capture = capture_of(points, normals, mask, positions, shown)
+    lobes = np.column_stack((axes, exponents))
+    lamps = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=equal, lobes=lobes)
+    estimator = make_estimator("iw12")
+    assert error_deg(estimate_normals(replace(capture, lamps=lamps), estimator)) < 0.2
+    assert error_deg(estimate_normals(replace(capture, lamps=replace(lamps, lobes=None)), estimator)) > 2
+
+
 def test_a_perspective_camera() -> None:
     """A tilted plane before a pinhole camera: points on the rays, and a highlight-free surface."""
     mask = np.ones((SIDE, SIDE), np.bool_)

@@ -18,9 +18,11 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.stamp import stamp_content
 from splinecli.capture.window import Window
 from splinecli.errors import InputError, UsageError
+from splinecli.maths.normals import unit
 
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
+LOBES = ("light_lobes.txt",)
 
 SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
 
@@ -86,6 +88,7 @@ class LampFiles:
         distance: see LampOptions.
         pixel_size, object_width: the scale; see LampOptions. Both are None where it is unknown.
         camera_matrix: (3, 3), or None for an orthographic camera.
+        lobes: the file of the lamps' lobes, or None.
         stamp: of the files that were found, from before they were read.
         used: whether the capture uses the lamps. If not, they are only compared with distant lights.
     """
@@ -95,6 +98,7 @@ class LampFiles:
     pixel_size: float | None
     object_width: float | None
     camera_matrix: NDArray[np.float64] | None
+    lobes: Path | None
     stamp: tuple[Any, ...]
     used: bool
 
@@ -139,7 +143,8 @@ class LampFiles:
         if pixel_size is None:
             return None
         shape = tuple(step * size for size in mask.shape) if window.shape is None else window.shape
-        lamps = NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix)
+        lobes = None if self.lobes is None else _read_lobes(self.lobes, positions, frame)
+        lamps = NearLamps.of(positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix, lobes=lobes)
         left, top, *_ = window.box or (0, 0)
         step *= window.step
         return lamps.within(left, top, step, None if camera_matrix is None else window.camera(camera_matrix))
@@ -172,7 +177,9 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     scaled = options.pixel_size is not None or options.object_width is not None
     pixel_file = None if scaled else _find(folders, PIXEL_SIZE)
     scaled = scaled or pixel_file is not None
-    stamp = tuple(stamp_content(path) for path in (positions, pixel_file, matrix_file) if path is not None)
+    lobes = _find(folders, LOBES)
+    files = (positions, pixel_file, matrix_file, lobes)
+    stamp = tuple(stamp_content(path) for path in files if path is not None)
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
         raise InputError("nothing tells the scale of the lamps' positions", path=positions, hint=SCALE_HINT)
@@ -182,6 +189,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         pixel_size,
         options.object_width,
         None if matrix_file is None else read_camera_matrix(matrix_file),
+        lobes,
         stamp,
         used and scaled,
     )
@@ -211,6 +219,32 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
             hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
         )
     return matrix
+
+
+def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -> NDArray[np.float64]:
+    """Return the lobes (F, 4) of lamps at positions (F, 3); see NearLamps. Raises InputError."""
+    table, hint = (
+        read_number_rows(path),
+        "A line has the direction in which a lamp shines most, x y z, and its exponent",
+    )
+    if len(table.rows) not in (1, len(positions)):
+        raise InputError(f"found {len(table.rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
+    for row, line in zip(table.rows, table.lines, strict=True):
+        if len(row) != 4 or not any(row[:3]) or row[3] < 0:
+            found = " ".join(f"{number:g}" for number in row)
+            raise InputError(f'found "{found[:60]}", expected x y z mu', path=path, line=line, hint=hint)
+    lobes = np.repeat(table.as_array(), len(positions) // len(table.rows), axis=0)
+    lobes[:, :3] = unit(lobes[:, :3] @ frame.matrix.T)
+    away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
+    if away.any():
+        lamp = int(away.argmax())
+        raise InputError(
+            f"lamp {lamp + 1} shines away from the object",
+            path=path,
+            line=table.lines[min(lamp, len(table.lines) - 1)],
+            hint="The directions point from the lamps to the object",
+        )
+    return lobes
 
 
 def _read_pixel_size(path: Path) -> float:

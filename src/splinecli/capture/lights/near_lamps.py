@@ -18,6 +18,9 @@ from splinecli.maths.normals import angle_between_deg
 
 Floats = NDArray[np.float64]
 
+_LEAST_SHARE = 1e-3
+"""Least intensity of a lobe: observations are divided by it."""
+
 
 @dataclass(frozen=True, eq=False)
 class NearLamps:
@@ -27,10 +30,13 @@ class NearLamps:
         positions: (F, 3), in any unit, in front of the object's mean plane (z > 0).
         pixel_size: the width of a pixel on the object's mean plane, in the unit of the positions.
         middle: row and column of the origin, in pixels of what was read.
-        reference_distances: (F,), the distances from each lamp at which the observations' light intensities hold. See
-            `of`.
+        reference_distances: (F,), the distances along each lamp's axis at which the observations' light intensities
+            hold. See `of`.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
         points: (P, 3), the surface in the capture's pixels, in the unit of the positions. None while it is unknown.
+        lobes: (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the axis, its
+            intensity is cos(a)^mu, as that of an LED (Quéau et al., LED-based photometric stereo, JMIV 2018, section
+            2.1). None for lamps that shine alike in all directions.
 
     Raises:
         InputError: a position is not finite or not in front of the object, or the pixel size is not above 0.
@@ -42,6 +48,7 @@ class NearLamps:
     reference_distances: Floats
     camera_matrix: Floats | None = None
     points: NDArray[np.float32] | None = None
+    lobes: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not np.isfinite(self.positions).all():
@@ -60,16 +67,21 @@ class NearLamps:
         *,
         equal: bool,
         camera_matrix: Floats | None = None,
+        lobes: Floats | None = None,
     ) -> NearLamps:
         """Return lamps at positions (F, 3) over whole images of this shape (H, W).
 
         Args:
-            equal: whether the light intensities are unknown, so that all lamps count as equally strong. Otherwise each
-                intensity holds at the origin, where a gray card would measure it.
+            equal: whether the light intensities are unknown, so that all lamps count as equally strong along their
+                axes. Otherwise each intensity holds at the origin, where a gray card would measure it.
         """
         distances = np.linalg.norm(positions, axis=1)
-        reference = np.full_like(distances, distances.mean()) if equal else distances
-        return cls(positions, pixel_size, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), reference, camera_matrix)
+        if equal:
+            distances = np.full_like(distances, distances.mean())
+        elif lobes is not None:
+            distances = distances / np.sqrt(_within_lobes(lobes, positions[None] / distances[:, None])[0])
+        middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
+        return cls(positions, pixel_size, middle, distances, camera_matrix, lobes=lobes)
 
     def within(self, left: float, top: float, step: int, camera_matrix: Floats | None) -> NearLamps:
         """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of these pixels."""
@@ -89,6 +101,7 @@ class NearLamps:
             "pixel_size": self.pixel_size,
             "camera": "orthographic" if self.camera_matrix is None else "perspective",
             "camera_matrix": None if self.camera_matrix is None else self.camera_matrix.tolist(),
+            "lobes": None if self.lobes is None else self.lobes.round(4).tolist(),
         }
 
     def turned(self, directions: Floats) -> NearLamps:
@@ -103,6 +116,7 @@ class NearLamps:
             self,
             positions=self.positions[chosen],
             reference_distances=self.reference_distances[chosen],
+            lobes=None if self.lobes is None else self.lobes[chosen],
         )
 
     def choose_pixels(self, rows: slice | NDArray[np.integer]) -> NearLamps:
@@ -135,9 +149,17 @@ class NearLamps:
     def light_at(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light at points (P, 3): unit directions (P, F, 3), and strengths (P, F).
 
-        A strength is the inverse square of the distance, relative to the light at the lamp's reference distance.
+        A strength is the inverse square of the distance, relative to the light at the lamp's reference distance, times
+        the share of the lamp's lobe.
         """
         towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
         distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
         towards /= distance[..., None]
-        return towards, np.square(self.reference_distances.astype(np.float32) / distance)
+        strengths = np.square(self.reference_distances.astype(np.float32) / distance)
+        return towards, strengths if self.lobes is None else strengths * _within_lobes(self.lobes, towards)
+
+
+def _within_lobes(lobes: Floats, towards: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps; along the axes 1."""
+    cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
+    return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=_LEAST_SHARE)
