@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splinecli.capture.formats.images import to_linear
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
 from splinecli.capture.lights.near_lamps import NearLamps
+from splinecli.capture.linearise import linear_light
 from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.white_level import SaturationFinder
@@ -73,7 +73,7 @@ def capture_from_arrays(
         for index, image in enumerate(stack):
             values = (image if image.ndim == 3 else image[..., None])[inside]
             path = Path(f"images[{index}]")
-            yield StoredPixels(path, values, to_linear(values, path), intensities[index])
+            yield StoredPixels(path, values, linear_light(values, path), intensities[index])
 
     found = collect_observations(pixels(), SaturationFinder(int(inside.sum()), n_lights, given=white_level))
     capture = Capture(

@@ -63,6 +63,20 @@ AS_STORED = RadiometricCalibration()
 """Stored values are linear light."""
 
 
+_MIDDLE_OF_8_BITS = np.float32(0.25 / 255)
+"""Nothing tells whether linear 8-bit values were rounded, or cut as `image >> 8` does. A value v stands for light
+between v - 0.5 and v + 0.5, or between v and v + 1. A quarter of a step is half of the mistake in both cases, which
+turns normals where a pixel is dark."""
+
+
+def linear_light(stored: NDArray[Any], path: Path, curve: TransferCurve = 1.0) -> NDArray[np.float32]:
+    """Return stored values of any shape as linear light. Raises InputError as to_linear does."""
+    linear = decode_transfer(to_linear(stored, path), curve)
+    if stored.dtype == np.uint8 and curve == 1:
+        linear += _MIDDLE_OF_8_BITS * (stored > 0)
+    return linear
+
+
 def take_pixels(image: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
     """Return image[mask], the pixels (P, C) of an image (H, W, C) in a mask (H, W), but faster."""
     if mask.all():
@@ -118,5 +132,5 @@ class PixelReader:
         """Return the pixels as stored, and linear without ambient light."""
         image = decode_image(path, ExpectedSize(self._window.shape or self.mask.shape, like))
         stored = take_pixels(self._window.of(image), self.mask)
-        linear = decode_transfer(to_linear(stored, path), self.radiometry.curve)
+        linear = linear_light(stored, path, self.radiometry.curve)
         return stored, linear if self._ambient is None else np.maximum(linear - self._ambient, 0)
