@@ -13,8 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from splinecli.cli.documents import error_document, printed_documents
-from splinecli.cli.failures import ParserError
+from splinecli.cli.failures import ParserError, error_document, printed_documents
 from splinecli.cli.panels import sort_into_panels
 from splinecli.system.memory import check_address_space, keep_freed_memory
 

@@ -13,7 +13,7 @@ from splinecli.capture.capture_warnings import PROBABLY_WRONG
 from splinecli.capture.formats.text import is_number
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
-from splinecli.cli.documents import printed_documents
+from splinecli.cli.failures import printed_documents
 from splinecli.cli.values import (
     Device,
     FirstLight,

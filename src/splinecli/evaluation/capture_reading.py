@@ -17,9 +17,13 @@ from splinecli.diagnosis.ground_truth import check_ground_truth
 from splinecli.errors import InputError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import TrialSource
+from splinecli.system.files import as_input_error
 
 OnImage = Callable[[int, int], object]
 """Called with the number of images read so far and their total."""
+
+Notes = list[tuple[str, ...]]
+"""Sentences about a capture, for each protocol."""
 
 DAMAGED_IMAGES = {"bearPNG": 20}
 """The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
@@ -43,7 +47,7 @@ class CaptureReading:
     lights: tuple[int, ...]
     whole: bool
 
-    def read(self, source: CaptureSource, on_image: OnImage | None = None) -> tuple[TrialSource, list[tuple[str, ...]]]:
+    def read(self, source: CaptureSource, on_image: OnImage | None = None) -> tuple[TrialSource, Notes]:
         """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""
         n_read = 0
 
@@ -56,7 +60,7 @@ class CaptureReading:
         try:
             stored = source.read_stored(self.lights, count)
         except OSError as error:
-            raise _as_input_error(error, self.folder) from error
+            raise as_input_error(error, self.folder) from error
         first = self.protocols[0]
         rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
         as_stored = all(protocol.as_stored for protocol in self.protocols)
@@ -69,11 +73,7 @@ def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
     try:
         return open_capture(folder, white_level=protocol.white_level)
     except OSError as error:
-        raise _as_input_error(error, folder) from error
-
-
-def _as_input_error(error: OSError, folder: Path) -> InputError:
-    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
+        raise as_input_error(error, folder) from error
 
 
 def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:

@@ -4,23 +4,42 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
+from typing import NamedTuple
 
-from splinecli.errors import InputError, UsageError
-from splinecli.evaluation.draws_elsewhere import DrawScores, DrawTask
+from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.evaluation.capture_reading import CaptureReading, Notes
 from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, check_skip_first, distinct_names, read_draws_file
+from splinecli.evaluation.plan import (
+    CaptureJob,
+    ProtocolTrials,
+    check_skip_first,
+    distinct_names,
+    plan_capture,
+    read_draws_file,
+)
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import SharedDraw
-from splinecli.evaluation.trials import Trial, TrialStore
+from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.methods import Estimator
 
-Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, DrawScores]]]
+
+class DrawTask(NamedTuple):
+    """One draw of a capture: what is read for all its draws, and the trials of this one; none for the notes alone."""
+
+    reading: CaptureReading
+    trials: Sequence[Trial]
+
+
+Scored = tuple[Sequence[Score], Notes] | SplinecliError
+"""The score of each trial of a draw and the notes on its capture, or why the capture cannot be scored."""
+
+Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
 """Scores draws in other processes, and yields each with its scores as it ends."""
 
 OnProgress = Callable[[float, int, str], object]
@@ -76,80 +95,71 @@ def evaluate_all(
     for protocol in protocols:
         check_skip_first(protocol, names)
     store = TrialStore() if store is None else store
-    planned = [CaptureJob.plan(folder, name, estimators, tasks) for folder, name in names_by_folder.items()]
-    run = _Run([job for job in planned if job is not None], store, on_progress)
+    planned = [plan_capture(folder, name, estimators, tasks, store) for folder, name in names_by_folder.items()]
+    captures_to_score = [job for job in planned if job is not None]
+    progress = _Progress(sum(len(draw) for job in captures_to_score for draw in job.draws), on_progress)
     if elsewhere is None:
-        run.run(jobs)
-    else:
-        run.run_elsewhere(elsewhere)
-    names_of_settings = ("weights", "device", "precision", "fingerprint")
-    settings = {e.name: {name: getattr(e, name) for name in names_of_settings} for e in estimators}
-    return [replace(task.evaluation(names, store), settings=settings) for task in tasks]
-
-
-class _Run:
-    """Scores the trials that the store does not have."""
-
-    def __init__(
-        self, jobs_by_capture: Sequence[CaptureJob], store: TrialStore, on_progress: OnProgress | None
-    ) -> None:
-        self._captures = [(job, job.missing(store)) for job in jobs_by_capture]
-        self._store = store
-        total = sum(len(draw) for _, draws in self._captures for draw in draws)
-        self._progress = _Progress(total, on_progress)
-
-    def run(self, jobs: int) -> None:
-        """Score `jobs` trials at a time. Raises what a trial raises."""
         with _share_cores(jobs), ThreadPoolExecutor(jobs) as workers:
             try:
-                self._submit_all(workers, jobs)
+                _score_here(captures_to_score, {e.name: e for e in estimators}, store, progress, workers, jobs)
             except BaseException:
                 workers.shutdown(cancel_futures=True)
                 raise
+    else:
+        _score_elsewhere(captures_to_score, elsewhere, store, progress)
+    names_of_settings = ("weights", "device", "precision", "fingerprint")
+    settings = {e.name: {name: getattr(e, name) for name in names_of_settings} for e in estimators}
+    return [task.evaluation(names, store, settings) for task in tasks]
 
-    def run_elsewhere(self, elsewhere: Elsewhere) -> None:
-        """Let other processes score the trials. Raises what a trial raises."""
-        jobs = {job.name: job for job, _ in self._captures}
-        tasks = [
-            DrawTask(reading, tuple(trial for trial, _ in draw))
-            for reading, draws in ((job.reading(draws), draws) for job, draws in self._captures)
-            for draw in draws or [[]]
-        ]
-        for task, result in elsewhere(tasks):
-            job = jobs[task.reading.name]
-            if result.error is not None:
-                job.fail(result.error)
-            else:
-                job.note(result.notes)
-                for trial, score in zip(task.trials, result.scores, strict=True):
-                    self._store.add(trial, score)
-            self._progress.skip(len(task.trials))
 
-    def _submit_all(self, workers: ThreadPoolExecutor, jobs: int) -> None:
-        running: set[Future[None]] = set()
-        for job, draws in self._captures:
+def _score_here(
+    captures: Sequence[CaptureJob],
+    estimators: Mapping[str, Estimator],
+    store: TrialStore,
+    progress: _Progress,
+    workers: ThreadPoolExecutor,
+    jobs: int,
+) -> None:
+    """Score `jobs` trials at a time in threads. Raises what a trial raises."""
 
-            def show_image(n_read: int, n_images: int, name: str = job.name) -> None:
-                self._progress.note(f"reading {name}, image {n_read} of {n_images}")
+    def score(shared: SharedDraw, trial: Trial) -> None:
+        store.add(trial, shared.score(trial, estimators[trial.method], progress.begin))
 
-            try:
-                source, notes = job.reading(draws).read(job.source, show_image)
-            except (InputError, UsageError) as error:
-                job.fail(error)
-                self._progress.skip(sum(map(len, draws)))
-                continue
+    running: set[Future[None]] = set()
+    for job in captures:
+        name = job.reading.name
+        try:
+            source, notes = job.reading.read(job.source, partial(progress.read_image, name))
+        except (InputError, UsageError) as error:
+            job.fail(error)
+            progress.skip(sum(map(len, job.draws)))
+            continue
+        job.note(notes)
+        for draw in job.draws:
+            shared = SharedDraw(source)
+            for trial in draw:
+                running.add(workers.submit(score, shared, trial))
+                running = _wait(running, jobs)  # one trial waits, so that no core does
+            del shared
+        del source  # before the next capture is read
+    _wait(running, 0)
+
+
+def _score_elsewhere(
+    captures: Sequence[CaptureJob], elsewhere: Elsewhere, store: TrialStore, progress: _Progress
+) -> None:
+    """Let other processes score the trials. Raises what a trial raises."""
+    jobs = {job.reading.name: job for job in captures}
+    for task, scored in elsewhere([DrawTask(job.reading, draw) for job in captures for draw in job.draws or [[]]]):
+        job = jobs[task.reading.name]
+        if isinstance(scored, SplinecliError):
+            job.fail(scored)
+        else:
+            scores, notes = scored
             job.note(notes)
-            for draw in draws:
-                shared = SharedDraw(source, draw[0][0])
-                for trial, estimator in draw:
-                    running.add(workers.submit(self._score, shared, trial, estimator))
-                    running = _wait(running, jobs)  # one trial waits, so that no core does
-                del shared
-            del source  # before the next capture is read
-        _wait(running, 0)
-
-    def _score(self, shared: SharedDraw, trial: Trial, estimator: Estimator) -> None:
-        self._store.add(trial, shared.score(estimator, self._progress.begin))
+            for trial, score in zip(task.trials, scores, strict=True):
+                store.add(trial, score)
+        progress.skip(len(task.trials))
 
 
 class _Progress:
@@ -162,9 +172,9 @@ class _Progress:
         self._running: dict[int, float] = {}
         self._begun = 0
 
-    def note(self, text: str) -> None:
+    def read_image(self, capture: str, n_read: int, n_images: int) -> None:
         with self._lock:
-            self._show(text)
+            self._show(f"reading {capture}, image {n_read} of {n_images}")
 
     def skip(self, count: int) -> None:
         with self._lock:

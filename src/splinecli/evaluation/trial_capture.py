@@ -16,7 +16,7 @@ from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.trials import Score, Trial
-from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.inference import estimate_normals
 from splinecli.light.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
@@ -95,45 +95,37 @@ class TrialSource:
 class SharedDraw:
     """The capture that the methods of one draw share. The first method that needs it makes it."""
 
-    def __init__(self, source: TrialSource, trial: Trial) -> None:
-        self._source, self._trial = source, trial
+    def __init__(self, source: TrialSource) -> None:
+        self._source = source
         self._lock = Lock()
         self._captures: dict[bool, Capture] = {}
 
-    def score(self, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
-        """Return the score of a method under the draw. Any thread may call this.
+    def score(self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
+        """Return the score of a trial of the draw. Any thread may call this.
 
         Args:
+            trial: a trial of the draw.
+            estimator: its method.
             begin: called with the number of pixels before they are estimated. Its function counts those done.
 
         Raises:
             SplinecliError: the method returned normals that are not unit vectors.
         """
-        capture = self._capture(whole=refiner_of(estimator) is not None)
-        progress = None if begin is None else begin(capture.n_pixels)
-        estimate = estimate_normals(capture, estimator, progress=progress)
-        estimated = capture.estimated_intensities is not None
-        return Score(self._mean_error_deg(estimate), estimate.seconds, estimated, self._light_error_deg(capture))
-
-    def _light_error_deg(self, capture: Capture) -> float | None:
-        if capture.light_errors_deg is None:
-            return None
-        source = self._source
-        true = source.stored.capture.light_directions[source.places(capture.light_indices)]
-        return float(angle_between_deg(capture.light_directions, true).mean())
-
-    def _capture(self, *, whole: bool) -> Capture:
+        source, whole = self._source, refiner_of(estimator) is not None
         with self._lock:
             if whole not in self._captures:
-                self._captures[whole] = self._source.see(self._trial, whole=whole)
-            return self._captures[whole]
-
-    def _mean_error_deg(self, estimate: NormalEstimate) -> float:
+                self._captures[whole] = source.see(trial, whole=whole)
+        capture = self._captures[whole]
+        estimate = estimate_normals(capture, estimator, progress=None if begin is None else begin(capture.n_pixels))
         assert estimate.errors is not None and estimate.error_map_deg is not None  # or it would have no trials
-        rows = self._source.rows
-        if rows is None or estimate.capture.n_pixels == len(rows):
-            return estimate.errors.mean
-        return float(estimate.error_map_deg[estimate.capture.mask][rows].mean())
+        mae_deg = estimate.errors.mean
+        if source.rows is not None and capture.n_pixels != len(source.rows):
+            mae_deg = float(estimate.error_map_deg[capture.mask][source.rows].mean())
+        light_error_deg = None
+        if capture.light_errors_deg is not None:
+            true = source.stored.capture.light_directions[source.places(trial.lights)]
+            light_error_deg = float(angle_between_deg(capture.light_directions, true).mean())
+        return Score(mae_deg, estimate.seconds, capture.estimated_intensities is not None, light_error_deg)
 
 
 def _with_noise(capture: Capture, trial: Trial) -> Capture:

@@ -102,12 +102,9 @@ def _on_workers(
         began, n_failed, n_pixels = time.monotonic(), 0, 0
         for n_ended, (item, result) in enumerate(workers.run(items), start=1):
             number, member = item.args
-            if isinstance(result, LostError):
-                outcome = failed(member.name, result)
-            else:
-                outcome, warnings = result
-                for warning in warnings:
-                    observer.warn(warning)
+            outcome, warnings = (failed(member.name, result), []) if isinstance(result, LostError) else result
+            for warning in warnings:
+                observer.warn(warning)
             n_failed += outcome.exit_code != 0
             n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
             advance(
@@ -133,17 +130,12 @@ def _infer(
 ) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return what became of it and the warnings."""
     options.check_files()
-    estimator, observer = _method(options, options.method_options, sha256), _Warnings()
+    estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):
-        here = this_worker()
-        member = replace(
-            member,
-            missing=InputError(
-                f"the folder does not exist on the worker {here}", path=member.folder, hint=SAME_STORAGE
-            ),
-        )
-    outcome = run_member(member, options, redo, lambda: estimator, observer)
-    return outcome, observer.found
+        problem = f"the folder does not exist on the worker {this_worker()}"
+        member = replace(member, missing=InputError(problem, path=member.folder, hint=SAME_STORAGE))
+    observer = _Warnings()
+    return run_member(member, options, redo, lambda: estimator, observer), observer.found
 
 
 @lru_cache(maxsize=1)

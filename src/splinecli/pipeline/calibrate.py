@@ -34,19 +34,7 @@ OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, P
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
-    """Which images `calibrate` reads, and where it writes.
-
-    Args:
-        balls: a folder of images of a mirror ball each.
-        circles: the outline of each ball, or empty.
-        masks: a mask of each ball, or empty.
-        ball_diameter: of each ball, in any unit, which becomes that of the lamps' positions.
-        camera_matrix: a text file of 3 x 3 numbers. None takes the focal length from EXIF, or the camera as distant.
-        gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
-        transfer: the curve of the gray target's images: auto, linear, srgb or gamma:G.
-        compare: a text file of light directions to compare the result with.
-        output: the folder of the results.
-        overwrite: replace earlier results.
+    """The options of `calibrate`, as its help describes them. None stands for the default in the help.
 
     Raises:
         UsageError: two options contradict each other, or a value is unknown.

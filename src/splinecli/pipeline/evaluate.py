@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from splinecli.capture import find_captures, open_capture
 from splinecli.capture.lights.found_lights import ESTIMATE
@@ -16,7 +16,7 @@ from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_li
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
-from splinecli.evaluation.files import TRIALS, make_plots, write_results
+from splinecli.evaluation.document import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
 from splinecli.evaluation.protocol import Protocol
@@ -37,24 +37,15 @@ DEFAULT_LIGHTS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """The options of `evaluate`.
+    """The options of `evaluate`, as its help describes them.
 
     Args:
-        methods: names of the methods; a name that comes twice counts once.
-        method_options: weights, rotations, batch size, device and precision.
-        n_lights: numbers of lights in each draw, None for all lights; one evaluation for each. Empty for
-            DEFAULT_LIGHTS, or for the number in the draws file.
-        light_noise_deg: standard deviations of the light noise; one evaluation for each.
-        trials: number of random draws; None for DEFAULT_TRIALS.
-        lights: "estimate" to find the lights of each trial from its images; None for the captures' light files.
-        refine_lights: refine the light directions of each trial. light_error_deg: see Protocol.
-        seed, max_pixels, skip_first, as_stored, white_level: see Protocol.
-        draws: path of a draws file, in place of random draws.
-        jobs: number of trials at a time; None for the cores, or for 1 on a GPU.
-        figures: whether to draw the methods' maps of the first draw of each capture.
-        pixels: (row, column) of the pixels whose observation maps the figures show.
-        output: folder for the results.
-        overwrite: whether to compute again what the folder has.
+        methods: a name that comes twice counts once.
+        n_lights: None in it stands for all lights; one evaluation for each. Empty for DEFAULT_LIGHTS, or for the
+            number in the draws file.
+        light_noise_deg: one evaluation for each.
+        trials: None for DEFAULT_TRIALS. jobs: None for the cores, or for 1 on a GPU.
+        pixels: (row, column) of each.
         cluster: the processes or machines that score trials; None for this process.
 
     Raises:
@@ -141,16 +132,8 @@ class EvaluateOptions:
         ]
 
 
-@dataclass(frozen=True)
-class EvaluateOutcome:
-    """What `evaluate` did.
-
-    Args:
-        evaluations: one for each protocol.
-        document: the content of results.json.
-        warnings: sentences for the user, for example on weights used with other lights than trained for.
-        figure_problems: why figures could not be drawn.
-    """
+class EvaluateOutcome(NamedTuple):
+    """One evaluation for each protocol, the content of results.json, warnings, and why figures could not be drawn."""
 
     evaluations: list[Evaluation]
     document: dict[str, Any]
@@ -190,6 +173,14 @@ def evaluate_captures(
         elsewhere = partial(score_on_workers, estimators, options.method_options, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
+            shown = 0.0
+
+            def follow(done: float, total: int, note: str) -> None:
+                nonlocal shown
+                share = done / total if total else 1.0
+                advance(share - shown, note)
+                shown = share
+
             evaluations = evaluate_all(
                 captures,
                 estimators,
@@ -197,7 +188,7 @@ def evaluate_captures(
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
                 jobs=options.jobs or jobs,
                 elsewhere=elsewhere,
-                on_progress=_follow(advance),
+                on_progress=follow,
             )
         plots = make_plots(evaluations)
         figures: list[CaptureFigure] | None = None
@@ -217,19 +208,6 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
             raise UsageError(f"{protocol.n_lights} lights were requested, but the captures have at most {most}")
-
-
-def _follow(advance: Callable[..., None]) -> Callable[[float, int, str], None]:
-    """Return a callback that moves a bar of length 1 with the trials."""
-    shown = 0.0
-
-    def follow(done: float, total: int, note: str) -> None:
-        nonlocal shown
-        share = done / total if total else 1.0
-        advance(share - shown, note)
-        shown = share
-
-    return follow
 
 
 def _draw_figures(

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from splinecli.errors import OutputError
+from splinecli.errors import InputError, OutputError
 
 UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
 _MOST_JSON = 1 << 24  # bytes of a file
@@ -140,6 +140,11 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
         # NumPy tells only how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
         raise OutputError(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
+
+
+def as_input_error(error: OSError, folder: Path) -> InputError:
+    """Return what a system's refusal to read a capture means for the user."""
+    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
 
 
 def check_writable(folder: Path) -> None:
