@@ -184,19 +184,17 @@ def test_normals_that_are_none_are_not_scored(write_dome: WriteDome, vector: Seq
 
 def test_progress(write_dome: WriteDome) -> None:
     folders = [write_dome("a"), write_dome("b")]
-    seen: list[tuple[float, int, str]] = []
+    seen: list[tuple[float, str]] = []
     protocols = [Protocol(n_lights=7, trials=2), Protocol()]
     evaluate_all(
         folders,
         [make_estimator("ls")],
         protocols,
-        on_progress=lambda done, total, note: seen.append((done, total, note)),
+        on_progress=lambda share, note: seen.append((share, note)),
     )
-    assert {total for _, total, _ in seen} == {6}
-    done = [done for done, _, _ in seen]
-    assert done == sorted(done)
-    assert done[-1] == 6
-    notes = [note for _, _, note in seen]
+    shares, notes = zip(*seen, strict=True)
+    assert min(shares) == 0
+    assert sum(shares) == pytest.approx(1)
     assert [note for note in notes if "reading b" in note] == [f"reading b, image {i} of 8" for i in range(1, 9)]
     assert notes[-1] == "trial 6 of 6"
 

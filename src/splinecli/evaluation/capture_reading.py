@@ -35,7 +35,6 @@ class CaptureReading:
 
     Args:
         folder: the capture's folder as it was given. Other processes open it again.
-        name: name of the capture in the tables.
         protocols: those that can score it. All protocols of an evaluation score the same pixels.
         lights: those of all trials, in rising order.
         whole: whether all pixels are needed: a method sees neighbours, or lights are refined or found.
@@ -64,8 +63,15 @@ class CaptureReading:
         first = self.protocols[0]
         rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
         as_stored = all(protocol.as_stored for protocol in self.protocols)
+        if len(rows) == stored.capture.n_pixels:
+            trials = TrialSource(stored)
+        elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
+            # `infer` estimates unknown intensities from all pixels, and near lamps need the whole surface.
+            trials = TrialSource(stored, rows)
+        else:
+            trials = TrialSource(stored.choose_pixels(rows))
         notes = [_notes(stored.capture, self.name, protocol) for protocol in self.protocols]
-        return TrialSource.with_pixels(stored, rows, as_stored=as_stored, whole=self.whole), notes
+        return trials, notes
 
 
 def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
@@ -105,10 +111,7 @@ def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 
     """Return the rows of the observations that have ground truth, in rising order.
 
     With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. A method
-    that sees neighbours estimates all pixels, and only these are scored.
-
-    Raises:
-        InputError: the capture has no ground truth.
+    that sees neighbours estimates all pixels, and only these are scored. Raises InputError without ground truth.
     """
     if capture.ground_truth is None:
         raise InputError(f"{capture.name}: the capture has no ground truth")

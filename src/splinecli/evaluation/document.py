@@ -16,7 +16,7 @@ from splinecli import __version__
 from splinecli.errors import printable
 from splinecli.evaluation.capture_figures import CaptureFigure
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
-from splinecli.evaluation.outcome import Evaluation, all_notes, all_skipped
+from splinecli.evaluation.outcome import Evaluation, all_skipped
 from splinecli.evaluation.protocol import Protocol, lights_value
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.statistics import compare
@@ -55,11 +55,7 @@ def write_results(
 ) -> dict[str, Any]:
     """Write all files in place of those of an earlier evaluation (see new_files). The caller holds the folder.
 
-    Args:
-        figures: None leaves the figures of an earlier evaluation.
-
-    Returns:
-        The content of results.json.
+    Without `figures`, those of an earlier evaluation stay. Returns the content of results.json.
     """
     document = results_document(evaluations)
     shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
@@ -101,7 +97,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         "averages": _averages(evaluations),
         "comparisons": [record for evaluation in evaluations for record in _comparisons(evaluation)],
         "skipped": [{"capture": s.capture, "reason": s.reason} for s in all_skipped(evaluations)],
-        "notes": all_notes(evaluations),
+        "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)),
         "version": __version__,
     }
 
@@ -181,22 +177,16 @@ def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
 
 
 def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    averages = [
-        {method: _rounded(value) for method, value in evaluation.averages.items()} for evaluation in evaluations
-    ]
+    averages = [{method: _rounded(value) for method, value in e.averages.items()} for e in evaluations]
     if len(evaluations) == 1:
         return dict(averages[0])
-    keys = _keys([evaluation.protocol for evaluation in evaluations])
+    # The values in which the evaluations differ: "10", "all"; "0", "2.5"; or both, "10, 2.5".
+    lights = [str(lights_value(e.protocol)) for e in evaluations]
+    noise = [f"{e.protocol.light_noise_deg:g}" for e in evaluations]
+    differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]
+    keys = [", ".join(values) for values in zip(*differing, strict=True)]
     methods = dict.fromkeys(method for average in averages for method in average)
     return {method: {key: average[method] for key, average in zip(keys, averages, strict=True)} for method in methods}
-
-
-def _keys(protocols: Sequence[Protocol]) -> list[str]:
-    """Return the values in which protocols differ as text: "10", "all"; "0", "2.5"; or both, "10, 2.5"."""
-    lights = [str(lights_value(protocol)) for protocol in protocols]
-    noise = [f"{protocol.light_noise_deg:g}" for protocol in protocols]
-    differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]
-    return [", ".join(values) for values in zip(*differing, strict=True)]
 
 
 def _rounded(value: float | None) -> float | None:

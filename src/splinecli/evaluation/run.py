@@ -42,8 +42,8 @@ Scored = tuple[Sequence[Score], Notes] | SplinecliError
 Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
 """Scores draws in other processes, and yields each with its scores as it ends."""
 
-OnProgress = Callable[[float, int, str], object]
-"""Called with the trials done, the total, and a short text. A running trial counts by the share of its pixels."""
+OnProgress = Callable[[float, str], object]
+"""Called with the share of all trials that was just done, and a short text. A trial counts by its pixels."""
 
 
 def evaluate(captures: Sequence[Path], estimators: Sequence[Estimator], protocol: Protocol) -> Evaluation:
@@ -59,7 +59,7 @@ def evaluate_all(
     store: TrialStore | None = None,
     jobs: int = 1,
     elsewhere: Elsewhere | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = lambda share, note: None,
 ) -> list[Evaluation]:
     """Score every estimator on every capture under every protocol.
 
@@ -68,9 +68,6 @@ def evaluate_all(
     truth or too few lights, is skipped, and the outcome says why.
 
     Args:
-        captures: folders.
-        estimators: methods with different names.
-        protocols: at least one.
         store: where finished trials are stored; those that it has are not computed again.
         jobs: number of trials at a time, each on its share of the cores.
         elsewhere: scores the draws in other processes, in place of `jobs`.
@@ -165,45 +162,33 @@ def _score_elsewhere(
 class _Progress:
     """Counts trials over all threads."""
 
-    def __init__(self, total: int, on_progress: OnProgress | None) -> None:
-        self._total, self._on_progress = total, on_progress
+    def __init__(self, total: int, advance: OnProgress) -> None:
+        self._total, self._advance = total, advance
         self._lock = Lock()
         self._finished = 0
-        self._running: dict[int, float] = {}
-        self._begun = 0
 
     def read_image(self, capture: str, n_read: int, n_images: int) -> None:
         with self._lock:
-            self._show(f"reading {capture}, image {n_read} of {n_images}")
+            self._advance(0, f"reading {capture}, image {n_read} of {n_images}")
 
     def skip(self, count: int) -> None:
         with self._lock:
             self._finished += count
-            self._show("")
+            self._advance(count / max(1, self._total), "")
 
     def begin(self, n_pixels: int) -> Callable[[int], None]:
         """Begin a trial. Returns the function that counts its pixels."""
-        with self._lock:
-            number, done = self._begun, 0
-            self._begun += 1
-            self._running[number] = 0.0
+        done = 0
 
-        def advance(pixels: int) -> None:
+        def count(pixels: int) -> None:
             nonlocal done
             with self._lock:
                 done += pixels
-                if done < n_pixels:
-                    self._running[number] = done / n_pixels
-                else:
-                    del self._running[number]
-                    self._finished += 1
-                self._show(f"trial {min(self._finished + 1, self._total)} of {self._total}")
+                self._finished += done >= n_pixels
+                note = f"trial {min(self._finished + 1, self._total)} of {self._total}"
+                self._advance(pixels / n_pixels / self._total, note)
 
-        return advance
-
-    def _show(self, text: str) -> None:
-        if self._on_progress is not None:
-            self._on_progress(self._finished + sum(self._running.values()), self._total, text)
+        return count
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:

@@ -35,31 +35,11 @@ class TrialSource:
     Every draw is restored by itself: a saturated observation is restored from the other lights of the draw, as
     `infer` restores it when it reads only these lights.
 
-    Args:
-        stored: the capture with the stored values of its lights.
-        rows: rows of the observations to score; None for all of them.
+    `rows` are the rows of the observations to score; None for all of them.
     """
 
     stored: StoredCapture
     rows: NDArray[np.integer] | None = None
-
-    @classmethod
-    def with_pixels(
-        cls, stored: StoredCapture, rows: NDArray[np.integer], *, as_stored: bool, whole: bool
-    ) -> TrialSource:
-        """Return a source that scores the given rows of the observations only.
-
-        Args:
-            whole: whether all pixels are needed: a method sees neighbours, or lights are refined.
-            as_stored: whether no trial restores. Otherwise all pixels are kept where the light intensities are
-                unknown, because `infer` estimates them from all pixels. They are also kept under near lamps, which
-                need the whole surface.
-        """
-        if len(rows) == stored.capture.n_pixels:
-            return cls(stored)
-        if not whole and stored.capture.lamps is None and (as_stored or stored.intensities_known):
-            return cls(stored.choose_pixels(rows))
-        return cls(stored, rows)
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
         """Return the capture under the lights of a trial, which have noise, or are refined or found, if it says so.
@@ -103,13 +83,8 @@ class SharedDraw:
     def score(self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
         """Return the score of a trial of the draw. Any thread may call this.
 
-        Args:
-            trial: a trial of the draw.
-            estimator: its method.
-            begin: called with the number of pixels before they are estimated. Its function counts those done.
-
-        Raises:
-            SplinecliError: the method returned normals that are not unit vectors.
+        `begin` is called with the number of pixels before they are estimated. Its function counts those done. Raises
+        SplinecliError if the method returns normals that are not unit vectors.
         """
         source, whole = self._source, refiner_of(estimator) is not None
         with self._lock:
