@@ -141,7 +141,7 @@ def test_the_worst_exit_code():
         (("--maps", "albedo,depth"), 2, "--maps has 'depth'"),
         (("--format", "bmp"), 2, "--format has 'bmp'"),
         (("--method", "magic"), 2, "no method named 'magic'"),
-        (("--transfer", "rec709"), 2, "the transfer curve is 'rec709'"),
+        (("--transfer", "rec709"), 2, "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10"),
         (("--white-level", "0"), 2, "the white level is 0, expected a number above 0"),
         (("--weights", "spline-net"), 2, "method ls uses no weights"),
         (("--maps", "confidence"), 2, "method ls gives no confidence"),
