@@ -93,7 +93,9 @@ def _usage_message(error: Any) -> str:
     """Return the message for a usage error of click: what was found, what was expected, and where help is."""
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
-    text = _bad_value(error) or _unknown_name(error) or _syntax(error.format_message())
+    text = _bad_value(error) or _unknown_name(error) or error.format_message()
+    for pattern, words in _SYNTAX:
+        text = re.sub(pattern, words, text)
     end = "" if text.endswith("?") else "."
     return f"{text.rstrip('.')}{end} See '{where} --help'."
 
@@ -136,12 +138,6 @@ def _unknown_name(error: Any) -> str | None:
     if command:
         return f"no command {command[1]}.{_suggestion((command[2] or '').strip('?').split(', '))}"
     return None
-
-
-def _syntax(text: str) -> str:
-    for pattern, words in _SYNTAX:
-        text = re.sub(pattern, words, text)
-    return text
 
 
 def _suggestion(names: list[str]) -> str:

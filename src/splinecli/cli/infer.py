@@ -208,7 +208,15 @@ def _show_all(
     rows: list[Row] = []
     for outcome in outcomes:
         document(outcome.report)
-        _show(outcome, output, messages, with_summary=summaries)
+        if outcome.status == "done":
+            if summaries:
+                print(printable(_summary(outcome.report, output)))
+        elif outcome.status == "skipped":
+            messages.say(f"{output / outcome.capture}: already done, skipped")
+        else:  # printed even with --quiet
+            if outcome.trace:
+                print_lines(outcome.trace)
+            messages.error(outcome.report["error"])
         statuses[outcome.status] += 1
         codes.add(outcome.exit_code)
         if outcome.status in ("done", "skipped"):
@@ -220,19 +228,6 @@ def _show_all(
         text = ", ".join(f"{statuses[name]} {_WORDS.get(name, name)}" for name in get_args(Status) if statuses[name])
         messages.say(f"{statuses.total()} captures: {text}; see {output / INDEX}")
     return worst_exit_code(codes)
-
-
-def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: bool) -> None:
-    """Print what became of a capture. Failures are printed even with --quiet."""
-    if outcome.status == "done":
-        if with_summary:
-            print(printable(_summary(outcome.report, output)))
-    elif outcome.status == "skipped":
-        messages.say(f"{output / outcome.capture}: already done, skipped")
-    else:
-        if outcome.trace:
-            print_lines(outcome.trace)
-        messages.error(outcome.report["error"])
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:

@@ -33,17 +33,13 @@ def infer_batch(
     shard: Shard | None = None,
     cluster: ClusterOptions | None = None,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield its outcome.
-
-    The outcomes come in order, or on other processes as they end.
+    """Run `infer_capture` on each folder and yield its outcome, in order, or on other processes as they end.
 
     With several captures, or where OUT/index.html is there already, that page is written at the end.
 
     Args:
         folders: the captures. A folder that is given twice counts once.
-        options, observer: see infer_capture.
         redo: which captures that have results are computed again.
-        shard: the part of the captures that is computed; None for all.
         cluster: the processes or machines that compute; None for this process. A number of workers of 0 means as many
             as the machine's cores and memory allow.
 

@@ -232,15 +232,9 @@ def _scheduler_lost() -> SplinecliError:
 def distributor(
     do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers.
+    """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does, or OutputError.
 
-    Args:
-        do: see Work.
-        output: the output folder, by which workers show that they have the same storage. It is made as needed.
-
-    Raises:
-        UsageError: Dask is not installed, or there is no scheduler at the address.
-        OutputError: the folder cannot be made.
+    By the output folder, which is made as needed, workers show that they have the same storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:

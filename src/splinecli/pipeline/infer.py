@@ -50,9 +50,6 @@ def infer_capture(
     other process may write there.
 
     Args:
-        folder: the capture.
-        options: how to read it, which method to run, what to write.
-        observer: receives warnings and progress.
         estimator: what `make_method(options)` returned; it saves time in a batch.
 
     Raises:
@@ -127,9 +124,7 @@ def held_results(name: str, options: InferOptions, observer: Observer) -> Iterat
 def make_method(options: InferOptions) -> Estimator:
     """Return the estimator that the options ask for. Loading a network takes about a second.
 
-    Raises:
-        UsageError: the method uses no weights or gives no confidence, and the options ask for it.
-        ModelError: the weights cannot be used.
+    Raises UsageError if the method uses no weights or gives no confidence, and the options ask for it, or ModelError.
     """
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:

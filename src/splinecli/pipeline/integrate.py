@@ -35,11 +35,7 @@ INPUT_FORMATS = ("npy", "tiff", "png", "png8")  # of the normal map in a folder,
 
 @dataclass(frozen=True, kw_only=True)
 class IntegrateOptions:
-    """The options of `integrate`, as its help describes them. None stands for the default in the help.
-
-    Raises:
-        UsageError: a format is unknown, or a number is out of range.
-    """
+    """The options of `integrate`, as its help describes them; None is the default in the help. Raises UsageError."""
 
     normals: Path
     output: Path | None = None

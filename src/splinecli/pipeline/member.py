@@ -36,11 +36,9 @@ class Outcome:
     """Outcome of one capture.
 
     Args:
-        capture: its name.
         status: done, skipped (results are up to date), changed (results are out of date and were kept), missing
             (there is no such folder) or failed.
         report: the report of the results, or the document {capture, error, exit_code}.
-        exit_code: of this capture.
         trace: the Python traceback of an error that splinecli did not expect.
     """
 
@@ -56,11 +54,7 @@ def run_member(
 ) -> Outcome:
     """Compute one capture of a batch, unless its results are up to date or are to be kept.
 
-    Args:
-        member: the capture.
-        options, observer: see infer_capture.
-        redo: see infer_batch.
-        method: returns the estimator; it is called if the capture is computed.
+    `method` returns the estimator; it is called if the capture is computed.
 
     Raises:
         UsageError, ModelError: what `method` raises. It is wrong for every capture.
@@ -158,17 +152,13 @@ def find_earlier(
     if version != __version__:
         raise ChangedError(f"by version {version}", target)
     if earlier != options:
-        raise ChangedError(f"with {_differences(earlier, options)}", target)
+        names = [
+            "--" + option.name.replace("formats", "format").replace("_", "-")
+            for option in fields(options)
+            if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
+        ]
+        differences = f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"
+        raise ChangedError(f"with {differences}", target)
     if stamp != inputs_sha256(options.open(folder), options.weights):
         raise ChangedError("from other input files", target)
     return report
-
-
-def _differences(earlier: InferOptions, options: InferOptions) -> str:
-    """Return words for the options that differ, such as "another --method"."""
-    names = [
-        "--" + option.name.replace("formats", "format").replace("_", "-")
-        for option in fields(options)
-        if option.compare and getattr(earlier, option.name) != getattr(options, option.name)
-    ]
-    return f"another {names[0]}" if len(names) == 1 else f"other options ({', '.join(names)})"

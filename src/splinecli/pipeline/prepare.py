@@ -51,8 +51,6 @@ def prepare_pixel_set(
 
     Args:
         output: the folder of the set, new or an earlier set to add to.
-        captures: folders of captures with ground truth.
-        plan: the scenes to render.
         as_stored, white_level: see add_capture.
         update: read captures again that changed since they were added.
         cluster: the processes that render scenes; None for this process.

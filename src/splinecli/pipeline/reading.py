@@ -25,10 +25,7 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 class Reading:
     """Which files make a capture, and how they are read: options of `infer` and `info`, as their help describes them.
 
-    None stands for the default in the help. Near lamps: see LampOptions.
-
-    Raises:
-        UsageError: a value is unknown, or two options contradict each other.
+    None is the default in the help. Raises UsageError.
     """
 
     lights: str | None = None

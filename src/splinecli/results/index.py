@@ -75,12 +75,7 @@ class Entry(NamedTuple):
 
 
 def index_page(entries: Sequence[Entry], output: Path) -> str:
-    """Return the page that shows small normal maps and links the files. It belongs beside the captures' folders.
-
-    Args:
-        entries: one of each capture.
-        output: the folder that has the captures' folders.
-    """
+    """Return the page that shows small normal maps and links the files, for the folder of the captures' folders."""
     rows = []
     for row, files, words in entries:
         # As bytes, because a folder's name may not be valid text.
