@@ -1,4 +1,4 @@
-"""Plots: every method is drawn, curves leave out what was not computed, and anything may be a title."""
+"""Plots: curves leave out what was not computed, and anything may be a title."""
 
 from typing import Any
 

@@ -15,10 +15,10 @@ from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
 from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.capture_reading import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
 from splinecli.evaluation.statistics import AVERAGE
+from splinecli.evaluation.trial_capture import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.trials import Trial, TrialStore
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
@@ -139,19 +139,10 @@ def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
-    """Return the protocol with the number of lights and trials of its draws file, and the file's draws.
-
-    Raises:
-        UsageError: the protocol asks for another number of lights.
-        InputError: the file is wrong.
-    """
+    """Return the protocol with the numbers of lights and trials of its draws file, and its draws. Raises InputError."""
     if protocol.draws_file is None:
         return protocol, None
     draws_file = read_draws(protocol.draws_file)
-    if protocol.n_lights not in (None, draws_file.n_lights):
-        raise UsageError(
-            f"{protocol.n_lights} lights were requested, but the draws in {draws_file.path} have {draws_file.n_lights}"
-        )
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 

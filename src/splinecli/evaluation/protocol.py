@@ -21,7 +21,7 @@ class Protocol:
     """Settings of an evaluation. Two methods are comparable only under the same protocol.
 
     Args:
-        n_lights: in each draw. None means all lights of a capture, or the number in the draws file.
+        n_lights: in each draw. None means all lights of a capture. A draws file replaces it, and trials.
         trials: the number of random draws. Without light noise, all lights need one trial only.
         seed: of the draws, of the light noise and of the choice of pixels.
         draws_file: file that gives the draws instead; see read_draws.
@@ -55,11 +55,6 @@ class Protocol:
         check_draw_settings(self.n_lights, self.trials, self.seed)
         if not 0 <= self.light_noise_deg <= LARGEST_SIGMA_DEG:
             raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}")
-        if self.max_pixels is not None and self.max_pixels < 1:
-            raise UsageError(f"--max-pixels is {self.max_pixels}; expected at least 1")
-        for name, count in self.skip_first.items():
-            if count < 0:
-                raise UsageError(f"{count} images of {name} to skip, expected a number from 0")
 
     def skipped_lights(self, capture: str) -> int:
         """Return how many first lights of a capture are left out."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ from threading import Lock
 from typing import NamedTuple
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.capture_reading import CaptureReading, Notes
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import (
     CaptureJob,
@@ -24,7 +22,7 @@ from splinecli.evaluation.plan import (
     read_draws_file,
 )
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.trial_capture import SharedDraw
+from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw
 from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.methods import Estimator
 
@@ -61,7 +59,7 @@ def evaluate_all(
     elsewhere: Elsewhere | None = None,
     on_progress: OnProgress = lambda share, note: None,
 ) -> list[Evaluation]:
-    """Score every estimator on every capture under every protocol.
+    """Score every estimator on every capture under every protocol. There are some of each, with different names.
 
     A capture is called by its name (capture_name). Where two names are equal, the captures are called by the last
     parts of their paths. A folder that is given twice counts once. A capture that cannot be read, or has no ground
@@ -74,18 +72,12 @@ def evaluate_all(
         on_progress: see OnProgress. It is called by one thread at a time.
 
     Raises:
-        UsageError: there are no captures or estimators, two estimators have the same name, n_lights is not the number
-            of lights in the draws file, or skip_first names a capture that does not exist.
+        UsageError: skip_first names a capture that does not exist.
         InputError: the draws file is wrong, or no capture could be scored. The error of a single capture is raised
             as it is, also a UsageError.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
-    if not captures or not estimators:
-        raise UsageError("there is nothing to score: give at least one capture and one method")
-    for method, count in Counter(estimator.name for estimator in estimators).items():
-        if count > 1:
-            raise UsageError(f"method {method} comes twice", hint="Name each method once")
     tasks = [ProtocolTrials(*read_draws_file(protocol)) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())

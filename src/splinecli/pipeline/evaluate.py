@@ -17,13 +17,12 @@ from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_li
 from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
-from splinecli.evaluation.capture_reading import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.document import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import distinct_names
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
-from splinecli.evaluation.trial_capture import SharedDraw, TrialSource
+from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw, TrialSource, open_to_score
 from splinecli.evaluation.trials import TrialStore
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
 from splinecli.networks.weights import untrained_warning
@@ -99,8 +98,6 @@ class EvaluateOptions:
                 "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg",
                 hint="Leave these out",
             )
-        if self.jobs is not None and self.jobs < 1:
-            raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(
                 "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"

@@ -130,15 +130,16 @@ def _render_on_workers(
         LostError: the workers of a scene were lost. The other scenes are in the set.
         SplinecliError: what add_scene or Distributor.run raises.
     """
-    missing = [position for position in range(len(plan.names)) if not has_scene(writer, plan, position)]
-    # What is in the set counts as rendered. The plan is sent without what it has read from files.
-    rendered: dict[int, str | LostError | None] = dict.fromkeys(set(range(len(plan.names))) - set(missing))
-    render = partial(_render, replace(plan), writer.folder)
+    numbers = range(len(plan.names))
+    missing = [number for number in numbers if not has_scene(writer, plan, number)]
+    in_set = ((number, None) for number in numbers if number not in missing)
+    rendered: dict[int, str | LostError | None] = {}
+    render = partial(_render, replace(plan), writer.folder)  # the plan without what it has read from files
     position = 0
     try:
         with distributor(render, writer.folder, cluster, observer) as workers:
             ended = ((item.args[0], shape) for item, shape in workers.run(Item((n,), plan.names[n]) for n in missing))
-            for number, result in chain(rendered.copy().items(), ended):
+            for number, result in chain(in_set, ended):
                 rendered[number] = result
                 while position in rendered:
                     shape = rendered[position]
