@@ -30,7 +30,7 @@ from splinecli.cli.values import (
 from splinecli.errors import UsageError, printable
 from splinecli.methods import method_names
 from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
-from splinecli.results.index import HEADER, INDEX, Row, row_of
+from splinecli.results.index import HEADER, INDEX, Entry, Row
 
 if TYPE_CHECKING:
     from splinecli.pipeline.member import Outcome, Redo
@@ -212,7 +212,7 @@ def _show_all(
             if summaries:
                 print(printable(_summary(outcome.report, output)))
         elif outcome.status == "skipped":
-            messages.say(f"{output / outcome.capture}: already done, skipped")
+            messages.say(f"{output / outcome.report['capture']}: already done, skipped")
         else:  # printed even with --quiet
             if outcome.trace:
                 print_lines(outcome.trace)
@@ -220,7 +220,7 @@ def _show_all(
         statuses[outcome.status] += 1
         codes.add(outcome.exit_code)
         if outcome.status in ("done", "skipped"):
-            rows.append(row_of(outcome.report))
+            rows.append(Entry.of(outcome.report).row)
     if statuses.total() > 1:
         if rows:
             columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]

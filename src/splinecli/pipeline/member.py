@@ -42,7 +42,6 @@ class Outcome:
         trace: the Python traceback of an error that splinecli did not expect.
     """
 
-    capture: str
     status: Status
     report: dict[str, Any]
     exit_code: int = 0
@@ -69,7 +68,7 @@ def run_member(
             with held_results(member.name, options, observer) as target:
                 report = find_earlier(target, folder, options, observer.warn)
             if report is not None:
-                return Outcome(member.name, "skipped", report)
+                return Outcome("skipped", report)
     except ChangedError as error:
         if redo == "nothing":
             return failed(member.name, error, status="changed")
@@ -77,7 +76,7 @@ def run_member(
         return _failure(member, error)
     estimator = method()
     try:
-        return Outcome(member.name, "done", infer_capture(member.folder, options, observer, estimator=estimator))
+        return Outcome("done", infer_capture(member.folder, options, observer, estimator=estimator))
     except Exception as error:
         return _failure(member, error)
 
@@ -106,7 +105,7 @@ def _failure(member: Member, error: Exception) -> Outcome:
 def failed(name: str, error: SplinecliError, trace: str = "", *, status: Status = "failed") -> Outcome:
     """Return the outcome of a capture that has no results of this run."""
     document = {"capture": name, "error": str(error), "exit_code": error.exit_code}
-    return Outcome(name, status, document, error.exit_code, trace)
+    return Outcome(status, document, error.exit_code, trace)
 
 
 class ChangedError(OutputError):
