@@ -14,7 +14,7 @@ from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.light.lamp_light import LampLight, flat_depth, surface_points
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.info import InfoOptions, describe_capture
+from splinecli.pipeline.info import describe_capture
 from splinecli.surface.camera import pixel_rays
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
@@ -78,11 +78,11 @@ def test_results_are_a_part_of_those_of_the_whole(crop: str | None, scale: str |
 
 def test_info_counts_what_is_read() -> None:
     crop, scale = WINDOWS[2]
-    part = describe_capture(InfoOptions(capture=MEDALLION, reading=InferOptions(crop=crop, scale=scale)))
+    part = describe_capture(MEDALLION, InferOptions(crop=crop, scale=scale))
     expected = open_capture(MEDALLION, window=parse_window(crop, scale)).read().n_pixels
     assert part["n_pixels"] == expected
     assert part["reads"] == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
-    assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
+    assert describe_capture(MEDALLION)["reads"] is None
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,11 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -98,6 +99,21 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> C
         return Run(code, *capfd.readouterr())
 
     return call
+
+
+@pytest.fixture
+def refuse(run: Callable[..., Run], golden: Callable[[str, str], None]) -> Callable[..., None]:
+    """Run a command with arguments that it must refuse, (exit code, arguments), and compare all its messages."""
+
+    def check(command: str, cases: Iterable[tuple[int, list[object]]], name: str) -> None:
+        messages = []
+        for code, arguments in cases:
+            result = run(command, *arguments)
+            assert (result.code, result.out) == (code, ""), (arguments, result.err)
+            messages.append(re.sub("[0-9a-f]{16}", "<checksum>", result.err.replace(f"{Path.cwd()}/", "")))
+        golden(name, "".join(messages))
+
+    return check
 
 
 @pytest.fixture

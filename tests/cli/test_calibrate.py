@@ -152,7 +152,7 @@ def test_balls_that_disagree_and_an_uncertain_outline(run):
     assert "warning: one: the outline of the ball is uncertain (" in result.err
 
 
-def test_refusals(run, golden):
+def test_refusals(refuse):
     write_balls(Path("ball"))
     write_balls(Path("short"), LIGHTS[:3])
     write_balls(Path("flat"), wall=0.02)
@@ -165,8 +165,7 @@ def test_refusals(run, golden):
     Path("empty").mkdir()
     Path("done").mkdir()
     Path("done/calibration.png").touch()
-    messages = []
-    for code, arguments in (
+    cases = (
         (2, []),
         (2, ["ball", "--circle", "60,48"]),
         (2, ["ball", "--circle", "60,48,-3"]),
@@ -184,11 +183,8 @@ def test_refusals(run, golden):
         (3, ["ball", "--circle", "60,48,40", "--gray-card", "short"]),
         (3, ["ball", "--circle", "60,48,40", "--compare", "missing.txt"]),
         (5, ["ball", "-o", "done"]),
-    ):
-        result = run("calibrate", *arguments)
-        assert (result.code, result.out) == (code, ""), (arguments, result.err)
-        messages.append(result.err.replace(f"{Path.cwd()}/", ""))
-    golden("calibrate_refusals.txt", "".join(messages))
+    )
+    refuse("calibrate", cases, "calibrate_refusals.txt")
     assert not Path("calibration").exists()
 
 

@@ -11,7 +11,7 @@ import typer
 
 from cli.test_schema import check
 from splinecli.cli.app import app
-from splinecli.cli.panels import OTHERS, sort_into_panels
+from splinecli.cli.commands import OTHERS, sort_into_panels
 
 COMMANDS = typer.main.get_command(app).commands
 

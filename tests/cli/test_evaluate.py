@@ -85,9 +85,8 @@ def test_a_capture_without_ground_truth_is_skipped(dataset, run, golden):
     assert [entry["capture"] for entry in json.loads(result.out)["skipped"]] == ["matte"]
 
 
-def test_refusals(dataset, run, golden):
-    messages = []
-    for code, arguments in (
+def test_refusals(refuse, dataset):
+    cases = (
         (3, ["nowhere"]),
         (2, [dataset, "--n-lights", "few"]),
         (2, [dataset, "--n-lights", 2]),
@@ -108,11 +107,8 @@ def test_refusals(dataset, run, golden):
         (2, [dataset, "--method", "ls", "--pixel", "3", "--figures"]),
         (2, [dataset, "--jobs", 0]),
         (4, [dataset, "--method", "cnn-ps", "--weights", "spline-net", "--n-lights", 4]),
-    ):
-        result = run("evaluate", *arguments)
-        assert (result.code, result.out) == (code, ""), arguments
-        messages.append(result.err)
-    golden("evaluate_refusals.txt", "".join(messages))
+    )
+    refuse("evaluate", cases, "evaluate_refusals.txt")
     assert not Path("evaluation").exists()
 
 

@@ -76,17 +76,6 @@ def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
 
 
 @posix
-def test_a_pipe_in_place_of_the_lock_is_refused(capture, run):
-    Path("out/sphere").mkdir(parents=True)
-    os.mkfifo("out/sphere/.lock")
-    result = run("infer", capture, "--method", "ls")
-    assert (result.code, result.err) == (
-        5,
-        "splinecli: out/sphere/.lock: is not a file, so it cannot lock the folder. Remove it.\n",
-    )
-
-
-@posix
 def test_a_pipe_in_place_of_stored_scores_is_replaced(capture, run):
     Path("evaluation").mkdir()
     os.mkfifo("evaluation/trials.jsonl")

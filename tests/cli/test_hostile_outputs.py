@@ -191,10 +191,11 @@ def test_an_interrupt_at_the_very_end(inputs, run, monkeypatch):
 def test_something_else_in_place_of_a_lock_fails_its_capture_only(inputs, run):
     shutil.copytree("sphere", "second")
     Path("out/sphere").mkdir(parents=True)
-    for plant in (lambda path: path.symlink_to("/nowhere"), Path.mkdir):
+    for plant in (lambda path: path.symlink_to("/nowhere"), Path.mkdir, os.mkfifo):
         lock = Path("out/sphere/.lock")
         plant(lock)
         result = run("infer", "sphere", "second", "--method", "ls", "-o", "out", "--overwrite")
-        assert (result.code, "out/sphere/.lock: is not a file" in result.err) == (5, True)
+        message = "out/sphere/.lock: is not a file, so it cannot lock the folder. Remove it."
+        assert (result.code, message in result.err) == (5, True)
         assert Path("out/second/report.json").is_file() and Path("out/index.html").is_file()
         lock.rmdir() if lock.is_dir() else lock.unlink()

@@ -62,11 +62,10 @@ def test_imported_weights_run(run, make_capture):
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
 
-def test_refusals(run, golden):
+def test_refusals(refuse):
     Path("notes.txt").write_text("no weights\n")
     Path("there.safetensors").touch()
-    messages = []
-    for code, arguments in (
+    cases = (
         (4, ["9-D.ckpt", "9-G.ckpt", "-o", "new.safetensors"]),
         (4, ["9-G.ckpt", "notes.txt", "-o", "new.safetensors"]),
         (4, ["9-G.ckpt", "none.ckpt", "-o", "new.safetensors"]),
@@ -75,11 +74,8 @@ def test_refusals(run, golden):
         (5, ["9-G.ckpt", "9-D.ckpt", "-o", "notes.txt/new.safetensors"]),
         (2, ["9-G.ckpt", "9-D.ckpt"]),
         (2, ["9-G.ckpt", "-o", "new.safetensors"]),
-    ):
-        result = run("import-weights", *arguments)
-        assert (result.code, result.out) == (code, "")
-        messages.append(result.err)
-    golden("import_weights_refusals.txt", "".join(messages))
+    )
+    refuse("import-weights", cases, "import_weights_refusals.txt")
     assert not Path("new.safetensors").exists()
     assert Path("there.safetensors").read_bytes() == b""
 

@@ -315,7 +315,7 @@ def test_a_damaged_report_is_named(run, capture, where, key, value):
     assert "report.json" in result.err and "damaged" in result.err
 
 
-def test_refusals(run, golden):
+def test_refusals(refuse):
     np.save("flat.npy", np.ones(SHAPE))
     dot = np.zeros((*SHAPE, 3), np.float32)
     dot[3, 3, 2] = 1
@@ -328,8 +328,7 @@ def test_refusals(run, golden):
     Path("mirrored.txt").write_text("-200 0 24.5\n0 200 19.5\n0 0 1\n")
     Path("done").mkdir()
     Path("done/mesh.ply").touch()
-    messages = []
-    for code, arguments in (
+    cases = (
         (2, []),
         (2, ["normals.npy", "--format", "fbx"]),
         (2, ["normals.npy", "--stiffness", -1]),
@@ -345,11 +344,9 @@ def test_refusals(run, golden):
         (3, ["normals.npy", "--camera-matrix", "camera.txt"]),
         (3, ["normals.npy", "--camera-matrix", "mirrored.txt"]),
         (5, ["normals.npy", "-o", "done"]),
-    ):
-        result = run("integrate", *arguments, *(["-o", "out"] if "-o" not in arguments else []))
-        assert (result.code, result.out) == (code, ""), (arguments, result.err)
-        messages.append(result.err.replace(f"{Path.cwd()}/", ""))
-    golden("integrate_refusals.txt", "".join(messages))
+    )
+    cases = [(code, words if "-o" in words else [*words, "-o", "out"]) for code, words in cases]
+    refuse("integrate", cases, "integrate_refusals.txt")
     assert not Path("out").exists()
 
 

@@ -218,15 +218,14 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
     assert result.err.startswith("splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z")
 
 
-def test_refusals(run, make_capture, cycles_tree, golden):
+def test_refusals(refuse, make_capture, cycles_tree):
     blind = make_capture("blind")
     (blind / "normals_gt.npy").unlink()
     Path("cycles/PRPS/Turtle/images_metallic/00002.tif").unlink()
     Path("full").mkdir()
     Path("full/notes.txt").write_text("mine")
     Path("cube.txt").write_text("no mesh")
-    messages = []
-    for code, arguments in (
+    cases = (
         (2, ["-o", "set"]),
         (3, ["missing", "-o", "set"]),
         (3, [blind, "-o", "set"]),
@@ -234,9 +233,5 @@ def test_refusals(run, make_capture, cycles_tree, golden):
         (5, [make_capture("good"), "-o", "full"]),
         (3, ["--mesh", "missing.ply", "-o", "set3"]),
         (2, ["--scenes", -1, "-o", "set3"]),
-    ):
-        result = run("prepare", *arguments)
-        assert result.out == ""
-        messages.append(result.err)
-        assert result.code == code, result.err
-    golden("prepare_refusals.txt", "".join(messages))
+    )
+    refuse("prepare", cases, "prepare_refusals.txt")

@@ -6,7 +6,7 @@ import pytest
 from splinecli.capture import Capture
 from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
-from splinecli.evaluation.capture_reading import scored_rows
+from splinecli.evaluation.trial_capture import scored_rows
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
 MASK = np.random.default_rng(5).random((9, 7)) < 0.7

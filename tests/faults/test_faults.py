@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from kills import content
+from scenes import write_capture
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
@@ -22,7 +24,7 @@ from splinecli.system.publishing import held_folder
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="POSIX processes, limits and mounts")
 
 COMMAND = f"{sys.executable} -m splinecli"
-LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
+LIGHTS = unit(np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float))
 
 
 def shell(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -32,12 +34,9 @@ def shell(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A folder with a flat capture of 60 x 60 pixels and the results of an earlier run in `out`."""
-    (tmp_path / "a").mkdir()
-    lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
-    for number, light in enumerate(lights):
-        noise = np.random.default_rng(number).integers(0, 2000, (60, 60))
-        cv2.imwrite(str(tmp_path / "a" / f"{number}.png"), (50_000 * light[2] + noise).astype(np.uint16))
-    np.savetxt(tmp_path / "a" / "lights.txt", lights)
+    noise = np.random.default_rng(0).integers(0, 2000, (len(LIGHTS), 60, 60))
+    images = (50_000 * LIGHTS[:, 2, None, None] + noise).astype(np.uint16)
+    write_capture(tmp_path / "a", images, LIGHTS, names="{}.png")
     assert shell(f"{COMMAND} infer a --method ls -q", tmp_path).returncode == 0
     return tmp_path
 
@@ -58,7 +57,7 @@ def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
     infer = f"{COMMAND} infer a --method ls -o disk --overwrite --format npy -q"
     fill = f"{infer} && cp -r disk before && cat /dev/zero >disk/fill 2>/dev/null;"
     script = (
-        f"mkdir disk; {mount} || exit 77; cp a/lights.txt disk/kept; {fill if disk_kb == 64 else ''}"
+        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept; {fill if disk_kb == 64 else ''}"
         f" {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
     done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
@@ -80,7 +79,7 @@ def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of 1.2 megapixels, whose reading takes long enough to be interrupted."""
     folder = tmp_path_factory.mktemp("large")
-    lights = np.tile(LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True), (4, 1))
+    lights = np.tile(LIGHTS, (4, 1))
     noise = np.random.default_rng(0).integers(0, 20_000, (1000, 1200), np.uint16)
     cv2.imwrite(str(folder / "00.png"), noise)
     for number in range(1, len(lights)):

@@ -1,29 +1,12 @@
-"""Plots: every method is drawn, curves leave out what was not computed, and anything may be a title."""
+"""Plots: curves leave out what was not computed, and anything may be a title."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 
-from scenes import decode_rgb
-from splinecli.pictures.curves import Panel, Point, error_curves
 from splinecli.pictures.light_sky import sky_plot
-from splinecli.pictures.plotting import method_styles
 from splinecli.pictures.training_curves import training_figure
-
-POINTS = (Point(4, 6.0, 0.5), Point(10, 4.0, 0.2), Point(96, 3.0, 0.0))
-TICKS = {4: "4", 10: "10", 96: "96\n(all)"}
-
-
-@pytest.mark.parametrize("logarithmic", [False, True])
-def test_every_method_has_its_colour(logarithmic: bool) -> None:
-    higher = [point._replace(mae_deg=point.mae_deg + 2) for point in POINTS]
-    panel = Panel("ball", TICKS, {("ls", ""): POINTS, ("spline-net", ""): higher})
-    picture = decode_rgb(error_curves([panel], label="number of lights", logarithmic=logarithmic)).astype(int)
-    for style in method_styles(["ls", "spline-net"]).values():
-        rgb = [int(style.colour[i : i + 2], 16) for i in (1, 3, 5)]
-        assert (np.abs(picture - rgb).max(axis=2) <= 2).mean() > 0.001
-
 
 COLUMNS: dict[str, list[float | None]] = {
     "step": [50, 100, 125],

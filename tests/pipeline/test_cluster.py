@@ -10,13 +10,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 import worker_tasks
+from scenes import write_capture
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
+from splinecli.maths.normals import unit
 from splinecli.pipeline import batch, connection
 from splinecli.pipeline import distribution as distribution_module
 from splinecli.pipeline.batch import infer_batch
@@ -132,14 +133,10 @@ def test_gpu_workers_only(client, work):
 
 def write_captures(names: list[str]) -> list[str]:
     """Write small captures of different content into the working folder; `broken` has no images."""
-    lights = np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
-    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    lights = unit(np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float))
     for seed, name in enumerate(names):
-        Path(name).mkdir(parents=True)
-        np.savetxt(Path(name) / "lights.txt", lights)
-        for number in range(len(lights) if name != "broken" else 0):
-            image = np.random.default_rng([seed, number]).integers(20_000, 50_000, (12, 15), np.uint16)
-            cv2.imwrite(f"{name}/{number}.png", image)
+        images = np.random.default_rng(seed).integers(20_000, 50_000, (5, 12, 15), np.uint16)
+        write_capture(Path(name), images[: 0 if name == "broken" else 5], lights)
     return names
 
 
@@ -257,7 +254,7 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
     names = write_captures(["data/b", "data/damaged", "data/a", "data/without"])
     for name in names[:3]:
         np.save(f"{name}/normals_gt.npy", np.float32(np.broadcast_to([0, 0, 1], (12, 15, 3))))
-    Path("data/damaged/2.png").write_bytes(b"no picture")
+    Path("data/damaged/002.png").write_bytes(b"no picture")
     call = ["evaluate", "data", "--method", "ls", "--method", "iw12", "--n-lights", "3", "--n-lights", "all"]
 
     def results(output: str, *more: str) -> Any:

@@ -1,4 +1,4 @@
-"""Errors as one message and an exit code.
+"""Errors as one message and an exit code, and as JSON documents among those of a command.
 
 Typer and click name the errors of their parser, such as an unknown option or a word in place of a number, differently
 from version to version. Only attributes of these errors are relied on. One without a known attribute keeps its text.
@@ -6,7 +6,11 @@ from version to version. Only attributes of these errors are relied on. One with
 
 from __future__ import annotations
 
+import json
 import re
+import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import typer
@@ -47,6 +51,39 @@ def explain(error: Exception) -> tuple[str, int]:
     return "this is a defect of splinecli; please report it with the lines above.", SplinecliError.exit_code
 
 
+def error_document(error: Exception) -> dict[str, Any]:
+    """Return {"error", "exit_code"}, which stand in place of a report."""
+    message, exit_code = explain(error)
+    return {"error": message, "exit_code": exit_code}
+
+
+@contextmanager
+def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Yield a function that prints a document of `infer`, which has one for each capture, as soon as that ends.
+
+    Each is a line, or an item of one list. The last is that of an error that ends the command.
+    """
+    is_empty = True
+
+    def add(document: dict[str, Any]) -> None:
+        nonlocal is_empty
+        if as_lines:
+            print(json.dumps(document), flush=True)
+        elif as_list:
+            item = textwrap.indent(json.dumps(document, indent=2), "  ")
+            print("[\n" if is_empty else ",\n", item, sep="", end="", flush=True)
+        is_empty = False
+
+    try:
+        yield add
+    except Exception as error:
+        add({"capture": None, **error_document(error)})
+        raise
+    finally:
+        if as_list and not as_lines:
+            print("[]" if is_empty else "\n]")
+
+
 def is_defect(error: Exception) -> bool:
     """Return whether splinecli did not expect the error."""
     return not isinstance(error, SplinecliError | ParserError | OSError) and not is_out_of_memory(error)
@@ -56,7 +93,9 @@ def _usage_message(error: Any) -> str:
     """Return the message for a usage error of click: what was found, what was expected, and where help is."""
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
-    text = _bad_value(error) or _unknown_name(error) or _syntax(error.format_message())
+    text = _bad_value(error) or _unknown_name(error) or error.format_message()
+    for pattern, words in _SYNTAX:
+        text = re.sub(pattern, words, text)
     end = "" if text.endswith("?") else "."
     return f"{text.rstrip('.')}{end} See '{where} --help'."
 
@@ -99,12 +138,6 @@ def _unknown_name(error: Any) -> str | None:
     if command:
         return f"no command {command[1]}.{_suggestion((command[2] or '').strip('?').split(', '))}"
     return None
-
-
-def _syntax(text: str) -> str:
-    for pattern, words in _SYNTAX:
-        text = re.sub(pattern, words, text)
-    return text
 
 
 def _suggestion(names: list[str]) -> str:

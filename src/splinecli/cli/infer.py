@@ -13,7 +13,7 @@ from splinecli.capture.capture_warnings import PROBABLY_WRONG
 from splinecli.capture.formats.text import is_number
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
-from splinecli.cli.documents import printed_documents
+from splinecli.cli.failures import printed_documents
 from splinecli.cli.values import (
     Device,
     FirstLight,
@@ -30,7 +30,7 @@ from splinecli.cli.values import (
 from splinecli.errors import UsageError, printable
 from splinecli.methods import method_names
 from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
-from splinecli.results.index import HEADER, INDEX, Row, row_of
+from splinecli.results.index import HEADER, INDEX, Entry, Row
 
 if TYPE_CHECKING:
     from splinecli.pipeline.member import Outcome, Redo
@@ -208,11 +208,19 @@ def _show_all(
     rows: list[Row] = []
     for outcome in outcomes:
         document(outcome.report)
-        _show(outcome, output, messages, with_summary=summaries)
+        if outcome.status == "done":
+            if summaries:
+                print(printable(_summary(outcome.report, output)))
+        elif outcome.status == "skipped":
+            messages.say(f"{output / outcome.report['capture']}: already done, skipped")
+        else:  # printed even with --quiet
+            if outcome.trace:
+                print_lines(outcome.trace)
+            messages.error(outcome.report["error"])
         statuses[outcome.status] += 1
         codes.add(outcome.exit_code)
         if outcome.status in ("done", "skipped"):
-            rows.append(row_of(outcome.report))
+            rows.append(Entry.of(outcome.report).row)
     if statuses.total() > 1:
         if rows:
             columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
@@ -220,19 +228,6 @@ def _show_all(
         text = ", ".join(f"{statuses[name]} {_WORDS.get(name, name)}" for name in get_args(Status) if statuses[name])
         messages.say(f"{statuses.total()} captures: {text}; see {output / INDEX}")
     return worst_exit_code(codes)
-
-
-def _show(outcome: Outcome, output: Path, messages: Messages, *, with_summary: bool) -> None:
-    """Print what became of a capture. Failures are printed even with --quiet."""
-    if outcome.status == "done":
-        if with_summary:
-            print(printable(_summary(outcome.report, output)))
-    elif outcome.status == "skipped":
-        messages.say(f"{output / outcome.capture}: already done, skipped")
-    else:
-        if outcome.trace:
-            print_lines(outcome.trace)
-        messages.error(outcome.report["error"])
 
 
 def _summary(report: dict[str, Any], output: Path) -> str:

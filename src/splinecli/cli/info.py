@@ -55,12 +55,19 @@ def info(
     """
     given = locals()
 
-    from splinecli.pipeline.info import InfoOptions, describe_capture, summary_lines
+    from splinecli.pipeline.info import describe_capture, summary_lines
     from splinecli.pipeline.reading import Reading
 
-    options = record_from(InfoOptions, given, reading=record_from(Reading, given))
     messages = Messages(quiet=quiet)
-    report = describe_capture(options, messages)
+    report = describe_capture(
+        capture,
+        record_from(Reading, given),
+        messages,
+        plot=plot,
+        overwrite=overwrite,
+        check_lights=check_lights,
+        mended_lights=mended_lights,
+    )
     print_report(report, *summary_lines(report), as_json=as_json, quiet=quiet)
     wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
     if strict and wrong:

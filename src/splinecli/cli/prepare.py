@@ -49,22 +49,22 @@ def prepare(
     the extra packages of 'splinecli[render]'.
     """
     from splinecli.pipeline.batch import worst_exit_code
-    from splinecli.pipeline.prepare import PrepareOptions, prepare_pixel_set
+    from splinecli.pipeline.prepare import prepare_pixel_set
     from splinecli.pixel_sets.rendered import ScenePlan
     from splinecli.synthesis.scenes import SceneConfig
 
     config = SceneConfig()
     config = replace(config, size=size or config.size, lights=n_lights or config.lights)
-    options = PrepareOptions(
-        output=output,
-        captures=tuple(folder for source in sources or [] for folder in find_captures(source)),
-        scenes=ScenePlan(config, seed, scenes, tuple(mesh or ())),
+    summary = prepare_pixel_set(
+        output,
+        [folder for source in sources or [] for folder in find_captures(source)],
+        ScenePlan(config, seed, scenes, tuple(mesh or ())),
         as_stored=as_stored,
         white_level=white_level,
         update=update,
         cluster=parse_cluster(workers),
+        observer=Messages(quiet=quiet),
     )
-    summary = prepare_pixel_set(options, Messages(quiet=quiet))
     in_words = (
         f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes, {summary['n_pixels']} pixels,"
         f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"

@@ -14,7 +14,7 @@ from splinecli.errors import UsageError, printable
 from splinecli.evaluation.plan import first_trial
 from splinecli.evaluation.protocol import Protocol, heading
 from splinecli.evaluation.trial_capture import TrialSource
-from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 from splinecli.pictures.method_maps import method_maps
 from splinecli.pictures.observation_maps import observation_map_figure
@@ -51,7 +51,6 @@ def capture_figures(
     max_pixels.
 
     Args:
-        folder: the capture.
         name: name of the capture in the tables.
         stem: stem of the figures' file names.
         pixels: (row, column) of the pixels whose observation maps are shown; by default those at SHOWN_PERCENTILES.
@@ -69,25 +68,23 @@ def capture_figures(
     stored = source.read_stored(lights, lambda: advance(1 / len(lights) / steps))
     capture = TrialSource(stored).see(trial)
     assert capture.ground_truth is not None  # or there is no first trial
-    estimates = {
-        e.name: estimate_normals(capture, e, progress=lambda count: advance(count / capture.n_pixels / steps))
-        for e in estimators
-    }
-    title = f"{printable(name)}, {heading(protocol)}{_listed(trial.lights)}"
-    png = method_maps(
-        capture.ground_truth,
-        capture.mask,
-        {method: estimate.normal_map for method, estimate in estimates.items()},
-        {method: _errors(estimate) for method, estimate in estimates.items()},
-        title=title,
-    )
+    normals: dict[str, NDArray[np.float32]] = {}
+    errors_deg: dict[str, NDArray[np.float32]] = {}
+    for estimator in estimators:
+        estimate = estimate_normals(
+            capture, estimator, progress=lambda count: advance(count / capture.n_pixels / steps)
+        )
+        assert estimate.error_map_deg is not None
+        normals[estimator.name], errors_deg[estimator.name] = estimate.normal_map, estimate.error_map_deg
+    listed = f" ({', '.join(map(str, trial.lights))})" if len(trial.lights) <= MOST_LISTED else ""
+    title = f"{printable(name)}, {heading(protocol)}{listed}"
+    png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
     figures = [CaptureFigure(stem, f"{title}. Normal maps above error maps, ground truth at the left.", png)]
-    estimator = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
+    network = next((estimator for estimator in estimators if has_observation_maps(estimator.name)), None)
     # Under near lamps, each pixel has light directions of its own.
-    if estimator is not None and capture.lamps is None:
+    if network is not None and capture.lamps is None:
         whole = stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
-        chosen = _chosen_pixels(capture, estimates[estimator.name], pixels)
-        png = _observation_maps(whole, capture, estimator, estimates[estimator.name], chosen, title=title)
+        png = _observation_maps(whole, capture, network, errors_deg[network.name], pixels, title=title)
         caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
         figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
@@ -111,39 +108,31 @@ def file_stems(names: Sequence[str]) -> list[str]:
     return stems
 
 
-def _errors(estimate: NormalEstimate) -> NDArray[np.float32]:
-    assert estimate.error_map_deg is not None
-    return estimate.error_map_deg
-
-
-def _chosen_pixels(capture: Capture, estimate: NormalEstimate, pixels: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
-    """Return the (row, column) of the pixels to show, (N, 2). Raises UsageError for one without ground truth."""
-    errors = _errors(estimate)
-    chosen = np.array(pixels or _typical_pixels(errors))
-    for row, column in chosen:
-        inside = 0 <= row < errors.shape[0] and 0 <= column < errors.shape[1]
-        if not inside or np.isnan(errors[row, column]):
-            raise UsageError(
-                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
-                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
-            )
-    return chosen
-
-
 def _observation_maps(
     whole: Capture,
     capture: Capture,
     estimator: Estimator,
-    estimate: NormalEstimate,
-    pixels: NDArray[np.intp],
+    errors_deg: NDArray[np.float32],
+    pixels: Sequence[tuple[int, int]],
     *,
     title: str,
 ) -> bytes:
+    """Return the figure of some pixels. Raises UsageError for one without ground truth."""
     from splinecli.methods.networks import NetworkEstimator
 
     assert isinstance(estimator, NetworkEstimator)
-    errors = _errors(estimate)
-    rows, columns = pixels[:, 0], pixels[:, 1]
+    for row, column in pixels:
+        inside = 0 <= row < errors_deg.shape[0] and 0 <= column < errors_deg.shape[1]
+        if not inside or np.isnan(errors_deg[row, column]):
+            raise UsageError(
+                f"the pixel in row {row}, column {column} of {capture.name} has no ground truth",
+                hint="Name pixels on the object, rows from the top and columns from the left, from 0",
+            )
+    rows, columns = np.array(pixels).T if pixels else np.nonzero(np.isfinite(errors_deg))
+    if not pixels:
+        order = np.argsort(errors_deg[rows, columns], kind="stable")
+        chosen = [order[round(percentile / 100 * (len(order) - 1))] for percentile in SHOWN_PERCENTILES]
+        rows, columns = rows[chosen], columns[chosen]
     place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
     sparse, dense, truth = estimator.maps(
         capture.observations[place],
@@ -155,19 +144,8 @@ def _observation_maps(
         sparse,
         dense,
         truth if whole.n_lights > capture.n_lights else None,
-        pixels=pixels,
-        error_deg=errors[rows, columns],
+        pixels=np.stack([rows, columns], axis=1),
+        error_deg=errors_deg[rows, columns],
         title=title,
         grid=estimator.network.config.grid,
     )
-
-
-def _typical_pixels(errors_deg: NDArray[np.float32]) -> list[tuple[int, int]]:
-    rows, columns = np.nonzero(np.isfinite(errors_deg))
-    order = np.argsort(errors_deg[rows, columns], kind="stable")
-    ranks = [order[round(percentile / 100 * (len(order) - 1))] for percentile in SHOWN_PERCENTILES]
-    return [(int(rows[rank]), int(columns[rank])) for rank in ranks]
-
-
-def _listed(lights: Sequence[int]) -> str:
-    return f" ({', '.join(map(str, lights))})" if len(lights) <= MOST_LISTED else ""

@@ -1,4 +1,4 @@
-"""Evaluations as data: results.json and results.csv.
+"""The files that an evaluation writes, and its data for results.json and results.csv.
 
 All functions take one evaluation, or several of the same methods that differ in n_lights, light_noise_deg or both.
 """
@@ -7,50 +7,102 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from splinecli import __version__
 from splinecli.errors import printable
-from splinecli.evaluation.outcome import Evaluation, all_notes, all_skipped
+from splinecli.evaluation.capture_figures import CaptureFigure
+from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
+from splinecli.evaluation.outcome import Evaluation, all_skipped
 from splinecli.evaluation.protocol import Protocol, lights_value
+from splinecli.evaluation.report import html_report
 from splinecli.evaluation.statistics import compare
+from splinecli.evaluation.tables import latex, markdown
+from splinecli.system.publishing import new_files
 
 SCHEMA = 1
 """Schema version of results.json. It rises when a field changes its meaning."""
 
-_DEGREE_DIGITS, _SECOND_DIGITS = 4, 4
+_DIGITS = 4  # behind the point, of degrees and seconds
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
+
+
+TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
+LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
+
+Plots = Mapping[str, tuple[str, bytes]]
+"""A caption and a PNG by the name of the file."""
+
+
+def make_plots(evaluations: Sequence[Evaluation]) -> Plots:
+    """Return the plots of the error against what the evaluations differ in; none where nothing differs."""
+    plots: dict[str, tuple[str, bytes]] = {}
+    if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
+        return plots
+    if len({evaluation.protocol.n_lights for evaluation in evaluations}) > 1:
+        plots[LIGHTS_PLOT] = ("Error against the number of lights.", lights_curves(evaluations))
+    if len({evaluation.protocol.light_noise_deg for evaluation in evaluations}) > 1:
+        plots[LIGHT_NOISE_PLOT] = ("Error against the light noise.", light_noise_curves(evaluations))
+    return plots
+
+
+def write_results(
+    output: Path, evaluations: Sequence[Evaluation], plots: Plots, figures: Sequence[CaptureFigure] | None
+) -> dict[str, Any]:
+    """Write all files in place of those of an earlier evaluation (see new_files). The caller holds the folder.
+
+    Without `figures`, those of an earlier evaluation stay. Returns the content of results.json.
+    """
+    document = results_document(evaluations)
+    shown = [*plots.values(), *((figure.caption, figure.png) for figure in figures or ())]
+    texts = {
+        "results.csv": results_csv(evaluations),
+        "table.md": markdown(evaluations),
+        "table.tex": latex(evaluations),
+        REPORT: html_report(evaluations, shown, document["notes"]),
+        RESULTS: json.dumps(document, indent=2) + "\n",
+    }
+    stale = [LIGHTS_PLOT, LIGHT_NOISE_PLOT]
+    if figures is not None:
+        stale += [f"{FIGURES}/{path.name}" for path in (output / FIGURES).glob("*.png")]
+    with new_files(output, report=RESULTS, stale=stale) as new:
+        for name, text in texts.items():
+            new.write(name, text)
+        for name, (_, png) in plots.items():
+            new.write(name, png)
+        for figure in figures or ():
+            new.write(f"{FIGURES}/{figure.stem}.png", figure.png)
+    return document
 
 
 def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Return the content of results.json. Degrees and seconds have four decimals.
 
     With several evaluations, `protocol` lists the values in which they differ, and `averages` has an entry for each
-    evaluation under each method, by the same values: {"ls": {"10": 16.1, "all": 15.4}}.
+    evaluation under each method, by the same values: {"ls": {"10": 16.1, "all": 15.4}}. p-values have three
+    significant digits.
     """
     return {
         "schema": SCHEMA,
         "protocol": _protocol_record([evaluation.protocol for evaluation in evaluations]),
         "methods": {name: dict(settings) for name, settings in evaluations[0].settings.items()},
         "results": [
-            {**record, "maes_deg": [round(mae_deg, _DEGREE_DIGITS) for mae_deg in result.maes_deg]}
+            {**record, "maes_deg": [_rounded(mae_deg) for mae_deg in result.maes_deg]}
             for record, result in zip(_records(evaluations), (r for e in evaluations for r in e.results), strict=True)
         ],
         "averages": _averages(evaluations),
-        "comparisons": comparison_records(evaluations),
+        "comparisons": [record for evaluation in evaluations for record in _comparisons(evaluation)],
         "skipped": [{"capture": s.capture, "reason": s.reason} for s in all_skipped(evaluations)],
-        "notes": all_notes(evaluations),
+        "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)),
         "version": __version__,
     }
 
 
-def comparison_records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
-    """Return `comparisons` of results.json: statistics.compare of each evaluation.
-
-    p-values have three significant digits. n_lights is a number or "all", as in the protocol.
-    """
+def _comparisons(evaluation: Evaluation) -> list[dict[str, Any]]:
     return [
         {
             "first": c.first,
@@ -59,16 +111,13 @@ def comparison_records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]
             "n_lights": lights_value(evaluation.protocol),
             "light_noise_deg": evaluation.protocol.light_noise_deg,
             "trials": c.trials,
-            "difference_deg": round(c.difference_deg, _DEGREE_DIGITS),
-            "std_deg": round(c.std_deg, _DEGREE_DIGITS),
-            "interval_deg": None
-            if c.interval_deg is None
-            else [round(end_deg, _DEGREE_DIGITS) for end_deg in c.interval_deg],
+            "difference_deg": _rounded(c.difference_deg),
+            "std_deg": _rounded(c.std_deg),
+            "interval_deg": None if c.interval_deg is None else [_rounded(end_deg) for end_deg in c.interval_deg],
             "p_value": _significant(c.p_value),
             "p_holm": _significant(c.p_holm),
             "differs": c.differs,
         }
-        for evaluation in evaluations
         for c in compare(evaluation)
     ]
 
@@ -115,14 +164,12 @@ def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
             "capture": result.capture,
             "n_lights": result.n_lights,
             "light_noise_deg": evaluation.protocol.light_noise_deg,
-            "mae_deg": round(result.mae_deg, _DEGREE_DIGITS),
-            "std_deg": round(result.std_deg, _DEGREE_DIGITS),
+            "mae_deg": _rounded(result.mae_deg),
+            "std_deg": _rounded(result.std_deg),
             "trials": result.trials,
-            "seconds": round(result.seconds, _SECOND_DIGITS),
+            "seconds": _rounded(result.seconds),
             "as_stored": evaluation.protocol.as_stored,
-            "found_light_error_deg": None
-            if result.found_light_error_deg is None
-            else round(result.found_light_error_deg, _DEGREE_DIGITS),
+            "found_light_error_deg": _rounded(result.found_light_error_deg),
         }
         for evaluation in evaluations
         for result in evaluation.results
@@ -130,23 +177,20 @@ def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
 
 
 def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    averages = [
-        {method: round(value, _DEGREE_DIGITS) for method, value in evaluation.averages.items()}
-        for evaluation in evaluations
-    ]
+    averages = [{method: _rounded(value) for method, value in e.averages.items()} for e in evaluations]
     if len(evaluations) == 1:
         return dict(averages[0])
-    keys = _keys([evaluation.protocol for evaluation in evaluations])
+    # The values in which the evaluations differ: "10", "all"; "0", "2.5"; or both, "10, 2.5".
+    lights = [str(lights_value(e.protocol)) for e in evaluations]
+    noise = [f"{e.protocol.light_noise_deg:g}" for e in evaluations]
+    differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]
+    keys = [", ".join(values) for values in zip(*differing, strict=True)]
     methods = dict.fromkeys(method for average in averages for method in average)
     return {method: {key: average[method] for key, average in zip(keys, averages, strict=True)} for method in methods}
 
 
-def _keys(protocols: Sequence[Protocol]) -> list[str]:
-    """Return the values in which protocols differ as text: "10", "all"; "0", "2.5"; or both, "10, 2.5"."""
-    lights = [str(lights_value(protocol)) for protocol in protocols]
-    noise = [f"{protocol.light_noise_deg:g}" for protocol in protocols]
-    differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]
-    return [", ".join(values) for values in zip(*differing, strict=True)]
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, _DIGITS)
 
 
 def _significant(p_value: float | None) -> float | None:

@@ -17,7 +17,6 @@ class Result:
     """The errors of one method on one capture.
 
     Args:
-        method: name of the method.
         capture: name of the capture in the tables.
         n_lights: number of lights in each draw.
         maes_deg: mean angular error (MAE) over the scored pixels, in degrees, of each trial.
@@ -101,8 +100,3 @@ def all_captures(evaluations: Sequence[Evaluation]) -> list[str]:
 def all_skipped(evaluations: Sequence[Evaluation]) -> list[Skipped]:
     """Return the captures that any of the evaluations skipped; the same reason comes once."""
     return list(dict.fromkeys(skipped for e in evaluations for skipped in e.skipped))
-
-
-def all_notes(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Return the notes of all evaluations, each once."""
-    return list(dict.fromkeys(note for e in evaluations for note in e.notes))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from splinecli import __version__
 from splinecli.capture import CaptureSource, capture_name
@@ -14,16 +15,13 @@ from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
 from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.capture_reading import CaptureReading, open_to_score
 from splinecli.evaluation.outcome import Evaluation, Result, Skipped
 from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
 from splinecli.evaluation.statistics import AVERAGE
+from splinecli.evaluation.trial_capture import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.trials import Trial, TrialStore
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
-
-Unit = tuple[Trial, Estimator]
-"""A trial and the method that it scores."""
 
 
 @dataclass
@@ -41,7 +39,9 @@ class ProtocolTrials:
         self.failures.setdefault(capture, error)
         self.trials = {key: trials for key, trials in self.trials.items() if key[0] != capture}
 
-    def evaluation(self, captures: Sequence[str], store: TrialStore) -> Evaluation:
+    def evaluation(
+        self, captures: Sequence[str], store: TrialStore, settings: Mapping[str, Mapping[str, Any]]
+    ) -> Evaluation:
         """Return the outcome, in the order of the captures. Raises an error where all captures failed."""
         results, n_estimated = [], {}
         for (capture, method), trials in self.trials.items():
@@ -66,79 +66,69 @@ class ProtocolTrials:
             for name, error_deg in {r.capture: r.found_light_error_deg for r in results}.items()
             if error_deg is not None
         ]
-        return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes))
+        return Evaluation(self.protocol, tuple(results), tuple(skipped), tuple(notes), settings)
 
 
 @dataclass
 class CaptureJob:
-    """One capture with its trials under all protocols.
+    """A capture, opened, with the protocols that can score it, and the missing trials of each draw."""
 
-    Args:
-        folder: the capture's folder as it was given.
-        name: name of the capture in the tables.
-        source: the opened capture.
-        tasks: the protocols that can score it.
-        draws: for each draw, the trial and the method of each method that sees it.
-    """
-
-    folder: Path
-    name: str
     source: CaptureSource
+    reading: CaptureReading
     tasks: list[ProtocolTrials]
-    draws: list[list[Unit]]
-
-    @classmethod
-    def plan(
-        cls, folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[ProtocolTrials]
-    ) -> CaptureJob | None:
-        """Return the job of a capture. Returns None if no protocol can score it; the tasks then contain the reasons."""
-        try:
-            source = open_to_score(folder, tasks[0].protocol)
-        except (InputError, UsageError) as error:
-            for task in tasks:
-                task.fail(name, error)
-            return None
-        made_of = [digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators]
-        job = cls(folder, name, source, [], [])
-        for task in tasks:
-            try:
-                draws = draws_for(source, name, task.protocol, task.draws_file)
-            except (InputError, UsageError) as error:
-                task.fail(name, error)
-                continue
-            job.tasks.append(task)
-            # All methods of a draw come together: they share its capture, and the remaining time can be estimated.
-            for number, draw in enumerate(draws):
-                job.draws.append([])
-                for estimator, made in zip(estimators, made_of, strict=True):
-                    trial = Trial(name, estimator.name, number, draw, task.protocol, made)
-                    task.trials.setdefault((name, estimator.name), []).append(trial)
-                    job.draws[-1].append((trial, estimator))
-        return job if job.tasks else None
-
-    def missing(self, store: TrialStore) -> list[list[Unit]]:
-        """Return the draws with the trials that the store does not have; draws without any are left out."""
-        draws = [[unit for unit in draw if store.find(unit[0]) is None] for draw in self.draws]
-        return [draw for draw in draws if draw]
-
-    def reading(self, draws: Sequence[Sequence[Unit]]) -> CaptureReading:
-        """Return what these draws need of the capture; without any, what the notes on it need: mask and truth."""
-        draws = draws or self.draws[:1]
-        protocols = tuple(task.protocol for task in self.tasks)
-        refines = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
-        whole = refines or any(refiner_of(estimator) is not None for draw in draws for _, estimator in draw)
-        lights = sorted(set().union(*(trial.lights for draw in draws for trial, _ in draw)))
-        return CaptureReading(self.folder, self.name, protocols, tuple(lights), whole)
-
-    def note(self, notes: Sequence[tuple[str, ...]]) -> None:
-        """Record the notes on the capture, by protocol."""
-        for task, of_protocol in zip(self.tasks, notes, strict=True):
-            task.notes[self.name] = of_protocol
+    draws: list[list[Trial]]
 
     def fail(self, error: SplinecliError) -> None:
         """Record why the capture cannot be scored."""
         for task in self.tasks:
-            task.fail(self.name, error)
+            task.fail(self.reading.name, error)
+
+    def note(self, notes: Notes) -> None:
+        """Record the notes on the capture."""
+        for task, of_protocol in zip(self.tasks, notes, strict=True):
+            task.notes[self.reading.name] = of_protocol
+
+
+def plan_capture(
+    folder: Path, name: str, estimators: Sequence[Estimator], tasks: Sequence[ProtocolTrials], store: TrialStore
+) -> CaptureJob | None:
+    """Add the trials of a capture to the tasks, and return those that the store does not have as a job.
+
+    Where no protocol can score the capture, this is None; the tasks then have the reasons.
+    """
+    try:
+        source = open_to_score(folder, tasks[0].protocol)
+    except (InputError, UsageError) as error:
+        for task in tasks:
+            task.fail(name, error)
+        return None
+    made_of = [digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators]
+    able: list[ProtocolTrials] = []
+    # All methods of a draw come together: they share its capture, and the remaining time can be estimated.
+    draws: list[list[Trial]] = []
+    for task in tasks:
+        try:
+            lights = draws_for(source, name, task.protocol, task.draws_file)
+        except (InputError, UsageError) as error:
+            task.fail(name, error)
+            continue
+        able.append(task)
+        for number, draw in enumerate(lights):
+            draws.append([])
+            for estimator, made in zip(estimators, made_of, strict=True):
+                trial = Trial(name, estimator.name, number, draw, task.protocol, made)
+                task.trials.setdefault((name, estimator.name), []).append(trial)
+                draws[-1].append(trial)
+    if not able:
+        return None
+    missing = [left for draw in draws if (left := [trial for trial in draw if store.find(trial) is None])]
+    needed = missing or draws[:1]  # the notes on the capture need its mask and its ground truth
+    protocols = tuple(task.protocol for task in able)
+    methods = {trial.method for draw in needed for trial in draw}
+    whole = any(protocol.light_error_deg is not None or protocol.finds_lights for protocol in protocols)
+    whole = whole or any(refiner_of(estimator) is not None for estimator in estimators if estimator.name in methods)
+    seen = sorted({light for draw in needed for light in draw[0].lights})
+    return CaptureJob(source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing)
 
 
 def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
@@ -149,19 +139,10 @@ def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
-    """Return the protocol with the number of lights and trials of its draws file, and the file's draws.
-
-    Raises:
-        UsageError: the protocol asks for another number of lights.
-        InputError: the file is wrong.
-    """
+    """Return the protocol with the numbers of lights and trials of its draws file, and its draws. Raises InputError."""
     if protocol.draws_file is None:
         return protocol, None
     draws_file = read_draws(protocol.draws_file)
-    if protocol.n_lights not in (None, draws_file.n_lights):
-        raise UsageError(
-            f"{protocol.n_lights} lights were requested, but the draws in {draws_file.path} have {draws_file.n_lights}"
-        )
     return replace(protocol, n_lights=draws_file.n_lights, trials=len(draws_file.draws)), draws_file
 
 

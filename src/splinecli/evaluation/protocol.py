@@ -12,7 +12,6 @@ from splinecli.errors import UsageError
 EVERY_CAPTURE = "*"
 """Key of `skip_first` for all captures that have no key of their own."""
 
-
 LARGEST_SIGMA_DEG = 30.0
 """Largest standard deviation of the light noise that an evaluation accepts."""
 
@@ -22,18 +21,16 @@ class Protocol:
     """Settings of an evaluation. Two methods are comparable only under the same protocol.
 
     Args:
-        n_lights: K, the lights in each draw. None means all lights of a capture, or the number in the draws file.
-        trials: T, the number of random draws. Without light noise, all lights need one trial only.
-        seed: seed of the draws, of the light noise and of the choice of pixels.
+        n_lights: in each draw. None means all lights of a capture. A draws file replaces it, and trials.
+        trials: the number of random draws. Without light noise, all lights need one trial only.
+        seed: of the draws, of the light noise and of the choice of pixels.
         draws_file: file that gives the draws instead; see read_draws.
         light_noise_deg: standard deviation of the angle by which each trial tilts the light directions.
         max_pixels: number of pixels to score in each capture, chosen at random. None scores all pixels that have
             ground truth.
-        skip_first: number of first images to leave out, by the name of the capture; EVERY_CAPTURE for all others. The
-            first 20 images of DiLiGenT's Bear are damaged.
+        skip_first: number of first images to leave out, by the name of the capture; EVERY_CAPTURE for all others.
         as_stored: score the stored values alone, as the published tables do. By default, saturated observations are
             restored and unknown light intensities are estimated, as `infer` does.
-        white_level: stored value from which an observation is saturated; None to find it, see open_capture.
         light_error_deg: usual error of light directions, with which each trial refines its directions (see
             refine_capture). None refines none.
         finds_lights: whether each trial finds its lights from its images, as `infer --lights estimate` does.
@@ -58,11 +55,6 @@ class Protocol:
         check_draw_settings(self.n_lights, self.trials, self.seed)
         if not 0 <= self.light_noise_deg <= LARGEST_SIGMA_DEG:
             raise UsageError(f"light noise of {self.light_noise_deg:g} degrees, expected 0 to {LARGEST_SIGMA_DEG:g}")
-        if self.max_pixels is not None and self.max_pixels < 1:
-            raise UsageError(f"--max-pixels is {self.max_pixels}; expected at least 1")
-        for name, count in self.skip_first.items():
-            if count < 0:
-                raise UsageError(f"{count} images of {name} to skip, expected a number from 0")
 
     def skipped_lights(self, capture: str) -> int:
         """Return how many first lights of a capture are left out."""

@@ -115,13 +115,10 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
 
 def _summary(evaluations: Sequence[Evaluation]) -> Table:
     """Return a table of methods by evaluations: the last column of each evaluation's table."""
-    columns = [[row[-1] for row in _error_table(evaluation)] for evaluation in evaluations]
-    columns = [
-        [Cell(heading(evaluation.protocol)), *column[1:]]
-        for evaluation, column in zip(evaluations, columns, strict=True)
-    ]
-    methods = [Cell(name) for name in ("method", *evaluations[0].methods)]
-    return [list(row) for row in zip(methods, *columns, strict=True)]
+    columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
+    for evaluation in evaluations:
+        columns.append([Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])])
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _error_table(evaluation: Evaluation) -> Table:
@@ -134,7 +131,7 @@ def _error_table(evaluation: Evaluation) -> Table:
         trials = [maes_deg[method, capture] for capture in evaluation.captures]
         trials.append(trial_averages(evaluation, method))
         cells = [
-            Cell(value, _plus_minus(maes), "best" if (r, c) in best else "")
+            Cell(value, f"± {np.std(maes):.2f}" if len(maes) > 1 else "", "best" if (r, c) in best else "")
             for c, (value, maes) in enumerate(zip(values, trials, strict=True), start=1)
         ]
         body.append([Cell(method), *cells])
@@ -191,10 +188,6 @@ def _figure(caption: str, png: bytes) -> dict[str, Any]:
 
 def _signed(value_deg: float) -> str:
     return f"{value_deg:+.2f}".replace("-", _MINUS)
-
-
-def _plus_minus(maes_deg: Sequence[float]) -> str:
-    return f"± {np.std(maes_deg):.2f}" if len(maes_deg) > 1 else ""
 
 
 def _count(number: int, noun: str) -> str:

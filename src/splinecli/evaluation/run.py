@@ -3,28 +3,45 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
+from typing import NamedTuple
 
-from splinecli.errors import InputError, UsageError
-from splinecli.evaluation.draws_elsewhere import DrawScores, DrawTask
+from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.plan import CaptureJob, ProtocolTrials, check_skip_first, distinct_names, read_draws_file
+from splinecli.evaluation.plan import (
+    CaptureJob,
+    ProtocolTrials,
+    check_skip_first,
+    distinct_names,
+    plan_capture,
+    read_draws_file,
+)
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.trial_capture import SharedDraw
-from splinecli.evaluation.trials import Trial, TrialStore
+from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw
+from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.methods import Estimator
 
-Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, DrawScores]]]
+
+class DrawTask(NamedTuple):
+    """One draw of a capture: what is read for all its draws, and the trials of this one; none for the notes alone."""
+
+    reading: CaptureReading
+    trials: Sequence[Trial]
+
+
+Scored = tuple[Sequence[Score], Notes] | SplinecliError
+"""The score of each trial of a draw and the notes on its capture, or why the capture cannot be scored."""
+
+Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
 """Scores draws in other processes, and yields each with its scores as it ends."""
 
-OnProgress = Callable[[float, int, str], object]
-"""Called with the trials done, the total, and a short text. A running trial counts by the share of its pixels."""
+OnProgress = Callable[[float, str], object]
+"""Called with the share of all trials that was just done, and a short text. A trial counts by its pixels."""
 
 
 def evaluate(captures: Sequence[Path], estimators: Sequence[Estimator], protocol: Protocol) -> Evaluation:
@@ -40,160 +57,130 @@ def evaluate_all(
     store: TrialStore | None = None,
     jobs: int = 1,
     elsewhere: Elsewhere | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = lambda share, note: None,
 ) -> list[Evaluation]:
-    """Score every estimator on every capture under every protocol.
+    """Score every estimator on every capture under every protocol. There are some of each, with different names.
 
     A capture is called by its name (capture_name). Where two names are equal, the captures are called by the last
     parts of their paths. A folder that is given twice counts once. A capture that cannot be read, or has no ground
     truth or too few lights, is skipped, and the outcome says why.
 
     Args:
-        captures: folders.
-        estimators: methods with different names.
-        protocols: at least one.
         store: where finished trials are stored; those that it has are not computed again.
         jobs: number of trials at a time, each on its share of the cores.
         elsewhere: scores the draws in other processes, in place of `jobs`.
         on_progress: see OnProgress. It is called by one thread at a time.
 
     Raises:
-        UsageError: there are no captures or estimators, two estimators have the same name, n_lights is not the number
-            of lights in the draws file, or skip_first names a capture that does not exist.
+        UsageError: skip_first names a capture that does not exist.
         InputError: the draws file is wrong, or no capture could be scored. The error of a single capture is raised
             as it is, also a UsageError.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
-    if not captures or not estimators:
-        raise UsageError("there is nothing to score: give at least one capture and one method")
-    for method, count in Counter(estimator.name for estimator in estimators).items():
-        if count > 1:
-            raise UsageError(f"method {method} comes twice", hint="Name each method once")
     tasks = [ProtocolTrials(*read_draws_file(protocol)) for protocol in protocols]
     names_by_folder = distinct_names(captures)
     names = list(names_by_folder.values())
     for protocol in protocols:
         check_skip_first(protocol, names)
     store = TrialStore() if store is None else store
-    planned = [CaptureJob.plan(folder, name, estimators, tasks) for folder, name in names_by_folder.items()]
-    run = _Run([job for job in planned if job is not None], store, on_progress)
+    planned = [plan_capture(folder, name, estimators, tasks, store) for folder, name in names_by_folder.items()]
+    captures_to_score = [job for job in planned if job is not None]
+    progress = _Progress(sum(len(draw) for job in captures_to_score for draw in job.draws), on_progress)
     if elsewhere is None:
-        run.run(jobs)
-    else:
-        run.run_elsewhere(elsewhere)
-    names_of_settings = ("weights", "device", "precision", "fingerprint")
-    settings = {e.name: {name: getattr(e, name) for name in names_of_settings} for e in estimators}
-    return [replace(task.evaluation(names, store), settings=settings) for task in tasks]
-
-
-class _Run:
-    """Scores the trials that the store does not have."""
-
-    def __init__(
-        self, jobs_by_capture: Sequence[CaptureJob], store: TrialStore, on_progress: OnProgress | None
-    ) -> None:
-        self._captures = [(job, job.missing(store)) for job in jobs_by_capture]
-        self._store = store
-        total = sum(len(draw) for _, draws in self._captures for draw in draws)
-        self._progress = _Progress(total, on_progress)
-
-    def run(self, jobs: int) -> None:
-        """Score `jobs` trials at a time. Raises what a trial raises."""
         with _share_cores(jobs), ThreadPoolExecutor(jobs) as workers:
             try:
-                self._submit_all(workers, jobs)
+                _score_here(captures_to_score, {e.name: e for e in estimators}, store, progress, workers, jobs)
             except BaseException:
                 workers.shutdown(cancel_futures=True)
                 raise
+    else:
+        _score_elsewhere(captures_to_score, elsewhere, store, progress)
+    names_of_settings = ("weights", "device", "precision", "fingerprint")
+    settings = {e.name: {name: getattr(e, name) for name in names_of_settings} for e in estimators}
+    return [task.evaluation(names, store, settings) for task in tasks]
 
-    def run_elsewhere(self, elsewhere: Elsewhere) -> None:
-        """Let other processes score the trials. Raises what a trial raises."""
-        jobs = {job.name: job for job, _ in self._captures}
-        tasks = [
-            DrawTask(reading, tuple(trial for trial, _ in draw))
-            for reading, draws in ((job.reading(draws), draws) for job, draws in self._captures)
-            for draw in draws or [[]]
-        ]
-        for task, result in elsewhere(tasks):
-            job = jobs[task.reading.name]
-            if result.error is not None:
-                job.fail(result.error)
-            else:
-                job.note(result.notes)
-                for trial, score in zip(task.trials, result.scores, strict=True):
-                    self._store.add(trial, score)
-            self._progress.skip(len(task.trials))
 
-    def _submit_all(self, workers: ThreadPoolExecutor, jobs: int) -> None:
-        running: set[Future[None]] = set()
-        for job, draws in self._captures:
+def _score_here(
+    captures: Sequence[CaptureJob],
+    estimators: Mapping[str, Estimator],
+    store: TrialStore,
+    progress: _Progress,
+    workers: ThreadPoolExecutor,
+    jobs: int,
+) -> None:
+    """Score `jobs` trials at a time in threads. Raises what a trial raises."""
 
-            def show_image(n_read: int, n_images: int, name: str = job.name) -> None:
-                self._progress.note(f"reading {name}, image {n_read} of {n_images}")
+    def score(shared: SharedDraw, trial: Trial) -> None:
+        store.add(trial, shared.score(trial, estimators[trial.method], progress.begin))
 
-            try:
-                source, notes = job.reading(draws).read(job.source, show_image)
-            except (InputError, UsageError) as error:
-                job.fail(error)
-                self._progress.skip(sum(map(len, draws)))
-                continue
+    running: set[Future[None]] = set()
+    for job in captures:
+        name = job.reading.name
+        try:
+            source, notes = job.reading.read(job.source, partial(progress.read_image, name))
+        except (InputError, UsageError) as error:
+            job.fail(error)
+            progress.skip(sum(map(len, job.draws)))
+            continue
+        job.note(notes)
+        for draw in job.draws:
+            shared = SharedDraw(source)
+            for trial in draw:
+                running.add(workers.submit(score, shared, trial))
+                running = _wait(running, jobs)  # one trial waits, so that no core does
+            del shared
+        del source  # before the next capture is read
+    _wait(running, 0)
+
+
+def _score_elsewhere(
+    captures: Sequence[CaptureJob], elsewhere: Elsewhere, store: TrialStore, progress: _Progress
+) -> None:
+    """Let other processes score the trials. Raises what a trial raises."""
+    jobs = {job.reading.name: job for job in captures}
+    for task, scored in elsewhere([DrawTask(job.reading, draw) for job in captures for draw in job.draws or [[]]]):
+        job = jobs[task.reading.name]
+        if isinstance(scored, SplinecliError):
+            job.fail(scored)
+        else:
+            scores, notes = scored
             job.note(notes)
-            for draw in draws:
-                shared = SharedDraw(source, draw[0][0])
-                for trial, estimator in draw:
-                    running.add(workers.submit(self._score, shared, trial, estimator))
-                    running = _wait(running, jobs)  # one trial waits, so that no core does
-                del shared
-            del source  # before the next capture is read
-        _wait(running, 0)
-
-    def _score(self, shared: SharedDraw, trial: Trial, estimator: Estimator) -> None:
-        self._store.add(trial, shared.score(estimator, self._progress.begin))
+            for trial, score in zip(task.trials, scores, strict=True):
+                store.add(trial, score)
+        progress.skip(len(task.trials))
 
 
 class _Progress:
     """Counts trials over all threads."""
 
-    def __init__(self, total: int, on_progress: OnProgress | None) -> None:
-        self._total, self._on_progress = total, on_progress
+    def __init__(self, total: int, advance: OnProgress) -> None:
+        self._total, self._advance = total, advance
         self._lock = Lock()
         self._finished = 0
-        self._running: dict[int, float] = {}
-        self._begun = 0
 
-    def note(self, text: str) -> None:
+    def read_image(self, capture: str, n_read: int, n_images: int) -> None:
         with self._lock:
-            self._show(text)
+            self._advance(0, f"reading {capture}, image {n_read} of {n_images}")
 
     def skip(self, count: int) -> None:
         with self._lock:
             self._finished += count
-            self._show("")
+            self._advance(count / max(1, self._total), "")
 
     def begin(self, n_pixels: int) -> Callable[[int], None]:
         """Begin a trial. Returns the function that counts its pixels."""
-        with self._lock:
-            number, done = self._begun, 0
-            self._begun += 1
-            self._running[number] = 0.0
+        done = 0
 
-        def advance(pixels: int) -> None:
+        def count(pixels: int) -> None:
             nonlocal done
             with self._lock:
                 done += pixels
-                if done < n_pixels:
-                    self._running[number] = done / n_pixels
-                else:
-                    del self._running[number]
-                    self._finished += 1
-                self._show(f"trial {min(self._finished + 1, self._total)} of {self._total}")
+                self._finished += done >= n_pixels
+                note = f"trial {min(self._finished + 1, self._total)} of {self._total}"
+                self._advance(pixels / n_pixels / self._total, note)
 
-        return advance
-
-    def _show(self, text: str) -> None:
-        if self._on_progress is not None:
-            self._on_progress(self._finished + sum(self._running.values()), self._total, text)
+        return count
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:

@@ -37,13 +37,10 @@ class Comparison:
 
     Args:
         capture: name of the capture, or AVERAGE.
-        first, second: names of the methods.
-        trials: number of trials that were compared.
         difference_deg: mean over the trials of the MAE of `first` minus that of `second`; `first` is better below 0.
         std_deg: population standard deviation of the differences.
         interval_deg: 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0
             while p_holm is above SIGNIFICANCE.
-        p_value: two-sided.
         p_holm: p_value corrected for the number of pairs that were tested on this capture.
     """
 
@@ -111,25 +108,21 @@ def p_in_words(p_value: float) -> str:
 
 
 def _compare_all(capture: str, maes_deg: dict[str, tuple[float, ...]]) -> list[Comparison]:
-    pairs = combinations(maes_deg, 2)
-    compared = [_compare(capture, a, b, np.subtract(maes_deg[a], maes_deg[b])) for a, b in pairs]
+    compared = []
+    for first, second in combinations(maes_deg, 2):
+        differences = np.subtract(maes_deg[first], maes_deg[second])
+        mean, std = float(differences.mean()), float(differences.std())
+        test = _paired_test(differences)
+        compared.append(Comparison(capture, first, second, len(differences), mean, std, *test, None))
     corrected = iter(holm([c.p_value for c in compared if c.p_value is not None]))
     return [c if c.p_value is None else replace(c, p_holm=next(corrected)) for c in compared]
 
 
-def _compare(capture: str, first: str, second: str, differences: NDArray[np.float64]) -> Comparison:
-    interval, p_value = _paired_test(differences)
-    mean, std = float(differences.mean()), float(differences.std())
-    return Comparison(capture, first, second, len(differences), mean, std, interval, p_value, None)
-
-
 def _paired_test(differences: NDArray[np.float64]) -> tuple[tuple[float, float] | None, float | None]:
     """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
-    if len(differences) < 2:
-        return None, None
-    if np.abs(differences).max() < _SAME_DEG:
+    if len(differences) > 1 and np.abs(differences).max() < _SAME_DEG:
         return (0.0, 0.0), 1.0
-    if np.ptp(differences) < _SAME_DEG:
+    if len(differences) < 2 or np.ptp(differences) < _SAME_DEG:
         return None, None
     from scipy import stats
 

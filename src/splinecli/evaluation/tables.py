@@ -58,10 +58,13 @@ def markdown(evaluations: Sequence[Evaluation]) -> str:
 
     The best value of each column is bold. With several evaluations, each has its table under a heading.
     """
-    tables = [_markdown_table(evaluation) for evaluation in evaluations]
-    if len(evaluations) > 1:
-        titles = [heading(evaluation.protocol) for evaluation in evaluations]
-        tables = [f"## {title}\n\n{table}" for title, table in zip(titles, tables, strict=True)]
+    tables = []
+    for evaluation in evaluations:
+        rows = _marked_rows(evaluation, _escape_markdown, "**{}**")
+        lines = ["| " + " | ".join(row) + " |" for row in rows]
+        lines.insert(1, "|---|" + "---:|" * (len(rows[0]) - 1))
+        title = [f"## {heading(evaluation.protocol)}", ""] if len(evaluations) > 1 else []
+        tables.append("\n".join([*title, *lines, "", _escape_markdown(caption(evaluation))]) + "\n")
     return "\n".join(tables)
 
 
@@ -72,13 +75,6 @@ def latex(evaluations: Sequence[Evaluation]) -> str:
     """
     needs = "% Needs \\usepackage{booktabs} in the preamble.\n"
     return needs + "\n".join(_latex_table(evaluation) for evaluation in evaluations)
-
-
-def _markdown_table(evaluation: Evaluation) -> str:
-    rows = _marked_rows(evaluation, _escape_markdown, "**{}**")
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    lines.insert(1, "|---|" + "---:|" * (len(rows[0]) - 1))
-    return "\n".join([*lines, "", _escape_markdown(caption(evaluation))]) + "\n"
 
 
 def _escape_markdown(text: str) -> str:

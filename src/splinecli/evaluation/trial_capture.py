@@ -1,31 +1,48 @@
-"""What a trial sees of a capture: the scored pixels under the lights of its draw, restored as `infer` would."""
+"""A capture read for its trials, and what a trial sees of it: the scored pixels under its lights, restored."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
+from pathlib import Path
 from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import Capture
-from splinecli.capture.lights.draws import NOISE_STREAM
+from splinecli.capture import Capture, CaptureSource, open_capture
+from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
+from splinecli.capture.lights.draws import NOISE_STREAM, PIXELS_STREAM
 from splinecli.capture.record import in_one_plane
 from splinecli.capture.restore.light_refinement import refine_capture
+from splinecli.capture.sample import sample_observations
 from splinecli.capture.stored import StoredCapture
+from splinecli.diagnosis.ground_truth import check_ground_truth
+from splinecli.errors import InputError
+from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trials import Score, Trial
-from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.inference import estimate_normals
 from splinecli.light.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.methods import Estimator
 from splinecli.methods.estimator import refiner_of
 from splinecli.methods.near_light import find_surface
+from splinecli.system.files import as_input_error
 from splinecli.system.progress import Progress
 
 _RETILTS = 100
 _LARGEST_TILT_DEG = 89.0
+
+OnImage = Callable[[int, int], object]
+"""Called with the number of images read so far and their total."""
+
+Notes = list[tuple[str, ...]]
+"""Sentences about a capture, for each protocol."""
+
+DAMAGED_IMAGES = {"bearPNG": 20}
+"""The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
 
 
 @dataclass(frozen=True)
@@ -35,31 +52,11 @@ class TrialSource:
     Every draw is restored by itself: a saturated observation is restored from the other lights of the draw, as
     `infer` restores it when it reads only these lights.
 
-    Args:
-        stored: the capture with the stored values of its lights.
-        rows: rows of the observations to score; None for all of them.
+    `rows` are the rows of the observations to score; None for all of them.
     """
 
     stored: StoredCapture
     rows: NDArray[np.integer] | None = None
-
-    @classmethod
-    def with_pixels(
-        cls, stored: StoredCapture, rows: NDArray[np.integer], *, as_stored: bool, whole: bool
-    ) -> TrialSource:
-        """Return a source that scores the given rows of the observations only.
-
-        Args:
-            whole: whether all pixels are needed: a method sees neighbours, or lights are refined.
-            as_stored: whether no trial restores. Otherwise all pixels are kept where the light intensities are
-                unknown, because `infer` estimates them from all pixels. They are also kept under near lamps, which
-                need the whole surface.
-        """
-        if len(rows) == stored.capture.n_pixels:
-            return cls(stored)
-        if not whole and stored.capture.lamps is None and (as_stored or stored.intensities_known):
-            return cls(stored.choose_pixels(rows))
-        return cls(stored, rows)
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
         """Return the capture under the lights of a trial, which have noise, or are refined or found, if it says so.
@@ -95,45 +92,32 @@ class TrialSource:
 class SharedDraw:
     """The capture that the methods of one draw share. The first method that needs it makes it."""
 
-    def __init__(self, source: TrialSource, trial: Trial) -> None:
-        self._source, self._trial = source, trial
+    def __init__(self, source: TrialSource) -> None:
+        self._source = source
         self._lock = Lock()
         self._captures: dict[bool, Capture] = {}
 
-    def score(self, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
-        """Return the score of a method under the draw. Any thread may call this.
+    def score(self, trial: Trial, estimator: Estimator, begin: Callable[[int], Progress] | None = None) -> Score:
+        """Return the score of a trial of the draw. Any thread may call this.
 
-        Args:
-            begin: called with the number of pixels before they are estimated. Its function counts those done.
-
-        Raises:
-            SplinecliError: the method returned normals that are not unit vectors.
+        `begin` is called with the number of pixels before they are estimated. Its function counts those done. Raises
+        SplinecliError if the method returns normals that are not unit vectors.
         """
-        capture = self._capture(whole=refiner_of(estimator) is not None)
-        progress = None if begin is None else begin(capture.n_pixels)
-        estimate = estimate_normals(capture, estimator, progress=progress)
-        estimated = capture.estimated_intensities is not None
-        return Score(self._mean_error_deg(estimate), estimate.seconds, estimated, self._light_error_deg(capture))
-
-    def _light_error_deg(self, capture: Capture) -> float | None:
-        if capture.light_errors_deg is None:
-            return None
-        source = self._source
-        true = source.stored.capture.light_directions[source.places(capture.light_indices)]
-        return float(angle_between_deg(capture.light_directions, true).mean())
-
-    def _capture(self, *, whole: bool) -> Capture:
+        source, whole = self._source, refiner_of(estimator) is not None
         with self._lock:
             if whole not in self._captures:
-                self._captures[whole] = self._source.see(self._trial, whole=whole)
-            return self._captures[whole]
-
-    def _mean_error_deg(self, estimate: NormalEstimate) -> float:
+                self._captures[whole] = source.see(trial, whole=whole)
+        capture = self._captures[whole]
+        estimate = estimate_normals(capture, estimator, progress=None if begin is None else begin(capture.n_pixels))
         assert estimate.errors is not None and estimate.error_map_deg is not None  # or it would have no trials
-        rows = self._source.rows
-        if rows is None or estimate.capture.n_pixels == len(rows):
-            return estimate.errors.mean
-        return float(estimate.error_map_deg[estimate.capture.mask][rows].mean())
+        mae_deg = estimate.errors.mean
+        if source.rows is not None and capture.n_pixels != len(source.rows):
+            mae_deg = float(estimate.error_map_deg[capture.mask][source.rows].mean())
+        light_error_deg = None
+        if capture.light_errors_deg is not None:
+            true = source.stored.capture.light_directions[source.places(trial.lights)]
+            light_error_deg = float(angle_between_deg(capture.light_directions, true).mean())
+        return Score(mae_deg, estimate.seconds, capture.estimated_intensities is not None, light_error_deg)
 
 
 def _with_noise(capture: Capture, trial: Trial) -> Capture:
@@ -166,3 +150,89 @@ def tilt_lights(
     angle = np.where(sunk, -angle, angle)[:, None]
     tilted: NDArray[np.float64] = unit(np.cos(angle) * light_directions + np.sin(angle) * across)
     return tilted
+
+
+@dataclass(frozen=True)
+class CaptureReading:
+    """What the trials of a capture need of it.
+
+    Args:
+        folder: the capture's folder as it was given. Other processes open it again.
+        protocols: those that can score it. All protocols of an evaluation score the same pixels.
+        lights: those of all trials, in rising order.
+        whole: whether all pixels are needed: a method sees neighbours, or lights are refined or found.
+    """
+
+    folder: Path
+    name: str
+    protocols: tuple[Protocol, ...]
+    lights: tuple[int, ...]
+    whole: bool
+
+    def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
+        """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""
+        numbers = count(1)
+        try:
+            stored = source.read_stored(self.lights, lambda: on_image(next(numbers), len(self.lights)))
+        except OSError as error:
+            raise as_input_error(error, self.folder) from error
+        first = self.protocols[0]
+        rows = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
+        as_stored = all(protocol.as_stored for protocol in self.protocols)
+        if len(rows) == stored.capture.n_pixels:
+            trials = TrialSource(stored)
+        elif self.whole or stored.capture.lamps is not None or not (as_stored or stored.intensities_known):
+            # `infer` estimates unknown intensities from all pixels, and near lamps need the whole surface.
+            trials = TrialSource(stored, rows)
+        else:
+            trials = TrialSource(stored.choose_pixels(rows))
+        notes = [_notes(stored.capture, self.name, protocol) for protocol in self.protocols]
+        return trials, notes
+
+
+def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
+    """Open a capture under a protocol. Raises InputError, UsageError."""
+    try:
+        return open_capture(folder, white_level=protocol.white_level)
+    except OSError as error:
+        raise as_input_error(error, folder) from error
+
+
+def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
+    """Return sentences about what is special about a capture and how the evaluation treated it."""
+    notes = []
+    skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
+    if skipped:
+        notes.append(f"{name}: the first {skipped} images are left out.")
+    elif damaged:
+        notes.append(
+            f"{name}: the first {damaged} images are known to be damaged and are used;"
+            f" --skip-first {name}={damaged} leaves them out."
+        )
+    notes += [f"{name}: {warning}" for warning in capture.warnings if warning.code == GROUND_TRUTH_UPSIDE_DOWN]
+    if capture.ground_truth is not None:
+        sample = sample_observations(capture.observations, capture.mask)
+        wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)
+        notes += [f"{name}: {warning}" for warning in wrong]
+        without = capture.n_pixels - int(np.count_nonzero(capture.ground_truth[capture.mask].any(axis=1)))
+        if without:
+            notes.append(
+                f"{name}: {without} of {capture.n_pixels} pixels in the mask have no ground-truth normal"
+                " and are not scored."
+            )
+    return tuple(notes)
+
+
+def scored_rows(capture: Capture, *, max_pixels: int | None = None, seed: int = 0) -> NDArray[np.intp]:
+    """Return the rows of the observations that have ground truth, in rising order.
+
+    With `max_pixels`, the seed chooses at most that many of them: the same pixels for every method and trial. A method
+    that sees neighbours estimates all pixels, and only these are scored. Raises InputError without ground truth.
+    """
+    if capture.ground_truth is None:
+        raise InputError(f"{capture.name}: the capture has no ground truth")
+    rows = np.flatnonzero(np.any(capture.ground_truth[capture.mask], axis=1))
+    if max_pixels is not None and len(rows) > max_pixels:
+        generator = np.random.default_rng([PIXELS_STREAM, seed, len(rows)])
+        rows = np.sort(generator.permutation(rows)[:max_pixels])
+    return rows

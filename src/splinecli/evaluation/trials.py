@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from threading import Lock
@@ -25,10 +24,7 @@ class Trial:
 
     Args:
         capture: name of the capture in the tables.
-        method: name of the method.
-        number: number of the trial, from 0.
-        lights: the draw.
-        protocol: what else decides the score.
+        number: of the trial, from 0.
         made_of: digest of the capture's files and of the method's settings.
     """
 
@@ -114,10 +110,12 @@ class TrialStore:
             return
         with refusals_as_output_errors(path):
             kept = []
-            for line in _lines(path) if is_plain(path) and not fresh else ():
-                if (read := _read_line(line)) is not None:
-                    kept.append(line.rstrip("\n") + "\n")
-                    self._scores.update((read,))
+            if is_plain(path) and not fresh:
+                with path.open(encoding="utf-8", errors="replace") as file:
+                    while line := file.readline(_LONGEST_LINE):  # a longer one in parts
+                        if (read := _read_line(line)) is not None:
+                            kept.append(line.rstrip("\n") + "\n")
+                            self._scores.update((read,))
             # Anew, because the next lines would reach every other name of this file.
             if os.path.lexists(path):
                 write_text(path, "".join(kept))
@@ -135,13 +133,6 @@ class TrialStore:
             line = json.dumps({**trial.record, **asdict(score), "key": trial.key})
             with refusals_as_output_errors(self._path), self._path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
-
-
-def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a file, a longer one in parts of _LONGEST_LINE characters."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        while line := file.readline(_LONGEST_LINE):
-            yield line
 
 
 def _read_line(line: str) -> tuple[str, Score] | None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from splinecli.maths.normals import encode_picture
 from splinecli.pictures.png import Picture
-from splinecli.pixel_sets.store import Entry, Pixels, PixelSet
+from splinecli.pixel_sets.store import Entry, PixelSet
 
 TILE = 96  # pixels: large enough to recognise shapes and materials; sixty scenes fit on a screen or two
 LARGE_TILE, FEW_SCENES = 160, 12
@@ -37,18 +37,15 @@ def contact_sheet(pixel_set: PixelSet) -> Picture:
 def _strip(pixel_set: PixelSet, entries: list[Entry], tile: int) -> Picture:
     first = pixel_set.load(entries[0])
     tiles = [_fit(encode_picture(_on_mask(first.normals, first.mask), np.asarray(first.mask), bits=8), tile)]
-    for entry in entries:
-        pixels = pixel_set.load(entry)
-        tiles += [_fit(_shown(pixels, light), tile) for light in _LIGHTS]
+    for pixels in map(pixel_set.load, entries):
+        for light in _LIGHTS:
+            # The image under the closest light, scaled so that its 98th percentile is white.
+            closest = int(np.argmax(pixels.light_directions @ np.array(light)))
+            values = np.asarray(pixels.observations[:, closest], np.float32)
+            exposed = (values / max(float(np.percentile(values, 98)), 1e-6)).clip(0, 1) ** (1 / _GAMMA)
+            gray = np.rint(exposed[:, None] * 255).repeat(3, axis=1)
+            tiles.append(_fit(_on_mask(gray, pixels.mask).astype(np.uint8), tile))
     return np.hstack(tiles)
-
-
-def _shown(pixels: Pixels, light: tuple[float, float, float]) -> Picture:
-    """Return the image under the light closest to `light`, scaled so that its 98th percentile is white."""
-    closest = int(np.argmax(pixels.light_directions @ np.array(light)))
-    values = np.asarray(pixels.observations[:, closest], np.float32)
-    exposed = (values / max(float(np.percentile(values, 98)), 1e-6)).clip(0, 1) ** (1 / _GAMMA)
-    return _on_mask(np.rint(exposed[:, None] * 255).repeat(3, axis=1), pixels.mask).astype(np.uint8)
 
 
 def _on_mask(values: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.floating]:

@@ -33,17 +33,13 @@ def infer_batch(
     shard: Shard | None = None,
     cluster: ClusterOptions | None = None,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield its outcome.
-
-    The outcomes come in order, or on other processes as they end.
+    """Run `infer_capture` on each folder and yield its outcome, in order, or on other processes as they end.
 
     With several captures, or where OUT/index.html is there already, that page is written at the end.
 
     Args:
         folders: the captures. A folder that is given twice counts once.
-        options, observer: see infer_capture.
         redo: which captures that have results are computed again.
-        shard: the part of the captures that is computed; None for all.
         cluster: the processes or machines that compute; None for this process. A number of workers of 0 means as many
             as the machine's cores and memory allow.
 
@@ -102,12 +98,9 @@ def _on_workers(
         began, n_failed, n_pixels = time.monotonic(), 0, 0
         for n_ended, (item, result) in enumerate(workers.run(items), start=1):
             number, member = item.args
-            if isinstance(result, LostError):
-                outcome = failed(member.name, result)
-            else:
-                outcome, warnings = result
-                for warning in warnings:
-                    observer.warn(warning)
+            outcome, warnings = (failed(member.name, result), []) if isinstance(result, LostError) else result
+            for warning in warnings:
+                observer.warn(warning)
             n_failed += outcome.exit_code != 0
             n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
             advance(
@@ -133,17 +126,12 @@ def _infer(
 ) -> tuple[Outcome, list[str]]:
     """Compute a capture on a worker, and return what became of it and the warnings."""
     options.check_files()
-    estimator, observer = _method(options, options.method_options, sha256), _Warnings()
+    estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):
-        here = this_worker()
-        member = replace(
-            member,
-            missing=InputError(
-                f"the folder does not exist on the worker {here}", path=member.folder, hint=SAME_STORAGE
-            ),
-        )
-    outcome = run_member(member, options, redo, lambda: estimator, observer)
-    return outcome, observer.found
+        problem = f"the folder does not exist on the worker {this_worker()}"
+        member = replace(member, missing=InputError(problem, path=member.folder, hint=SAME_STORAGE))
+    observer = _Warnings()
+    return run_member(member, options, redo, lambda: estimator, observer), observer.found
 
 
 @lru_cache(maxsize=1)

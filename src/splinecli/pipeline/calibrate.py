@@ -8,18 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from splinecli.calibration.balls import CalibratedLights, calibrate_ball, combine_balls, find_ball_files
+from splinecli.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.gray import measure_light_intensities
-from splinecli.calibration.lamp_positions import LampPositions, triangulate_lamps
+from splinecli.calibration.lamp_positions import triangulate_lamps
 from splinecli.calibration.report import calibration_report, summary_lines
 from splinecli.capture.lights.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import UsageError
-from splinecli.maths.transfer import AUTOMATIC, TransferCurve, parse_transfer
+from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.pictures.calibration import calibration_picture
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.observer import SILENT, Observer
@@ -34,23 +31,7 @@ OUTPUT_FILES = (DIRECTIONS, INTENSITIES, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, P
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
-    """Which images `calibrate` reads, and where it writes.
-
-    Args:
-        balls: a folder of images of a mirror ball each.
-        circles: the outline of each ball, or empty.
-        masks: a mask of each ball, or empty.
-        ball_diameter: of each ball, in any unit, which becomes that of the lamps' positions.
-        camera_matrix: a text file of 3 x 3 numbers. None takes the focal length from EXIF, or the camera as distant.
-        gray_ball, gray_card: a folder of images of a gray target, at most one of the two.
-        transfer: the curve of the gray target's images: auto, linear, srgb or gamma:G.
-        compare: a text file of light directions to compare the result with.
-        output: the folder of the results.
-        overwrite: replace earlier results.
-
-    Raises:
-        UsageError: two options contradict each other, or a value is unknown.
-    """
+    """The options of `calibrate`, as its help describes them; None is the default in the help. Raises UsageError."""
 
     balls: tuple[Path, ...]
     circles: tuple[Circle, ...] = ()
@@ -65,7 +46,7 @@ class CalibrateOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.curve != 1 and not (self.gray_ball or self.gray_card):
+        if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
             raise UsageError(
                 "--transfer needs --gray-ball or --gray-card",
                 hint="Leave it out: the light directions do not depend on the curve",
@@ -86,11 +67,6 @@ class CalibrateOptions:
                     f"{option} is given {times} for {len(self.balls)} balls",
                     hint="Give it once for each ball, in the same order",
                 )
-
-    @property
-    def curve(self) -> TransferCurve:
-        """The transfer curve of the gray target's images, as in RadiometricCalibration."""
-        return parse_transfer(self.transfer)
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
@@ -125,7 +101,7 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     intensities = None
     warnings: list[str] = []
     if target_files is not None:
-        radiometry = RadiometricCalibration(options.curve, automatic=options.transfer == AUTOMATIC)
+        radiometry = RadiometricCalibration(parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC)
         radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
         warnings = [f"{target}: {warning}" for warning in of_curve]
         intensities = measure_light_intensities(
@@ -134,7 +110,18 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
     report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
     report["warnings"] += warnings
-    _write(options.output, lights, intensities, lamps, report)
+    texts = {DIRECTIONS: rows_text(lights.directions), REPORT: json.dumps(report, indent=2) + "\n"}
+    if intensities is not None:
+        texts[INTENSITIES] = rows_text(intensities)
+    if lamps is not None and lamps.known:
+        texts |= {POSITIONS: rows_text(lamps.positions), PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n"}
+        if lamps.view.known:
+            texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
+    # Files that are not written anew would belong to earlier lights. They are removed.
+    with new_files(options.output, report=REPORT, stale=OUTPUT_FILES) as new:
+        for name, text in texts.items():
+            new.write(name, text)
+        new.write(PICTURE, encode_png(calibration_picture(lights.balls)))
     for line in summary_lines(report):
         observer.say(line)
     if intensities is not None:
@@ -144,27 +131,3 @@ def _calibrate_into(options: CalibrateOptions, observer: Observer) -> dict[str, 
     for warning in report["warnings"]:
         observer.warn(warning)
     return report
-
-
-def _write(
-    folder: Path,
-    lights: CalibratedLights,
-    intensities: NDArray[np.float64] | None,
-    lamps: LampPositions | None,
-    report: dict[str, Any],
-) -> None:
-    known = lamps if lamps is not None and lamps.known else None
-    texts = {
-        DIRECTIONS: rows_text(lights.directions),
-        INTENSITIES: None if intensities is None else rows_text(intensities),
-        POSITIONS: None if known is None else rows_text(known.positions),
-        PIXEL_SIZE: None if known is None else f"{known.pixel_size:.9g}\n",
-        CAMERA_MATRIX: rows_text(known.view.matrix) if known is not None and known.view.known else None,
-        REPORT: json.dumps(report, indent=2) + "\n",
-    }
-    # Files that are not written anew would belong to earlier lights. They are removed.
-    with new_files(folder, report=REPORT, stale=OUTPUT_FILES) as new:
-        for name, text in texts.items():
-            if text is not None:
-                new.write(name, text)
-        new.write(PICTURE, encode_png(calibration_picture(lights.balls)))

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from splinecli.capture import capture_name
 from splinecli.capture.formats.film import is_film
@@ -18,23 +19,11 @@ from splinecli.results.files import MAPS, NORMALS
 _SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
 
 
-@dataclass(frozen=True)
-class Shard:
-    """One of `count` parts of a batch. `number` counts from 1.
-
-    Raises:
-        UsageError: there is no such part.
-    """
+class Shard(NamedTuple):
+    """Part `number` of a batch of `n_parts`, counted from 1."""
 
     number: int
-    count: int
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.number <= self.count:
-            raise UsageError(
-                f"--shard is {self.number}/{self.count}; expected I/N with I from 1 to N",
-                hint="If your job numbers count from 0, add 1",
-            )
+    n_parts: int
 
     @classmethod
     def parse(cls, text: str) -> Shard:
@@ -42,27 +31,18 @@ class Shard:
         found = _SHARD.fullmatch(text)
         if found is None:
             raise UsageError(f"--shard is {text!r}; expected I/N, such as 3/8 for the third of eight parts")
-        return cls(int(found[1]), int(found[2]))
-
-    def choose(self, folders: Sequence[Path]) -> list[Path]:
-        """Return every N-th folder, in the order given.
-
-        The folders are counted in the order of their bytes. A shell sorts captures/* by its language, and the machines
-        of a cluster may differ in that.
-        """
-        chosen = set(sorted(folders, key=os.fsencode)[self.number - 1 :: self.count])
-        return [folder for folder in folders if folder in chosen]
+        number, count = int(found[1]), int(found[2])
+        if not 1 <= number <= count:
+            raise UsageError(
+                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
+                hint="If your job numbers count from 0, add 1",
+            )
+        return cls(number, count)
 
 
 @dataclass(frozen=True)
 class Member:
-    """A capture of a batch.
-
-    Args:
-        folder: its folder.
-        name: the name of the capture, also if the folder does not exist.
-        missing: why the capture cannot be read, if there is no such folder.
-    """
+    """A capture of a batch. `missing` says why it cannot be read, if there is no such folder."""
 
     folder: Path
     name: str
@@ -77,7 +57,11 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
             method.
     """
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
-    chosen = folders if shard is None else shard.choose(folders)
+    chosen = set(folders)
+    if shard is not None:
+        # In the order of their bytes: a shell sorts captures/* by its language, and the machines of a cluster may
+        # differ in that.
+        chosen = set(sorted(folders, key=os.fsencode)[shard.number - 1 :: shard.n_parts])
     # Also of the other shards, because their results go to the same place.
     members = {folder: _member(folder) for folder in folders}
     seen: dict[str, Path] = {}
@@ -87,7 +71,7 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[M
                 f"{other} and {folder} have the same name, so their results would overwrite each other",
                 hint="Run them one by one with different -o",
             )
-    return [members[folder] for folder in chosen]
+    return [member for folder, member in members.items() if folder in chosen]
 
 
 def _own_path(folder: Path) -> Path:

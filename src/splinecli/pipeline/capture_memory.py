@@ -26,10 +26,7 @@ _ASKED = 16  # captures that stand for a batch
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """Return the bytes of memory that spline-net takes for a capture, beside BASE_BYTES.
 
-    Args:
-        largest: the size of the largest image.
-        n_pixels: the number of the mask's pixels.
-        n_lights: the number of images that are read.
+    They follow from the size of the largest image, and the numbers of pixels in the mask and of images that are read.
     """
     of_pixels = INDIRECT_BYTES * n_pixels + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
     return capture_bytes(largest, n_pixels, n_lights) + of_pixels
@@ -44,11 +41,7 @@ def expected_bytes(member: Member, options: InferOptions) -> float:
 def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
     """Return about how many bytes a capture takes, from the header of its first image, and its mask if it is large.
 
-    A capture that cannot be read takes none: it will fail soon.
-
-    Args:
-        open_source: returns the capture.
-        n_lights: the number of images that are read; 0 for all.
+    A capture that cannot be read takes none: it will fail soon. `n_lights` images are read, or all for 0.
     """
     try:
         source = open_source()

@@ -74,9 +74,7 @@ class ClusterOptions:
 def connected(options: ClusterOptions) -> Iterator[Client]:
     """Yield a Dask client: of a new cluster of this machine's processes, or of a running one.
 
-    Raises:
-        UsageError: Dask is not installed, or there is no scheduler at the address.
-        InputError: the scheduler file cannot be read.
+    Raises UsageError if Dask is not installed, or there is no scheduler at the address.
     """
     distributed = import_extra("distributed", "cluster")
     for name in _LOGGERS:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import metadata
-from itertools import count
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock
@@ -110,14 +109,7 @@ def _do(work: Work, *args: Any) -> Any:
 
 @dataclass
 class Distributor:
-    """Gives items to the workers of a Dask cluster, at most one for each worker. Workers may come and go.
-
-    Args:
-        client: see connected.
-        work: what all items share.
-        options: of the cluster.
-        observer: hears that there are no workers yet.
-    """
+    """Gives items to the workers of a Dask cluster, at most one for each worker. Workers may come and go."""
 
     client: Client
     work: Work
@@ -137,16 +129,21 @@ class Distributor:
         for address, found in self.client.run(metadata.version, "splinecli", on_error="return").items():
             if isinstance(found, metadata.PackageNotFoundError):
                 raise UsageError(f"splinecli is not installed on the worker {address}", hint=SAME_VERSIONS)
-        source, following = iter(items), None
+        if not self._workers():
+            self.observer.say("waiting for workers")
+        source = iter(items)
+        following = next(source, None)
         free_memory, began = available_memory(), time.monotonic()
-        for n_looks in count():
+        while self.running or following is not None:
             workers = self._workers()
-            if not workers and n_looks == 0:
-                self.observer.say("waiting for workers")
-            while len(self.running) < len(workers):
-                following = following or next(source, None)
-                if following is None:
-                    break
+            if workers:
+                began = time.monotonic()
+            elif not self.options.address and time.monotonic() - began > _NO_WORKER_SECONDS:
+                raise SplinecliError(
+                    "the workers end while they are getting ready",
+                    hint="If there is too little memory, use fewer. Dask's output says more",
+                )
+            while following is not None and len(self.running) < len(workers):
                 limits = (_resources(info).get("MEMORY") or info.get("memory_limit") for info in workers.values())
                 largest = max(float(limit or math.inf) for limit in limits)
                 # The workers of a cluster have limits of Dask. Those of this machine share its memory.
@@ -163,17 +160,9 @@ class Distributor:
                     self._submit(following, workers)
                 else:
                     break
-                following = None
-            if workers:
-                began = time.monotonic()
-                if following is None and not self.running:
-                    return
-            elif not self.options.address and time.monotonic() - began > _NO_WORKER_SECONDS:
-                raise SplinecliError(
-                    "the workers end while they are getting ready",
-                    hint="If there is too little memory, use fewer. Dask's output says more",
-                )
-            yield from self._take_results()
+                following = next(source, None)
+            with suppress(Empty):
+                yield from self._take_result(self._done.get(timeout=_LOOK_SECONDS))
 
     def _workers(self) -> dict[str, dict[str, Any]]:
         """Return what Dask says of the workers that may be used. Raises SplinecliError if the scheduler is lost."""
@@ -204,14 +193,6 @@ class Distributor:
             raise _scheduler_lost() from error
         self.running[future] = item
         future.add_done_callback(self._done.put)
-
-    def _take_results(self) -> Iterator[tuple[Item, Any]]:
-        """Wait a moment for results, and yield those that there are."""
-        with suppress(Empty):
-            future = self._done.get(timeout=_LOOK_SECONDS)
-            while True:
-                yield from self._take_result(future)
-                future = self._done.get_nowait()
 
     def _take_result(self, future: Future) -> Iterator[tuple[Item, Any]]:
         from distributed.scheduler import KilledWorker
@@ -251,15 +232,9 @@ def _scheduler_lost() -> SplinecliError:
 def distributor(
     do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers.
+    """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does, or OutputError.
 
-    Args:
-        do: see Work.
-        output: the output folder, by which workers show that they have the same storage. It is made as needed.
-
-    Raises:
-        UsageError: Dask is not installed, or there is no scheduler at the address.
-        OutputError: the folder cannot be made.
+    By the output folder, which is made as needed, workers show that they have the same storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from splinecli.capture import find_captures, open_capture
 from splinecli.capture.lights.found_lights import ESTIMATE
 from splinecli.capture.restore.light_refinement import LIGHT_ERROR_DEG, check_light_error
 from splinecli.capture.restore.white_level import check_white_level
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
-from splinecli.evaluation.files import TRIALS, make_plots, write_results
+from splinecli.evaluation.document import TRIALS, make_plots, write_results
 from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.plan import check_skip_first, distinct_names, read_draws_file
+from splinecli.evaluation.plan import distinct_names
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import Elsewhere, evaluate_all
+from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
+from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw, TrialSource, open_to_score
 from splinecli.evaluation.trials import TrialStore
 from splinecli.methods import DEFAULT_METHOD, Estimator, MethodOptions, check_method, make_estimator
 from splinecli.networks.weights import untrained_warning
+from splinecli.pipeline.capture_memory import source_bytes
 from splinecli.pipeline.connection import ClusterOptions
-from splinecli.pipeline.evaluate_on_workers import score_on_workers
+from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.system.devices import count_available_cores
 from splinecli.system.files import check_writable
@@ -37,24 +40,15 @@ DEFAULT_LIGHTS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """The options of `evaluate`.
+    """The options of `evaluate`, as its help describes them.
 
     Args:
-        methods: names of the methods; a name that comes twice counts once.
-        method_options: weights, rotations, batch size, device and precision.
-        n_lights: numbers of lights in each draw, None for all lights; one evaluation for each. Empty for
-            DEFAULT_LIGHTS, or for the number in the draws file.
-        light_noise_deg: standard deviations of the light noise; one evaluation for each.
-        trials: number of random draws; None for DEFAULT_TRIALS.
-        lights: "estimate" to find the lights of each trial from its images; None for the captures' light files.
-        refine_lights: refine the light directions of each trial. light_error_deg: see Protocol.
-        seed, max_pixels, skip_first, as_stored, white_level: see Protocol.
-        draws: path of a draws file, in place of random draws.
-        jobs: number of trials at a time; None for the cores, or for 1 on a GPU.
-        figures: whether to draw the methods' maps of the first draw of each capture.
-        pixels: (row, column) of the pixels whose observation maps the figures show.
-        output: folder for the results.
-        overwrite: whether to compute again what the folder has.
+        methods: a name that comes twice counts once.
+        n_lights: None in it stands for all lights; one evaluation for each. Empty for DEFAULT_LIGHTS, or for the
+            number in the draws file.
+        light_noise_deg: one evaluation for each.
+        trials: None for DEFAULT_TRIALS. jobs: None for the cores, or for 1 on a GPU.
+        pixels: (row, column) of each.
         cluster: the processes or machines that score trials; None for this process.
 
     Raises:
@@ -104,8 +98,6 @@ class EvaluateOptions:
                 "--lights estimate uses no light file, so it contradicts --refine-lights and --light-noise-deg",
                 hint="Leave these out",
             )
-        if self.jobs is not None and self.jobs < 1:
-            raise UsageError(f"--jobs is {self.jobs}; expected at least 1")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(
                 "--jobs contradicts --workers and --cluster", hint="Leave it out: a worker scores one trial at a time"
@@ -141,16 +133,8 @@ class EvaluateOptions:
         ]
 
 
-@dataclass(frozen=True)
-class EvaluateOutcome:
-    """What `evaluate` did.
-
-    Args:
-        evaluations: one for each protocol.
-        document: the content of results.json.
-        warnings: sentences for the user, for example on weights used with other lights than trained for.
-        figure_problems: why figures could not be drawn.
-    """
+class EvaluateOutcome(NamedTuple):
+    """One evaluation for each protocol, the content of results.json, warnings, and why figures could not be drawn."""
 
     evaluations: list[Evaluation]
     document: dict[str, Any]
@@ -163,10 +147,8 @@ def evaluate_captures(
 ) -> EvaluateOutcome:
     """Score the methods on the captures, and write the results to the output folder.
 
-    All options are checked before the first image is read.
-
-    Args:
-        datasets: folders of captures with ground truth, or such captures.
+    All options are checked before the first image is read. `datasets` are folders of captures with ground truth, or
+    such captures.
 
     Raises:
         UsageError: an option does not fit the captures or the methods.
@@ -177,8 +159,6 @@ def evaluate_captures(
     captures = [capture for dataset in datasets for capture in find_captures(dataset)]
     output, protocols = Path(options.output), options.protocols
     check_writable(output)
-    check_skip_first(protocols[0], list(distinct_names(captures).values()))
-    read_draws_file(protocols[0])
     _check_counts(captures, protocols)
     estimators = [make_estimator(name, options.method_options) for name in dict.fromkeys(options.methods)]
     if options.method_options.weights is not None and not any(estimator.weights for estimator in estimators):
@@ -187,7 +167,7 @@ def evaluate_captures(
     jobs = 1 if any(estimator.device.startswith("cuda") for estimator in estimators) else count_available_cores()
     elsewhere: Elsewhere | None = None
     if (cluster := options.cluster and options.cluster.on_cores()) is not None:
-        elsewhere = partial(score_on_workers, estimators, options.method_options, cluster, output, observer)
+        elsewhere = partial(_score_on_workers, estimators, options.method_options, cluster, output, observer)
     with held_folder(output, observer.warn):
         with observer.progress("evaluating", 1.0) as advance:
             evaluations = evaluate_all(
@@ -197,15 +177,17 @@ def evaluate_captures(
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
                 jobs=options.jobs or jobs,
                 elsewhere=elsewhere,
-                on_progress=_follow(advance),
+                on_progress=advance,
             )
-        plots = make_plots(evaluations)
         figures: list[CaptureFigure] | None = None
         problems: list[str] = []
         if options.figures:
             figures, problems = _draw_figures(captures, estimators, evaluations[0], options.pixels, observer)
-        document = write_results(output, evaluations, plots, figures)
-    return EvaluateOutcome(evaluations, document, _untrained(evaluations), problems)
+        document = write_results(output, evaluations, make_plots(evaluations), figures)
+    used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
+    counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
+    untrained = [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]
+    return EvaluateOutcome(evaluations, document, untrained, problems)
 
 
 def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> None:
@@ -217,19 +199,6 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
             raise UsageError(f"{protocol.n_lights} lights were requested, but the captures have at most {most}")
-
-
-def _follow(advance: Callable[..., None]) -> Callable[[float, int, str], None]:
-    """Return a callback that moves a bar of length 1 with the trials."""
-    shown = 0.0
-
-    def follow(done: float, total: int, note: str) -> None:
-        nonlocal shown
-        share = done / total if total else 1.0
-        advance(share - shown, note)
-        shown = share
-
-    return follow
 
 
 def _draw_figures(
@@ -252,8 +221,74 @@ def _draw_figures(
     return figures, problems
 
 
-def _untrained(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Return warnings about shipped weights that were used with numbers of lights they were not trained for."""
-    used = [weights for settings in evaluations[0].settings.values() if (weights := settings["weights"])]
-    counts = sorted({result.n_lights for evaluation in evaluations for result in evaluation.results})
-    return [warning for weights in used for k in counts for warning in untrained_warning(weights["sha256"], k)]
+def _score_on_workers(
+    estimators: Sequence[Estimator],
+    method_options: MethodOptions,
+    cluster: ClusterOptions,
+    output: Path,
+    observer: Observer,
+    draws: Sequence[DrawTask],
+) -> Iterator[tuple[DrawTask, Scored]]:
+    """Yield the draws with their scores as they end: one item a draw. Only this process writes the store of trials.
+
+    Raises:
+        LostError: the workers of a draw were lost. All others are scored.
+        SplinecliError: what a trial or Distributor.run raises.
+    """
+    fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
+    score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
+    lost: LostError | None = None
+    with distributor(score, output, cluster, observer) as workers:
+        for item, result in workers.run(_items(draws)):
+            if isinstance(result, LostError):
+                lost = result
+            else:
+                yield item.args[0], result
+    if lost is not None:
+        raise lost
+
+
+def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
+    folder, memory = None, 0.0
+    for draw in draws:
+        if draw.reading.folder != folder:
+            folder = draw.reading.folder
+            memory = source_bytes(lambda: open_capture(folder))  # noqa: B023 - called here
+        yield Item((draw,), draw.reading.name, memory)
+
+
+def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
+    return _scorer(command, fingerprints, options).score(draw)
+
+
+@lru_cache(maxsize=1)
+def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
+    """Return the scorer of the command that this worker serves: files may change until the next command."""
+    estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
+    for name, expected in fingerprints:
+        if (found := estimators[name].fingerprint) != expected:
+            raise ModelError(
+                f"{name} is {found} here, expected {expected} as on the machine of the command",
+                hint="Use the same weight file everywhere, and the same --precision",
+            )
+    return _Scorer(estimators)
+
+
+class _Scorer:
+    """Scores draws, and keeps the last capture in memory."""
+
+    def __init__(self, estimators: dict[str, Estimator]) -> None:
+        self._estimators = estimators
+        self._last: tuple[CaptureReading, TrialSource, Notes] | None = None
+
+    def score(self, task: DrawTask) -> Scored:
+        if self._last is None or self._last[0] != task.reading:
+            self._last = None  # frees the memory
+            reading = task.reading
+            try:
+                self._last = reading, *reading.read(open_to_score(reading.folder, reading.protocols[0]))
+            except (InputError, UsageError) as error:
+                return error
+        _, source, notes = self._last
+        shared = SharedDraw(source)
+        return [shared.score(trial, self._estimators[trial.method]) for trial in task.trials], notes

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
@@ -46,7 +45,15 @@ def unpacked(
     refuse_link(folder)
     with held_folder(folder, observer.warn):
         of_film, sizes = _earlier(folder)
-        _refuse_others(folder, sizes)
+        # Other files would count as photographs, or as a mask.
+        known = {*sizes, _RECORD}
+        others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
+        if others and (sizes or not all(map(_FRAME.fullmatch, others))):
+            raise RefusedFolderError(
+                f"contains {others[0]}, which is no frame of this film",
+                path=folder,
+                hint="Move it, or choose another -o",
+            )
         whole = all(is_plain(folder / name) and (folder / name).stat().st_size == sizes[name] for name in sizes)
         if of_film == stamp and whole and redo != "all":
             return folder
@@ -78,13 +85,3 @@ def _earlier(folder: Path) -> tuple[str, dict[str, int]]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         pass
     return "", {}
-
-
-def _refuse_others(folder: Path, frames: Collection[str]) -> None:
-    """Raise RefusedFolderError for files that are no frames: they would count as photographs, or as a mask."""
-    known = {*frames, _RECORD}
-    others = sorted(e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith("."))
-    if others and not (not frames and all(map(_FRAME.fullmatch, others))):
-        raise RefusedFolderError(
-            f"contains {others[0]}, which is no frame of this film", path=folder, hint="Move it, or choose another -o"
-        )

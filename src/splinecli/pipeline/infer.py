@@ -16,6 +16,7 @@ from splinecli.capture.capture_size import results_bytes
 from splinecli.capture.formats.image_size import check_memory
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_refinement import refine_capture
+from splinecli.capture.stamp import digest
 from splinecli.diagnosis.checks import check_capture
 from splinecli.errors import OutputError, UsageError
 from splinecli.inference import NormalEstimate
@@ -25,7 +26,6 @@ from splinecli.pictures.light_sky import sky_plot
 from splinecli.pictures.maps import albedo_picture
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.estimate import estimate_capture
-from splinecli.pipeline.finished import inputs_sha256
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import make_surface, view_of_report
@@ -37,6 +37,7 @@ from splinecli.results.report import report_of
 from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
+from splinecli.system.files import file_sha256
 from splinecli.system.publishing import Content, held_folder, refuse_link
 
 
@@ -49,9 +50,6 @@ def infer_capture(
     other process may write there.
 
     Args:
-        folder: the capture.
-        options: how to read it, which method to run, what to write.
-        observer: receives warnings and progress.
         estimator: what `make_method(options)` returned; it saves time in a batch.
 
     Raises:
@@ -104,6 +102,16 @@ def infer_capture(
         )
 
 
+def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
+    """Return a digest that changes when any file that is read for the capture, or the weight file, changes.
+
+    `loaded` is the SHA-256 of the weight file when it was loaded; None reads the file.
+    """
+    if weights is not None and Path(weights).is_file():
+        weights = loaded or file_sha256(Path(weights))
+    return digest([*source.stamp, weights])
+
+
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
     """Hold the folder of results of a capture (see held_folder) and yield it. Raises OutputError."""
@@ -116,9 +124,7 @@ def held_results(name: str, options: InferOptions, observer: Observer) -> Iterat
 def make_method(options: InferOptions) -> Estimator:
     """Return the estimator that the options ask for. Loading a network takes about a second.
 
-    Raises:
-        UsageError: the method uses no weights or gives no confidence, and the options ask for it.
-        ModelError: the weights cannot be used.
+    Raises UsageError if the method uses no weights or gives no confidence, and the options ask for it, or ModelError.
     """
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:

@@ -25,27 +25,15 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 @dataclass(frozen=True, kw_only=True)
 class InferOptions(Reading):
-    """How `infer` reads a capture (see Reading), estimates its normals, and what it writes.
+    """The options of `infer`, as its help describes them.
 
     Two records are equal if they give the same results. `output` and `device` do not count.
 
     Args:
-        refine_lights: refine rough light directions.
-        auto_mask: find the object where the capture has no mask.
-        as_stored: use the stored values alone. By default, saturated pixels are restored and unknown light
-            intensities are estimated.
-        n_lights, seed: use this many lights, drawn with this seed. None for all lights.
-        light_indices: use these lights, counted from 0.
-        method: a name that `splinecli.methods.method_names` lists.
-        weights: a shipped name or a file. None for the method's own.
-        distil: learn the network on a sample of the pixels; False for the network on every pixel, None for the faster.
-        output: results go to `output`/<capture name>/.
-        formats: names of `splinecli.results.files.NORMALS`. With exr, albedo and depth are EXR files, too.
-        maps: names of `splinecli.results.files.MAPS`.
+        n_lights: None for all. light_indices: counted from 0.
+        distil: False for the method on every pixel, None for the faster way.
+        formats, maps: names of `splinecli.results.files.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
-        html: also write page.html. surface: also write the depth map and the mesh; pixel_size, in millimetres, then
-            scales it, too. stiffness: how easily that surface tears; see integrate_normals.
-        convention: direction of the green channel in PNG files.
 
     Raises:
         UsageError: a value is unknown, or two options contradict each other.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -42,90 +42,73 @@ ORIGINS = {
 """The sources of a white level, for people."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class InfoOptions:
-    """Which capture `info` reads, and how.
+def describe_capture(
+    capture: Path,
+    reading: Reading | None = None,
+    observer: Observer = SILENT,
+    *,
+    plot: Path | None = None,
+    overwrite: bool = False,
+    check_lights: bool = False,
+    mended_lights: Path | None = None,
+) -> dict[str, Any]:
+    """Read a capture without estimating normals, write the plot and the mended lights, and return the report.
 
     Args:
-        capture: the folder of the capture.
         reading: how `infer` would read it. With its `strict`, what could not be checked is a warning, too.
-        plot: a PNG file that a plot of the lights is written to.
-        overwrite: replace an earlier plot, and earlier mended lights.
-        check_lights: also list the readings of the light file that were compared.
-        mended_lights: a text file for the light directions in the reading that fits best, if the given one does not.
-    """
-
-    capture: Path
-    reading: Reading = field(default_factory=Reading)
-    plot: Path | None = None
-    overwrite: bool = False
-    check_lights: bool = False
-    mended_lights: Path | None = None
-
-    def __post_init__(self) -> None:
-        """Raise UsageError for options that contradict each other."""
-        for name, given in (("--check-lights", self.check_lights), ("--mended-lights", self.mended_lights)):
-            if given and self.reading.finds_lights:
-                raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
-
-
-def describe_capture(options: InfoOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Read a capture without estimating normals, and return the report.
-
-    The plot is written if there is one.
+        plot, overwrite, check_lights, mended_lights: as in the help of `info`.
 
     Raises:
         InputError: the folder has no capture, or a file cannot be read.
-        OutputError: the plot exists and `overwrite` is not set, or it cannot be written.
-        UsageError: the plot would be in the folder of the images, or an option is out of range.
+        OutputError: a file exists and `overwrite` is not set, or it cannot be written.
+        UsageError: the plot would be in the folder of the images, or options contradict each other.
     """
+    reading = reading or Reading()
+    for name, given in (("--check-lights", check_lights), ("--mended-lights", mended_lights is not None)):
+        if given and reading.finds_lights:
+            raise UsageError(f"{name} checks a light file, and --lights estimate reads none", hint="Leave one out")
     with TemporaryDirectory() as frames:  # of a film
-        folder = unpacked(options.capture, Path(frames), options.reading, observer, redo="all")
-        return _describe(replace(options, capture=folder), observer)
-
-
-def _describe(options: InfoOptions, observer: Observer) -> dict[str, Any]:
-    source = options.reading.open(options.capture)
-    if options.plot is not None:
-        if options.plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-            raise UsageError(
-                f"the plot {options.plot} would be in the folder of the images and count as an image of the capture",
-                hint="Choose another folder for it",
-            )
-        check_free(options.plot.parent, [options.plot.name], overwrite=options.overwrite)
-    if options.mended_lights is not None:
-        if source.lamps is not None and source.lamps.used:
-            raise UsageError("--mended-lights writes directions, but the lights are near lamps")
-        check_free(options.mended_lights.parent, [options.mended_lights.name], overwrite=options.overwrite)
-    with observer.progress("reading", len(source.files.images)) as advance:
-        summary = summarise_capture(source, progress=lambda: advance(1))
-    summary, found_lights = _with_found_lights(summary)
-    source = summary.source
-    if options.plot is not None:
-        errors_deg = None if found_lights is None else found_lights.errors_deg
-        write_bytes(options.plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
-    check, warnings = None, summary.warnings()
-    if summary.sample is not None and summary.closeup is not None:
-        lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
-        check, found = check_sample(lights, summary.sample, summary.closeup, strict=options.reading.strict)
-        warnings += found
-    if found_lights is not None:
-        warnings.append(estimated_lights(found_lights.errors_deg))
-    for warning in warnings:
-        observer.warn(str(warning))
-    report = {
-        **_report(summary, found_lights),
-        "warnings": [str(warning) for warning in warnings],
-        "warning_codes": [warning.code for warning in warnings],
-    }
-    if options.mended_lights is not None:
-        mended = None if check is None or check.odd_image is not None else check.mended
-        if mended is not None:
-            write_bytes(options.mended_lights, rows_text(mended).encode())
-        report["mended_lights"] = None if mended is None else str(options.mended_lights)
-    if options.check_lights:
-        report["light_candidates"] = [] if check is None else candidate_rows(check)
-    return report
+        source = reading.open(unpacked(capture, Path(frames), reading, observer, redo="all"))
+        if plot is not None:
+            if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
+                raise UsageError(
+                    f"the plot {plot} would be in the folder of the images and count as an image of the capture",
+                    hint="Choose another folder for it",
+                )
+            check_free(plot.parent, [plot.name], overwrite=overwrite)
+        if mended_lights is not None:
+            if source.lamps is not None and source.lamps.used:
+                raise UsageError("--mended-lights writes directions, but the lights are near lamps")
+            check_free(mended_lights.parent, [mended_lights.name], overwrite=overwrite)
+        with observer.progress("reading", len(source.files.images)) as advance:
+            summary = summarise_capture(source, progress=lambda: advance(1))
+        summary, found_lights = _with_found_lights(summary)
+        source = summary.source
+        if plot is not None:
+            errors_deg = None if found_lights is None else found_lights.errors_deg
+            write_bytes(plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
+        check, warnings = None, summary.warnings()
+        if summary.sample is not None and summary.closeup is not None:
+            lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
+            check, found = check_sample(lights, summary.sample, summary.closeup, strict=reading.strict)
+            warnings += found
+        if found_lights is not None:
+            warnings.append(estimated_lights(found_lights.errors_deg))
+        for warning in warnings:
+            observer.warn(str(warning))
+        report = {
+            **_report(summary, found_lights),
+            "warnings": [str(warning) for warning in warnings],
+            "warning_codes": [warning.code for warning in warnings],
+        }
+        if mended_lights is not None:
+            mended = None if check is None or check.odd_image is not None else check.mended
+            if mended is not None:
+                write_bytes(mended_lights, rows_text(mended).encode())
+            report["mended_lights"] = None if mended is None else str(mended_lights)
+        if check_lights:
+            report["light_candidates"] = [] if check is None else candidate_rows(check)
+        return report
 
 
 def summary_lines(report: dict[str, Any]) -> list[str]:

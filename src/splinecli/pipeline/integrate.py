@@ -35,30 +35,7 @@ INPUT_FORMATS = ("npy", "tiff", "png", "png8")  # of the normal map in a folder,
 
 @dataclass(frozen=True, kw_only=True)
 class IntegrateOptions:
-    """Which normal map `integrate` reads, how it integrates it, and what it writes.
-
-    Args:
-        normals: a normal map, or a folder that `infer` wrote.
-        output: the folder of the results. None for the folder of the normal map.
-        mask: a mask image. None takes all pixels that have a normal.
-        camera_matrix: a text file of 3 x 3 numbers, for a perspective camera. None for that of the report of `infer`
-            beside the normal map, or else for an orthographic camera.
-        stiffness: how easily the surface tears at edges. 0 never tears it.
-        prior: a depth map of the same view from elsewhere, for the shape in the large. None for the normals alone.
-        prior_detail: the width in pixels below which the shape is that of the normals. None chooses it.
-        largest_step: leaves out triangles that are higher, in pixels. None keeps all.
-        pixel_size: the width of a pixel on the object in millimetres. None for that of the report, or else for a
-            surface without this unit.
-        decimate: the number of triangles that the mesh is reduced to. None keeps all.
-        colours: an image of the colours of the object. None for the albedo in the folder of the normal map, if any.
-        formats: keys of `splinecli.surface.surface_files.SURFACE_FILES`.
-        convention: direction of the green channel of normal maps that are pictures. None for that of the report, or
-            else opengl.
-        overwrite: replace earlier results.
-
-    Raises:
-        UsageError: a format is unknown, or a number is out of range.
-    """
+    """The options of `integrate`, as its help describes them; None is the default in the help. Raises UsageError."""
 
     normals: Path
     output: Path | None = None

@@ -2,61 +2,58 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.errors import InputError, UsageError
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
+from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import SILENT, Advance, Observer
-from splinecli.pipeline.prepare_on_workers import render_on_workers
 from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
-from splinecli.pixel_sets.rendered import ScenePlan, add_scene
+from splinecli.pixel_sets.rendered import (
+    ScenePlan,
+    add_rendered,
+    add_scene,
+    has_scene,
+    load_rendered,
+    render_planned,
+    save_rendered,
+)
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
-from splinecli.system.files import check_writable, write_bytes
+from splinecli.system.files import UNFINISHED, as_input_error, check_writable, write_bytes
 from splinecli.system.publishing import held_folder
 
 CONTACT_SHEET = "contact_sheet.png"
 
 
-@dataclass(frozen=True, kw_only=True)
-class PrepareOptions:
-    """What `prepare` puts into a pixel set.
-
-    Args:
-        output: the folder of the set, new or an earlier set to add to.
-        captures: folders of captures with ground truth.
-        scenes: the scenes to render.
-        as_stored: use the stored values of captures alone, see add_capture.
-        white_level: stored value from which a pixel of a capture counts as saturated; None to find it.
-        update: read captures again that changed since they were added.
-        cluster: the processes that render scenes; None for this process.
-
-    Raises:
-        UsageError: there is nothing to prepare.
-    """
-
-    output: Path
-    captures: tuple[Path, ...]
-    scenes: ScenePlan
-    as_stored: bool = False
-    white_level: float | None = None
-    update: bool = False
-    cluster: ClusterOptions | None = None
-
-    def __post_init__(self) -> None:
-        if not self.captures and not self.scenes.names:
-            raise UsageError("nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE")
-
-
-def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
+def prepare_pixel_set(
+    output: Path,
+    captures: Sequence[Path],
+    plan: ScenePlan,
+    *,
+    as_stored: bool = False,
+    white_level: float | None = None,
+    update: bool = False,
+    cluster: ClusterOptions | None = None,
+    observer: Observer = SILENT,
+) -> dict[str, Any]:
     """Write a pixel set, or add to it, and return its summary.
 
     A capture that cannot be used is left out, and the observer receives the error. Every other error ends the work.
     The same call then continues where it stopped.
+
+    Args:
+        output: the folder of the set, new or an earlier set to add to.
+        as_stored, white_level: see add_capture.
+        update: read captures again that changed since they were added.
+        cluster: the processes that render scenes; None for this process.
 
     Returns:
         The values that `prepare --json` prints. `skipped` lists the captures that were left out, each with the
@@ -65,21 +62,36 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     Raises:
         InputError: a mesh cannot be used.
         OutputError: the set cannot be written, or has a scene that was rendered with other settings.
-        UsageError: the packages of the extra `render` are not installed.
+        UsageError: there is nothing to prepare, or the packages of the extra `render` are not installed.
     """
-    check_writable(options.output)
-    options.scenes.check_inputs()
-    with held_folder(options.output, observer.warn):
-        writer = PixelSetWriter(options.output)
-        options.scenes.check_set(writer)
-        captures = name_captures(options.captures, writer)
-        with observer.progress("preparing", len(captures) + len(options.scenes.names)) as advance:
-            skipped = _add_captures(writer, captures, options, observer, advance)
-            _add_scenes(writer, options, observer, advance)
-        pixel_set = PixelSet(options.output, ())
+    if not captures and not plan.names:
+        raise UsageError("nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE")
+    check_writable(output)
+    plan.check_inputs()
+    cluster = cluster and cluster.on_cores(len(plan.names))
+    with held_folder(output, observer.warn):
+        writer = PixelSetWriter(output)
+        plan.check_set(writer)
+        named = name_captures(captures, writer)
+        with observer.progress("preparing", len(named) + len(plan.names)) as advance:
+            skipped: list[dict[str, Any]] = []
+            for name, folder in named.items():
+                try:
+                    add_capture(writer, name, folder, as_stored=as_stored, white_level=white_level, update=update)
+                    observer.say(writer.describe(name))
+                except (InputError, CaptureChangedError, OSError) as refused:
+                    error = as_input_error(refused, folder) if isinstance(refused, OSError) else refused
+                    observer.error(str(error))
+                    skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
+                advance(1)
+            if cluster is None:
+                _render_here(writer, plan, observer, advance)
+            else:
+                _render_on_workers(writer, plan, cluster, observer, advance)
+        pixel_set = PixelSet(output, ())
         if len(writer):
             # Before the set counts as finished, so that a finished set has its own overview.
-            write_bytes(options.output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
+            write_bytes(output / CONTACT_SHEET, encode_png(contact_sheet(writer.pixel_set)))
             pixel_set = writer.finish()
     return {
         "set": str(pixel_set.folder),
@@ -93,47 +105,7 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     }
 
 
-def _add_captures(
-    writer: PixelSetWriter, captures: dict[str, Path], options: PrepareOptions, observer: Observer, advance: Advance
-) -> list[dict[str, Any]]:
-    """Add the captures and return those that were left out. Raises OutputError if the set cannot be written."""
-    skipped: list[dict[str, Any]] = []
-    for name, folder in captures.items():
-        error: SplinecliError | None = None
-        try:
-            add_capture(
-                writer,
-                name,
-                folder,
-                as_stored=options.as_stored,
-                white_level=options.white_level,
-                update=options.update,
-            )
-        except (InputError, CaptureChangedError) as refused:
-            error = refused
-        except OSError as refused:
-            error = InputError(f"cannot be read ({refused.strerror or refused})", path=refused.filename or folder)
-        if error is None:
-            observer.say(writer.describe(name))
-        else:
-            observer.error(str(error))
-            skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
-        advance(1)
-    return skipped
-
-
-def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Observer, advance: Advance) -> None:
-    plan = options.scenes
-    cluster = None if options.cluster is None else options.cluster.on_cores(len(plan.names))
-    if cluster is not None:
-
-        def show(position: int) -> None:
-            for name in plan.entry_names(position).values():
-                observer.say(writer.describe(name))
-            advance(1)
-
-        render_on_workers(writer, plan, cluster, observer, show)
-        return
+def _render_here(writer: PixelSetWriter, plan: ScenePlan, observer: Observer, advance: Advance) -> None:
     for position in range(len(plan.names)):
         done = 0.0
 
@@ -145,3 +117,56 @@ def _add_scenes(writer: PixelSetWriter, options: PrepareOptions, observer: Obser
         for name in add_scene(writer, plan, position, reach):
             observer.say(writer.describe(name))
         reach(1.0)
+
+
+def _render_on_workers(
+    writer: PixelSetWriter, plan: ScenePlan, cluster: ClusterOptions, observer: Observer, advance: Advance
+) -> None:
+    """Render the scenes that the set does not have, and add them in the order of the plan, as one process does.
+
+    A worker writes a scene to a hidden file of the set. This process alone adds it to the set.
+
+    Raises:
+        LostError: the workers of a scene were lost. The other scenes are in the set.
+        SplinecliError: what add_scene or Distributor.run raises.
+    """
+    numbers = range(len(plan.names))
+    missing = [number for number in numbers if not has_scene(writer, plan, number)]
+    in_set = ((number, None) for number in numbers if number not in missing)
+    rendered: dict[int, str | LostError | None] = {}
+    render = partial(_render, replace(plan), writer.folder)  # the plan without what it has read from files
+    position = 0
+    try:
+        with distributor(render, writer.folder, cluster, observer) as workers:
+            ended = ((item.args[0], shape) for item, shape in workers.run(Item((n,), plan.names[n]) for n in missing))
+            for number, result in chain(in_set, ended):
+                rendered[number] = result
+                while position in rendered:
+                    shape = rendered[position]
+                    if isinstance(shape, str):
+                        path = _path(writer.folder, position)
+                        add_rendered(writer, plan, position, shape, partial(load_rendered, path))
+                        path.unlink()
+                    if not isinstance(shape, LostError):
+                        for name in plan.entry_names(position).values():
+                            observer.say(writer.describe(name))
+                        advance(1)
+                    position += 1
+    finally:
+        for number in missing:
+            _path(writer.folder, number).unlink(missing_ok=True)
+    for result in rendered.values():
+        if isinstance(result, LostError):
+            raise result
+
+
+def _path(folder: Path, position: int) -> Path:
+    return folder / f".scene{position}{UNFINISHED}"
+
+
+def _render(plan: ScenePlan, folder: Path, position: int) -> str:
+    """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
+    plan.check_inputs()
+    rendered = render_planned(plan, position)
+    save_rendered(rendered, _path(folder, position))
+    return rendered.shape

@@ -23,26 +23,9 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """Which files make a capture, and how they are read.
+    """Which files make a capture, and how they are read: options of `infer` and `info`, as their help describes them.
 
-    Args:
-        lights, mask, ground_truth: files that replace those of the capture. `lights` may be "estimate": the directions
-            are found from the images.
-        first_light: the side of the image from which the first of these lights comes: left, right, above or below.
-        intensities: a file of light intensities, or "equal".
-        lights_format: xyz for vectors; azel or slant-tilt for angles in degrees.
-        light_frame: the frame of the light file, such as "x-left,y-down". None for x right, y up, z to the camera.
-        strict: fail where a warning says that the lights or images are probably wrong.
-        light_positions, light_distance, pixel_size, object_width, camera_matrix: near lamps; see LampOptions.
-        crop: the box X,Y,W,H of the images that is read; None for whole images.
-        scale: 1/N to read one of N rows and columns; None for all.
-        transfer: the curve of the images: auto, linear, srgb or gamma:G.
-        ambient: an image without any of the lights.
-        flat_field: a folder of images of an evenly white surface.
-        white_level: stored value from which a pixel counts as saturated, such as 4095. None to find it.
-
-    Raises:
-        UsageError: a value is unknown, or two options contradict each other.
+    None is the default in the help. Raises UsageError.
     """
 
     lights: str | None = None
@@ -67,9 +50,20 @@ class Reading:
     surface = False  # is made of the capture, too, in the unit of pixel_size; a field of InferOptions
 
     def __post_init__(self) -> None:
-        if self.finds_lights:
-            self._check_found_lights()
-        elif self.first_light is not None:
+        # These concern a light file or near lamps.
+        reasons = {
+            "--light-positions": self.light_positions is not None and "finds distant lights",
+            "--light-distance": self.light_distance is not None and "finds distant lights",
+            "--light-frame": self.light_frame is not None and "needs no light file",
+            "--lights-format": self.lights_format != "xyz" and "needs no light file",
+        }
+        for option, reason in reasons.items():
+            if self.finds_lights and reason:
+                raise UsageError(
+                    f"--lights estimate {reason}, so it contradicts {option}",
+                    hint=f"Leave {option} out, or give a light file",
+                )
+        if self.first_light is not None and not self.finds_lights:
             raise UsageError("--first-light needs --lights estimate", hint="Add it, or leave both out")
         if self.first_light is not None:
             check_one_of("first light", self.first_light, get_args(FirstLight))
@@ -83,21 +77,6 @@ class Reading:
     def finds_lights(self) -> bool:
         """Whether the lights are found from the images."""
         return self.lights == ESTIMATE
-
-    def _check_found_lights(self) -> None:
-        """Raise UsageError for options that concern a light file or near lamps."""
-        reasons = {
-            "--light-positions": self.light_positions is not None and "finds distant lights",
-            "--light-distance": self.light_distance is not None and "finds distant lights",
-            "--light-frame": self.light_frame is not None and "needs no light file",
-            "--lights-format": self.lights_format != "xyz" and "needs no light file",
-        }
-        for option, reason in reasons.items():
-            if reason:
-                raise UsageError(
-                    f"--lights estimate {reason}, so it contradicts {option}",
-                    hint=f"Leave {option} out, or give a light file",
-                )
 
     @property
     def light_file(self) -> str | None:

@@ -78,7 +78,7 @@ def make_surface(
         "camera": "orthographic" if camera_matrix is None else "perspective",
         "unit": unit,
         "pixel_size_mm": pixel_size_mm,
-        "range": [_round(float(end(depth))) for end in (np.nanmin, np.nanmax)],
+        "range": [float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax)],  # the digits of float32
         "n_vertices": len(mesh.vertices),
         "n_triangles": len(mesh.triangles),
         "normal_texture": mesh.normal_texture is not None,
@@ -114,8 +114,3 @@ def check_pixel_size(pixel_size: float | None) -> None:
     """Raise UsageError for a pixel size (mm) out of range."""
     if pixel_size is not None and not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
         raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}")
-
-
-def _round(value: float) -> float:
-    """Round a number to as many significant digits as float32 has."""
-    return float(f"{value:.7g}")

@@ -101,9 +101,7 @@ def write_estimate(
     The files replace those of an earlier run in the folder (see new_files). The caller holds the folder.
 
     Args:
-        estimate: the result.
         report: what report_of returned.
-        folder: the capture's folder of results.
         formats: keys of NORMALS.
         convention: whether green is y up or y down in pictures of normals.
         clock: tells the seconds of all stages, of which writing is the last.

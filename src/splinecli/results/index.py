@@ -43,23 +43,6 @@ class Row(NamedTuple):
 HEADER = Row("capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error")
 
 
-def row_of(report: Mapping[str, Any]) -> Row:
-    """Return the row of a report (see report_of) or of a document with `capture` and `error`."""
-    if "error" in report:
-        return Row(report["capture"], error=report["error"])
-    errors, expected = report["angular_error_deg"], report["expected_under_5"]
-    seconds = report["seconds"]
-    return Row(
-        report["capture"],
-        lights=str(report["n_lights"]),
-        pixels=f"{report['n_pixels']:,}",
-        mae="" if errors is None else f"{errors['mean']:.2f}°",
-        likely="" if expected is None else f"{expected:.0%}",
-        warnings=str(len(report["warnings"]) or ""),
-        seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
-    )
-
-
 class Entry(NamedTuple):
     """What the page shows of one capture: its row, the names of its files, and its warnings."""
 
@@ -69,18 +52,24 @@ class Entry(NamedTuple):
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> Entry:
-        """Return the entry of a report, or of a document with `capture` and `error`."""
-        words = tuple(str(warning["text"]) for warning in report.get("warnings", ()))
-        return cls(row_of(report), tuple(report.get("files", ())), words)
+        """Return the entry of a report (see report_of), or of a document with `capture` and `error`."""
+        if "error" in report:
+            return cls(Row(report["capture"], error=report["error"]))
+        errors, expected, seconds = report["angular_error_deg"], report["expected_under_5"], report["seconds"]
+        row = Row(
+            report["capture"],
+            lights=str(report["n_lights"]),
+            pixels=f"{report['n_pixels']:,}",
+            mae="" if errors is None else f"{errors['mean']:.2f}°",
+            likely="" if expected is None else f"{expected:.0%}",
+            warnings=str(len(report["warnings"]) or ""),
+            seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
+        )
+        return cls(row, tuple(report["files"]), tuple(str(warning["text"]) for warning in report["warnings"]))
 
 
 def index_page(entries: Sequence[Entry], output: Path) -> str:
-    """Return the page that shows small normal maps and links the files. It belongs beside the captures' folders.
-
-    Args:
-        entries: one of each capture.
-        output: the folder that has the captures' folders.
-    """
+    """Return the page that shows small normal maps and links the files, for the folder of the captures' folders."""
     rows = []
     for row, files, words in entries:
         # As bytes, because a folder's name may not be valid text.

@@ -69,6 +69,7 @@ def result_page(
     (height, width), size = shown.shape, _size(shown)
     is_reduced = shown.shape != mask.shape
     stops = colour_errors(np.linspace(0, TOP_DEG, 16)[None])[0]
+    figures = report["angular_error_deg"]
     millimetres = (report.get("surface") or {}).get("pixel_size_mm")
     return render(
         "page.html",
@@ -80,7 +81,15 @@ def result_page(
         else None,
         unit="pixels" if millimetres is None else "mm",
         units_per_pixel=mask.shape[1] / width * (millimetres or 1),
-        errors=_errors(report),
+        errors=[]
+        if figures is None
+        else [
+            ("Mean", f"{figures['mean']:.2f}°"),
+            ("Median", f"{figures['median']:.2f}°"),
+            ("90th percentile", f"{figures['p90']:.2f}°"),
+            ("Under 5°", f"{figures['under_5']:.1%}"),
+            ("Under 10°", f"{figures['under_10']:.1%}"),
+        ],
         width=width,
         height=height,
         light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
@@ -160,19 +169,6 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
         *([] if reduced is None else [("Size on this page", reduced)]),
         ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:g}" for name, n in seconds if n and name != "total")),
         ("Device", f"{report['device']}, {report['precision']}"),
-    ]
-
-
-def _errors(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    errors = report["angular_error_deg"]
-    if errors is None:
-        return []
-    return [
-        ("Mean", f"{errors['mean']:.2f}°"),
-        ("Median", f"{errors['median']:.2f}°"),
-        ("90th percentile", f"{errors['p90']:.2f}°"),
-        ("Under 5°", f"{errors['under_5']:.1%}"),
-        ("Under 10°", f"{errors['under_10']:.1%}"),
     ]
 
 

@@ -31,8 +31,6 @@ def report_of(
     write_estimate adds `seconds`, `folder` and `files`.
 
     Args:
-        estimate: the result. Its capture has what the user should know about it as warnings.
-        estimator: the method that made it.
         options: the options of the run, ready for JSON.
         inputs: a digest that changes when an input file changes.
         light_file: the file that gave the lights; None where they were found from the images.

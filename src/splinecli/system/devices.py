@@ -14,11 +14,7 @@ if TYPE_CHECKING:
 
 
 def choose_device(name: Literal["auto", "cpu", "cuda"] | str) -> torch.device:
-    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU.
-
-    Raises:
-        UsageError: the name is unknown, or there is no CUDA GPU.
-    """
+    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises UsageError."""
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
     import torch

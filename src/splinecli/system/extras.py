@@ -30,9 +30,7 @@ def import_extra(
     """Import a module of an extra when it is used for the first time.
 
     Args:
-        module: full name of the module.
         extra: a key of _PROBLEMS.
-        error: the exception to raise.
         path: the file that cannot be read without the module, for the message.
         otherwise: another way out, for the message.
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from splinecli.errors import OutputError
+from splinecli.errors import InputError, OutputError
 
 UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
 _MOST_JSON = 1 << 24  # bytes of a file
@@ -33,11 +33,7 @@ def create_hidden(folder: Path) -> IO[bytes]:
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[list[Path]]:
-    """Make a folder, and yield those that were made: it and its parents. At the end, empty ones are removed again.
-
-    Raises:
-        OSError: the folder cannot be made.
-    """
+    """Make a folder, and yield those that were made: it and its parents. At the end, empty ones are removed again."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,10 +49,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Yield a new file that takes the place of `path` after the block, so that it appears complete or not at all.
 
     It is written beside its place and renamed. The rename replaces a link, it does not follow it. Folders are made as
-    needed.
-
-    Raises:
-        OutputError: the file cannot be written.
+    needed. Raises OutputError.
     """
     temporary: Path | None = None
     with refusals_as_output_errors(path), made_folder(path.parent) as made:
@@ -100,11 +93,7 @@ def sync_names(folder: Path, *made: Path) -> None:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        ValueError: the text is no JSON, is nested too deeply, or has a number that no float can hold.
-    """
+    """Return the value of a JSON text. Raises ValueError, also if it is nested deeply or no float can hold a number."""
     try:
         return json.loads(text, parse_int=_whole_number)
     except RecursionError:
@@ -142,12 +131,13 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
         raise OutputError(f"cannot be written ({reason})", path=path, hint="Choose another place with -o") from error
 
 
-def check_writable(folder: Path) -> None:
-    """Check that a folder exists or can be made, and that files can be written into it.
+def as_input_error(error: OSError, folder: Path) -> InputError:
+    """Return what a system's refusal to read a capture means for the user."""
+    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or folder)
 
-    Raises:
-        OutputError: the path is a file, or permissions do not allow it.
-    """
+
+def check_writable(folder: Path) -> None:
+    """Raise OutputError unless a folder exists or can be made, and files can be written into it."""
     place = folder
     try:
         while not place.exists():
@@ -163,11 +153,7 @@ def check_writable(folder: Path) -> None:
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Check that a folder can be written into and has none of the named files, unless they may be replaced.
-
-    Raises:
-        OutputError: one of the files exists and `overwrite` is False, or check_writable fails.
-    """
+    """Raise OutputError as check_writable does, or if a folder has one of the named files and not `overwrite`."""
     check_writable(folder)
     for name in () if overwrite else names:
         if (folder / name).exists():

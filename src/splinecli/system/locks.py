@@ -29,9 +29,7 @@ class BusyError(RefusedFolderError):
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Make a folder and lock it.
 
-    Args:
-        folder: the folder.
-        wait: wait for another process that has locked the folder, instead of raising BusyError.
+    `wait` waits for another process that has locked the folder, instead of raising BusyError.
 
     Raises:
         BusyError: another process has locked the folder.

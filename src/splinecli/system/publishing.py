@@ -39,7 +39,6 @@ def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *,
     A folder that was made here and is empty at the end is removed, as are its parents.
 
     Args:
-        folder: the folder.
         warn: receives a sentence about what a killed process had left.
         wait: wait for another process that has locked the folder, instead of raising BusyError.
 
@@ -122,7 +121,6 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     that ends during the replacement leaves a folder without a report.
 
     Args:
-        folder: where the files belong.
         report: the name of the file that describes the others: removed first, written last. None where the caller takes
             care that no report names a file that changes.
         stale: names of earlier files that are removed if no new file replaces them.
