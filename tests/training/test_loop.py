@@ -146,23 +146,6 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
             replace(tiny, **settings)
 
 
-def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(tiny: TrainingConfig, tmp_path: Path) -> None:
-    first = Trainer(tiny, tmp_path / "first", CPU)
-    first.run()
-    grown = replace(tiny.network, set_width=16, set_layers=1)
-    config = replace(tiny, network=grown, start_from=str(tmp_path / "first" / WEIGHTS))
-    second = Trainer(config, tmp_path / "second", CPU)
-    (batch, _), *_ = second.task.draw(second.counters.step)[0]
-    with torch.no_grad():
-        plain, with_set = (
-            network.eval()(batch.observations, batch.light_directions, batch.valid).normals
-            for network in (load_weights(tmp_path / "first" / WEIGHTS).network, second.network)
-        )
-    torch.testing.assert_close(with_set, plain, atol=1e-6, rtol=0)
-    second.run()
-    assert any(value.any() for value in second.network.ne_net.join.parameters())
-
-
 def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "REPORT_STEPS", 4)
     seen: list[tuple[float, Metrics]] = []

@@ -25,7 +25,7 @@ def batch(tiny: TrainingConfig) -> PixelBatch:
 
 def test_validation_is_the_mean_angle_to_the_truth(network: SplineNet, batch: PixelBatch) -> None:
     network.train()
-    found = validation_deg(network, batch)
+    found = validation_deg(network, [batch])
     assert not network.training
     with torch.no_grad():
         normals = network(batch.observations, batch.light_directions, batch.valid).normals
@@ -35,7 +35,7 @@ def test_validation_is_the_mean_angle_to_the_truth(network: SplineNet, batch: Pi
 
 
 def test_the_maps_of_some_pixels(network: SplineNet, batch: PixelBatch) -> None:
-    shown = sample_maps(network, batch)
+    shown = sample_maps(network, [batch])
     assert len(shown.sparse) == len(shown.dense) == len(shown.truth) == len(shown.error_deg) == SHOWN_PIXELS
     views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     inside = cell_directions()[1].numpy()

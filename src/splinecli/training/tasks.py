@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splinecli.errors import UsageError
 from splinecli.networks.spline_net import SplineNet
-from splinecli.synthesis.batches import PixelBatch, join_batches
-from splinecli.training.config import TrainingConfig
+from splinecli.synthesis.batches import PixelBatch
+from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.objective import Losses, compute_losses, fixed, part_of_step
 from splinecli.training.refinement import (
     FIRST_EXAMPLES,
@@ -20,7 +21,7 @@ from splinecli.training.refinement import (
     refinement_losses,
     stack_maps,
 )
-from splinecli.training.sources import open_scenes, open_sources
+from splinecli.training.sources import Scenes, open_sets, pixel_source
 from splinecli.training.validation import SampleMaps, sample_maps, validation_deg
 
 VALIDATION_PIXELS = 2048
@@ -46,7 +47,7 @@ class PixelTask:
 
     Attributes:
         source: draws training pixels.
-        validation: the validation pixels.
+        validation: batches of validation pixels.
     """
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
@@ -56,17 +57,15 @@ class PixelTask:
         self.generator = torch.Generator(device)
         held = torch.Generator(device)
         held.manual_seed(stream_seed(config.seed, 0, _VALIDATION_STREAM))
-        sources = open_sources(config, self.generator, held)
-        self.source = sources.training
-        self._held = sources.validation
-        self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
+        self.sets = open_sets(config)
+        self.source = pixel_source(config, self.sets.training, self.generator)
+        self._held = pixel_source(config, self.sets.validation, held, validates=True)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
         if rank == 0:
             pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
-            draws = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
-            self.validation = join_batches(draws)
+            self.validation = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
 
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
@@ -118,22 +117,31 @@ class RefinementTask:
         self.shards = shards
         self.device = device
         self.generator = torch.Generator()
-        self.scenes = open_scenes(config)
-        self.sets, self.single_scene_sets = self.scenes.sets, self.scenes.single_scene_sets
+        if config.sources.get(GENERATOR, 0) > 0:
+            raise UsageError(
+                "the refinement net learns from pixel sets of rendered scenes,"
+                " and the sources name the pixel generator",
+                hint="Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset refine",
+            )
+        self.sets = open_sets(config)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        config, scenes = self.config, self.scenes
+        config = self.config
         seed = stream_seed(config.seed, rank, _POOL_STREAM)
         first = -(-step // STEPS_PER_EXAMPLE)  # of the captures, if one is added before step 0 and so on
-        self.pool = ScenePool(scenes.training, network, config.pixels, seed, first=first)
+        self.pool = self._pool(self.sets.training, network, seed, first=first)
         for _ in range(FIRST_EXAMPLES):
             self.pool.add()
         if rank == 0:
             seed = stream_seed(config.seed, 0, _VALIDATION_STREAM)
-            held = ScenePool(scenes.validation, network, config.pixels, seed)
+            held = self._pool(self.sets.validation, network, seed)
             for _ in range(VALIDATION_SCENES):
                 held.add()
             self.validation = [stack_maps([example]) for example in held.examples]
+
+    def _pool(self, scenes: Scenes, network: SplineNet, seed: int, *, first: int = 0) -> ScenePool:
+        weighted = [(*scenes[name], self.config.sources[name]) for name in scenes]
+        return ScenePool(weighted, network, self.config.pixels, seed, first=first)
 
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
         if step % STEPS_PER_EXAMPLE == 0:
