@@ -8,7 +8,6 @@ import torch
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
-from splinecli.errors import UsageError
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import CLASSES, draw_class
 from splinecli.synthesis.scenes import MIN_LIGHT_Z, SceneConfig, draw_lights, draw_patches, draw_scene, render_scene
@@ -93,9 +92,3 @@ def test_patches_are_connected_areas_of_about_one_size() -> None:
         # Voronoi cells are convex: their middle belongs to them, or to the face next to it.
         middle = np.linalg.norm(centres - here.mean(axis=0), axis=1).argsort()[:6]
         assert (patches[middle] == patch).any()
-
-
-@pytest.mark.parametrize("name", ["size", "lights", "samples", "directions", "bounces"])
-def test_settings_out_of_range(name: str) -> None:
-    with pytest.raises(UsageError, match=f"{name} is -1"):
-        SceneConfig(**{name: -1})

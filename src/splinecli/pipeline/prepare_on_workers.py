@@ -54,7 +54,7 @@ def render_on_workers(
             shape = rendered.get(position)
             if isinstance(shape, str):
                 path = _path(writer.folder, position)
-                add_rendered(writer, plan, position, shape, partial(load_rendered, path))
+                add_rendered(writer, plan, position, shape, load_rendered(path))
                 path.unlink()
             if not isinstance(shape, LostError):
                 on_scene(position)
@@ -81,6 +81,6 @@ def _path(folder: Path, position: int) -> Path:
 def _render(plan: ScenePlan, folder: Path, position: int) -> str:
     """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
     plan.check_inputs()
-    rendered = render_planned(plan, position)
-    save_rendered(rendered, _path(folder, position))
-    return rendered.shape
+    shape, pixels = render_planned(plan, position)
+    save_rendered(pixels, _path(folder, position))
+    return shape

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.errors import UsageError
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_class
@@ -35,9 +34,6 @@ class SceneConfig:
         samples: k of the k x k samples per pixel.
         directions: number of paths per pixel for indirect light.
         bounces: largest number of reflections before the visible surface; 0 for direct light only.
-
-    Raises:
-        UsageError: a number is out of range.
     """
 
     size: int = 128
@@ -45,12 +41,6 @@ class SceneConfig:
     samples: int = 4
     directions: int = 256
     bounces: int = 4
-
-    def __post_init__(self) -> None:
-        low = {"size": 4, "lights": 1, "samples": 1, "directions": 1, "bounces": 0}
-        for name, least in low.items():
-            if getattr(self, name) < least:
-                raise UsageError(f"{name} is {getattr(self, name)} and has to be at least {least}")
 
 
 @dataclass(frozen=True)
