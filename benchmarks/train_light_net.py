@@ -24,13 +24,13 @@ from torch.utils.data import DataLoader, IterableDataset
 from splinecli.networks.light_net import LightNet, network_inputs, square_images
 from splinecli.networks.weights import LIGHT_FORMAT, save_module
 from splinecli.synthesis import shapes
-from splinecli.synthesis.background import add_background
 from splinecli.synthesis.fields import ellipsoid, smooth_union, triangulate
 from splinecli.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.synthesis.meshes import Mesh, fit_to_frame
 from splinecli.synthesis.principled import CLASSES
 from splinecli.synthesis.random_numbers import draw_number
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.whole_capture import add_background
 
 CONFIG = SceneConfig(size=72, lights=64, samples=2, directions=24, bounces=2)
 SPACING, FEWEST_FACES = 0.025, 1500  # coarser than other scenes: the network sees 48 pixels

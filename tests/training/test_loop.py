@@ -24,7 +24,6 @@ from splinecli.training.defaults import METRICS
 from splinecli.training.loop import CHECKPOINT, WEIGHTS, Trainer, learning_rate
 from splinecli.training.objective import compute_losses
 from splinecli.training.run_log import Metrics, read_metrics
-from splinecli.training.validation import validation_deg
 
 CPU = torch.device("cpu")
 MakeSet = Callable[..., PixelSet]
@@ -165,7 +164,7 @@ def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatc
     assert [row.validation_deg is not None for row in rows] == [False, False, True]
     assert last.validation_deg is not None
     loaded = load_weights(tmp_path / WEIGHTS).network
-    again = validation_deg(loaded, trainer.task.validation)
+    again = trainer.task.validation_deg(loaded, bfloat16=False)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
     assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
     assert TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text())) == trainer.config
@@ -253,7 +252,7 @@ def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path
     expected = losses(plain, 3)
     found = []
     for _ in range(3):
-        validation_deg(checked.average, checked.task.validation)
+        checked.task.validation_deg(checked.average, bfloat16=False)
         found += losses(checked, 1)
     assert found == expected
 

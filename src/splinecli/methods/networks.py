@@ -89,13 +89,8 @@ class NetworkEstimator:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see ConfidentEstimator.
 
-        The numbers of the distributions are means over the rotations.
-
-        Raises:
-            UsageError: the weights have no error head.
+        The numbers of the distributions are means over the rotations. The weights need an error head.
         """
-        if not self.tells_confidence:
-            raise UsageError(f"the weights {self.weights['name']!r} cannot estimate the confidence")
         results = self._in_batches(observations, light_directions, progress)
         return results[:, :3], results[:, 3:]
 

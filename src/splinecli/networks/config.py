@@ -100,14 +100,11 @@ class NetworkConfig:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
         if config.width < 2:
             raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
-        if config.fits and config.size != "compact":
-            raise ModelError("network setting 'fits' needs the size 'compact'")
-        if config.error_head and config.size != "compact":
-            raise ModelError("network setting 'error_head' needs the size 'compact'")
+        for name in ("fits", "error_head", "set_width"):
+            if getattr(config, name) and config.size != "compact":
+                raise ModelError(f"network setting {name!r} needs the size 'compact'")
         if config.refines and not config.error_head:
             raise ModelError("network setting 'refines' needs 'error_head'")
-        if config.set_width and config.size != "compact":
-            raise ModelError("network setting 'set_width' needs the size 'compact'")
         if config.set_width % HEAD_WIDTH:
             raise ModelError(f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}")
         if config.grid != "even" and config.size != "paper":

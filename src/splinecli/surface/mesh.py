@@ -29,7 +29,7 @@ class SurfaceMesh:
             0 at the top to 1 at the bottom, as in glTF.
         texture: (H, W, 3) uint8, sRGB colours, or None.
         normal_texture: (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where
-            `normals` are exact. See normal_texture.py.
+            `normals` are exact. See decimation.py.
         tangents: (V, 3) float32, unit, where there is a normal texture.
     """
 

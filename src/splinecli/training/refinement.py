@@ -18,11 +18,10 @@ from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
-from splinecli.synthesis.background import add_background
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
-from splinecli.synthesis.whole_capture import photograph_scene
+from splinecli.synthesis.whole_capture import add_background, photograph_scene
 from splinecli.training.losses import angles
 
 FIRST_EXAMPLES = 64

@@ -15,7 +15,7 @@ from splinecli.system.extras import import_extra
 from splinecli.system.files import refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.publishing import refuse_link
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
-from splinecli.training.validation import SampleMaps
+from splinecli.training.tasks import SampleMaps
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import UsageError
-from splinecli.networks.spline_net import SplineNet
+from splinecli.maths.normals import angle_between_deg
+from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.objective import Losses, compute_losses, fixed, part_of_step
+from splinecli.training.losses import angles
+from splinecli.training.objective import Losses, compute_losses, dense_truth_in_frame, fixed, part_of_step
 from splinecli.training.refinement import (
     FIRST_EXAMPLES,
     STEPS_PER_EXAMPLE,
@@ -22,11 +26,11 @@ from splinecli.training.refinement import (
     stack_maps,
 )
 from splinecli.training.sources import Scenes, open_sets, pixel_source
-from splinecli.training.validation import SampleMaps, sample_maps, validation_deg
 
 VALIDATION_PIXELS = 2048
 _VALIDATION_DRAW = 64  # pixels at a time: a draw has one source
 VALIDATION_SCENES = 12
+SHOWN_PIXELS = 8
 
 # Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
 # other processes follow it.
@@ -40,6 +44,22 @@ def stream_seed(seed: int, step: int, stream: int) -> int:
     another way, therefore sees the same batches.
     """
     return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
+
+
+class SampleMaps(NamedTuple):
+    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals.
+
+    Attributes:
+        sparse: the sparse maps, (N, w, w).
+        dense: LI-Net's dense maps, (N, w, w); None without a LI-Net.
+        truth: the true maps with gaps filled, (N, w, w).
+        error_deg: (N,).
+    """
+
+    sparse: NDArray[np.float32]
+    dense: NDArray[np.float32] | None
+    truth: NDArray[np.float32]
+    error_deg: NDArray[np.float32]
 
 
 class PixelTask:
@@ -103,10 +123,52 @@ class PixelTask:
             )
 
     def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
-        return validation_deg(network, self.validation, bfloat16=bfloat16)
+        """Return the mean angular error of the validation pixels, in degrees."""
+        found = []
+        for batch in self.validation:
+            maps, _, normals = _estimate(network, batch, bfloat16=bfloat16)
+            found.append(angles(normals, to_pixel_frame(batch.truth.normals, maps)))
+        return math.degrees(torch.cat(found).mean().item())
 
     def sample_maps(self, network: SplineNet) -> SampleMaps:
-        return sample_maps(network, self.validation)
+        """Return the maps of up to SHOWN_PIXELS validation pixels, evenly spaced."""
+        shown = self.validation[:: max(1, len(self.validation) // SHOWN_PIXELS)][:SHOWN_PIXELS]
+        found = [_sample(network, batch, SHOWN_PIXELS // len(shown)) for batch in shown]
+        maps: list[Any] = [None if parts[0] is None else np.concatenate(parts) for parts in zip(*found, strict=True)]
+        return SampleMaps(*maps)
+
+
+def _sample(network: SplineNet, batch: PixelBatch, count: int) -> SampleMaps:
+    maps, dense, normals = _estimate(network, batch)
+    truth = dense_truth_in_frame(batch, maps, size=network.config.map_size)
+    normal_truth = to_pixel_frame(batch.truth.normals, maps)
+    error_deg = angle_between_deg(normals.cpu().numpy(), normal_truth.cpu().numpy())
+    step = max(1, len(normals) // count)
+
+    def picture(values: Tensor, known: Tensor) -> NDArray[np.float32]:
+        values = values.float().masked_fill(known == 0, torch.nan)
+        picked: NDArray[np.float32] = values[::step, 0][:count].cpu().numpy()
+        return picked
+
+    return SampleMaps(
+        picture(maps.sparse, maps.occupied),
+        None if dense is None else picture(dense, network.inside.expand_as(dense)),
+        picture(truth.values, truth.filled),
+        error_deg[::step][:count].astype(np.float32),
+    )
+
+
+@torch.no_grad()
+def _estimate(
+    network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
+) -> tuple[PixelMaps, Tensor | None, Tensor]:
+    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the frames of the pixels."""
+    network.eval()
+    maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
+    with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+        dense = network.interpolate(maps)
+        normals = network.estimate(maps, dense).normals
+    return maps, dense, normals
 
 
 class RefinementTask:
