@@ -50,10 +50,11 @@ def render(folder: Path, scenes: int, seed: int = 1) -> None:
             continue
         rng = np.random.default_rng([seed, index, 77])
         mesh = draw_smooth(rng) if rng.random() < SMOOTH_SHARE else None
-        done = render_scene(draw_scene(seed, index, CONFIG, mesh), CONFIG)
+        scene = draw_scene(seed, index, CONFIG, mesh)
+        done = render_scene(scene, CONFIG)
         observations = {name: values.astype(np.float16) for name, values in done.observations.items()}
         new = path.with_suffix(".tmp.npz")
-        np.savez(new, mask=done.mask, lights=done.light_directions, **observations)
+        np.savez(new, mask=done.mask, lights=scene.lights, **observations)
         new.replace(path)
         print(path, flush=True)
 

@@ -43,33 +43,31 @@ class OneBatch(PixelGenerator):
         return self.batch
 
 
+COSINE = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
+
+
 @pytest.mark.parametrize(
-    ("step", "progress", "expected"),
-    [(0, 0.0, 1.5e-3 / 300), (149, 0.0, 1.5e-3 / 2), (10_000, 0.5, 1.5e-3 * 0.505), (40_000, 1.0, 1.5e-5)],
+    ("config", "step", "progress", "expected"),
+    [
+        (COSINE, 0, 0.0, 1.5e-3 / 300),
+        (COSINE, 149, 0.0, 1.5e-3 / 2),
+        (COSINE, 10_000, 0.5, 1.5e-3 * 0.505),
+        (COSINE, 40_000, 1.0, 1.5e-5),
+        (preset("paper"), 0, 0.899, 1e-4),
+        (preset("paper"), 0, 0.9, 1e-5),
+    ],
 )
-def test_cosine_schedule(step: int, progress: float, expected: float) -> None:
-    config = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
+def test_schedules(config: TrainingConfig, step: int, progress: float, expected: float) -> None:
     assert learning_rate(config, step, progress) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("progress", "expected"), [(0.0, 1e-4), (0.899, 1e-4), (0.9, 1e-5), (1.0, 1e-5)])
-def test_the_authors_schedule(progress: float, expected: float) -> None:
-    assert learning_rate(preset("paper"), 0, progress) == pytest.approx(expected)
-
-
-def learn(config: TrainingConfig, folder: Path) -> list[float]:
-    """Loss, angle, map error and its share at the lights after a run on one batch, over those at its start."""
-    trainer = Trainer(replace(config, turn_jitter_deg=0.0, shards=1), folder, CPU)
-    trainer.task.source = OneBatch(config)
-    results = torch.stack([trainer.step() for _ in range(config.steps)])
-    shares: list[float] = (results[-5:].mean(dim=0) / results[:3].mean(dim=0)).tolist()[:4]
-    return shares
 
 
 def test_normals_of_one_batch_are_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path) -> None:
     # At 1e-2 all units of so small a network may fall silent.
-    config = replace(tiny, steps=300, seed=6, learning_rate=3e-3)
-    loss, angle, _, _ = learn(config, tmp_path)
+    config = replace(tiny, steps=300, seed=6, learning_rate=3e-3, turn_jitter_deg=0.0, shards=1)
+    trainer = Trainer(config, tmp_path, CPU)
+    trainer.task.source = OneBatch(config)
+    results = torch.stack([trainer.step() for _ in range(config.steps)])
+    loss, angle, *_ = results[-5:].mean(dim=0) / results[:3].mean(dim=0)
     assert angle < 0.5
     # The maps of 16 pixels are more than so few channels can hold.
     assert loss < 0.7

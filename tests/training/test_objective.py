@@ -50,8 +50,6 @@ def test_five_steps_for_ne_net_then_one_for_li_net(tiny: TrainingConfig) -> None
         "ne_net", "li_net", "ne_net",
     ]  # fmt: skip
     assert {part_of_step(tiny, step) for step in range(12)} == {"both"}
-    assert preset("paper").updates == "alternating"
-    assert preset("paper").ne_net_updates == 5
 
 
 def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny: TrainingConfig, tmp_path: Path) -> None:

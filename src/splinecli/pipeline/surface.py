@@ -54,18 +54,11 @@ def make_surface(
     depth = integrate_normals(
         normal_map, mask, camera_matrix, stiffness=stiffness, prior=prior, prior_detail=prior_detail, progress=progress
     )
+    surface = depth, mask, camera_matrix, colours
     if n_triangles is None:
-        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+        mesh = surface_mesh(*surface, normal_map=normal_map, largest_step=largest_step)
     else:
-        fine = mesh_to_decimate(
-            depth,
-            mask,
-            camera_matrix,
-            colours,
-            n_triangles=n_triangles,
-            normal_map=normal_map,
-            largest_step=largest_step,
-        )
+        fine = mesh_to_decimate(*surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step)
         mesh = decimate(fine, n_triangles, normal_map, camera_matrix)
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit, millimetres = "pixel" if camera_matrix is None else "mean depth", 1 / pixel

@@ -97,11 +97,7 @@ def add_scene(
 ) -> list[str]:
     """Render scene number `position` of the plan, unless the set has it, and return the names of its entries.
 
-    Args:
-        writer: the set, which `plan.check_set` has checked.
-        plan: all scenes.
-        position: the number of the scene.
-        progress: called with the finished share of the rendering, 0 to 1.
+    The set has passed `plan.check_set`. `progress` is called with the finished share of the rendering, 0 to 1.
 
     Raises:
         InputError: the mesh cannot be used, or the camera sees nothing.
@@ -155,7 +151,7 @@ def render_planned(
             path=mesh_file or plan.names[position],
             hint="The camera looks along -z. A face is visible if its corners run anticlockwise towards the camera",
         )
-    normals, lights = rendered.normals.astype(np.float32), rendered.light_directions.astype(np.float32)
+    normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
     # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
     observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
-    return rendered.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}
+    return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}

@@ -47,7 +47,6 @@ class SceneConfig:
 class Scene:
     """A scene before rendering.
 
-    name: unique within a set.
     shape: kind of the shape.
     mesh: the shape.
     lights: (F, 3), unit directions towards the lights.
@@ -56,7 +55,6 @@ class Scene:
     seed: seed of the paths of indirect light.
     """
 
-    name: str
     shape: str
     mesh: Mesh
     lights: Floats
@@ -69,18 +67,13 @@ class Scene:
 class RenderedScene:
     """The images of a scene.
 
-    name, shape: as in Scene.
     mask: (H, W).
     normals: (P, 3), unit; pixels row-major.
-    light_directions: (F, 3).
     observations: by class, (P, F) float32; 1 is a matte white surface that faces the light.
     """
 
-    name: str
-    shape: str
     mask: NDArray[np.bool_]
     normals: Floats
-    light_directions: Floats
     observations: dict[str, Floats]
 
 
@@ -111,7 +104,7 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
     shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng, place)
     patch_of_face = draw_patches(mesh, patches, rng)
-    return Scene(f"{index:05d}", shape, mesh, lights, materials, patch_of_face, render_seed)
+    return Scene(shape, mesh, lights, materials, patch_of_face, render_seed)
 
 
 def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
@@ -139,8 +132,7 @@ def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], 
             )
             for name, received in indirect.items():
                 radiance[name] += received
-    observations = {name: values.numpy() for name, values in radiance.items()}
-    return RenderedScene(scene.name, scene.shape, visible.mask, visible.normals, scene.lights, observations)
+    return RenderedScene(visible.mask, visible.normals, {name: values.numpy() for name, values in radiance.items()})
 
 
 def draw_lights(count: int, rng: np.random.Generator) -> Floats:

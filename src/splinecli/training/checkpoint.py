@@ -41,19 +41,9 @@ def save_checkpoint(
     counters: RunCounters,
     sets: dict[str, str],
 ) -> None:
-    """Write the whole state of a run.
+    """Write the whole state of a run: the network with its running average, and the SHA-256 of each pixel set by path.
 
-    Args:
-        path: the checkpoint file, replaced as a whole.
-        config: the configuration of the run.
-        network: the network that is trained.
-        average: the running average of its weights.
-        optimizer: the optimiser of `network`.
-        counters: how far the run has come.
-        sets: SHA-256 of each pixel set by path.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Raises OutputError.
     """
     tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", network), ("average", average)):

@@ -53,16 +53,13 @@ def open_run(
     *,
     resume: bool,
     tensorboard: bool,
-    warn: Callable[[str], object] = lambda _: None,
+    warn: Callable[[str], object],
 ) -> Iterator[Trainer]:
     """Join the other processes, lock the folder and yield the trainer.
 
     Args:
-        config: the configuration, from `configure_run`.
-        folder: the folder of the run.
+        config: from `configure_run`.
         device_name: "auto", "cpu" or "cuda".
-        resume: continue from the checkpoint.
-        tensorboard: also write TensorBoard's event files.
         warn: receives a sentence about what a killed process had left in the folder.
 
     Raises:
