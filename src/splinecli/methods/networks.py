@@ -29,8 +29,6 @@ class NetworkEstimator:
 
     Args:
         name: the method's name in the registry.
-        loaded: the network with its name and checksum.
-        device: the torch device.
         precision: the number format of the convolutions.
         refines: whether the refinement net, if the weights have one, corrects the map afterwards.
         rotations: number R of averaged estimates, see `rotations_of`.

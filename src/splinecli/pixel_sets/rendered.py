@@ -29,14 +29,7 @@ _FIRST_MESH_INDEX = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The scenes to render: first one of each mesh, then `count` random ones.
-
-    Args:
-        config: size, lights and quality of all scenes.
-        seed: seed of all random numbers.
-        count: number of random scenes.
-        meshes: mesh files of the user.
-    """
+    """The scenes to render: first one of each mesh file, then `count` random ones."""
 
     config: SceneConfig
     seed: int

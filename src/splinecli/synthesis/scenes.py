@@ -108,10 +108,7 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
 
 
 def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
-    """Render the scene in all its materials.
-
-    Args:
-        progress: called with the finished share, from 0 to 1.
+    """Render the scene in all its materials. `progress` is called with the finished share, from 0 to 1.
 
     Raises:
         UsageError: the extra `render` is not installed.

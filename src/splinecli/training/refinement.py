@@ -83,8 +83,6 @@ class ScenePool:
     Args:
         scenes: pixel sets with some of their entries, and the weight of each set.
         network: a SPLINE-Net with an error head, on the device of the captures.
-        config: number of lights and the faults of a capture.
-        seed: seed of all captures.
         first: the number of the first capture. A run that continues begins with its newest captures.
     """
 

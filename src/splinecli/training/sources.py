@@ -35,18 +35,10 @@ class MixedSource:
 
 
 def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:
-    """Split entries into training and validation entries, scene by scene.
+    """Split the entries of a set into training and validation entries, scene by scene.
 
-    The scenes with the lowest hashes of their names are for validation. So the choice for one scene hardly
-    depends on the other scenes of the set.
-
-    Args:
-        entries: all entries of a set.
-        share: share of the scenes that is for validation. Above 0, this is at least one scene, and one is
-            always left for training.
-
-    Returns:
-        Training entries, validation entries.
+    The scenes with the lowest hashes of their names are for validation. So the choice for one scene hardly depends on
+    the other scenes of the set. A share above 0 gives at least one scene, and one is always left for training.
     """
     scenes = sorted({entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest())
     count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
@@ -103,14 +95,7 @@ def open_sets(config: TrainingConfig) -> OpenSets:
 def pixel_source(
     config: TrainingConfig, scenes: Scenes, generator: torch.Generator, *, validates: bool = False
 ) -> PixelSource:
-    """Return the source of pixels of a configuration's sets and generator.
-
-    Args:
-        config: the configuration.
-        scenes: the sets with the entries to draw from.
-        generator: source of all random numbers.
-        validates: every pixel has `usual_lights` lights.
-    """
+    """Return the source of a configuration's pixels. Validation pixels all have `usual_lights` lights."""
     pixels, usual = config.pixels, config.pixels.usual_lights
     if validates:
         pixels = replace(pixels, min_lights=usual, max_lights=usual)
