@@ -11,7 +11,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface import decimation
 from splinecli.surface.decimation import decimate, mesh_to_decimate
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
-from splinecli.surface.mesh_files import encode_glb
+from splinecli.surface.surface_files import Surface, encode_surface
 
 SIDE = 90
 CAMERA = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
@@ -56,7 +56,8 @@ def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
 def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
     full, _ = dome(None)
     assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
-    _, arrays = read_glb(encode_glb(decimated, metres=0.001))
+    ((_, content),) = encode_surface(Surface(np.zeros((1, 1)), decimated, "pixel", 1.0), ["glb"])
+    _, arrays = read_glb(content)
     assert (arrays["TANGENT"][:, 3] == 1).all()
     # Ten points in each triangle.
     weights = np.random.default_rng(0).dirichlet((1, 1, 1), (10, len(arrays["indices"])))

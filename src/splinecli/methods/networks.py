@@ -76,7 +76,7 @@ class NetworkEstimator:
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
-        return self._in_batches(observations, light_directions, progress)[:, :3]
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     @property
     def tells_confidence(self) -> bool:
@@ -87,18 +87,9 @@ class NetworkEstimator:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see ConfidentEstimator.
 
-        The numbers of the distributions are means over the rotations. The weights need an error head.
+        The numbers of the distributions are means over the rotations, and 0 without an error head.
         """
-        results = self._in_batches(observations, light_directions, progress)
-        return results[:, :3], results[:, 3:]
-
-    def _in_batches(
-        self,
-        observations: Observations,
-        light_directions: Directions,
-        progress: Progress | None,
-    ) -> NDArray[np.float32]:
-        return estimate_in_batches(
+        results = estimate_in_batches(
             self._average_rotations,
             observations,
             light_directions,
@@ -108,6 +99,7 @@ class NetworkEstimator:
             columns=5,
             progress=progress,
         )
+        return results[:, :3], results[:, 3:]
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
         """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""

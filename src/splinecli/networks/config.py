@@ -19,13 +19,8 @@ _CHOICES = {
 }
 
 
-_LEAST = {"set_width": 0}
-"""Smallest values of settings that may be below 1."""
-
-_MOST = {"li_blocks": 64, "ne_blocks": 64, "set_layers": 64}
-"""Largest values of settings that count layers. Each layer is an object in memory, whatever its size."""
-
-_MOST_OTHERS = 4096
+_RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "set_layers": (1, 64)}
+"""Smallest and largest values of settings, of others 1 and 4096. Each layer takes memory, whatever its size."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +80,11 @@ class NetworkConfig:
                 if value not in _CHOICES[name]:
                     expected = " or ".join(map(repr, _CHOICES[name]))
                     raise ModelError(f"network {name} is {value!r}; expected {expected}")
-            elif (
-                not isinstance(value, int)
-                or isinstance(value, bool)
-                or not _LEAST.get(name, 1) <= value <= _MOST.get(name, _MOST_OTHERS)
-            ):
+                continue
+            least, most = _RANGES.get(name, (1, 4096))
+            if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
                 raise ModelError(
-                    f"network setting {name!r} is {value!r}; expected a whole number"
-                    f" from {_LEAST.get(name, 1)} to {_MOST.get(name, _MOST_OTHERS)}"
+                    f"network setting {name!r} is {value!r}; expected a whole number from {least} to {most}"
                 )
         config = cls(**values, fits=fits)
         # Both sizes halve the map twice. An instance norm needs more than one cell after that.
