@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args, get_type_hints
 
 from splinecli.errors import ModelError
 from splinecli.maths.observation_map import MAP_SIZE, Grid
 from splinecli.networks.set_branch import HEAD_WIDTH
 from splinecli.networks.starting_fits import STARTING_FITS
-
-_CHOICES = {
-    "size": ("paper", "compact"),
-    "grid": get_args(Grid),
-    "interpolates": (True, False),
-    "error_head": (True, False),
-    "refines": (True, False),
-}
-
 
 _RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "set_layers": (1, 64)}
 """Smallest and largest values of settings, of others 1 and 4096. Each layer takes memory, whatever its size."""
@@ -69,16 +60,17 @@ class NetworkConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
         """Rebuild a configuration from plain values. Raises ModelError for an unknown key or value."""
-        known = {field.name: field.type for field in fields(cls)}
+        known = get_type_hints(cls)
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
         values = dict(values)
         fits = _fits(values.pop("fits", ()))
         for name, value in values.items():
-            if name in _CHOICES:
-                if value not in _CHOICES[name]:
-                    expected = " or ".join(map(repr, _CHOICES[name]))
+            choices = (True, False) if known[name] is bool else get_args(known[name])
+            if choices:
+                if value not in choices:
+                    expected = " or ".join(map(repr, choices))
                     raise ModelError(f"network {name} is {value!r}; expected {expected}")
                 continue
             least, most = _RANGES.get(name, (1, 4096))
