@@ -16,20 +16,15 @@ from splinecli.training.config import TrainingConfig, preset
 from splinecli.training.loop import Trainer
 from splinecli.training.losses import asymmetric_loss, asymmetries
 from splinecli.training.objective import Part, compute_losses, dense_truth_in_frame, part_of_step
+from tiny_networks import random_network
 
 CPU = torch.device("cpu")
 SILENT = {"angle_weight": 0.0, "map_weight": 0.0, "masked_weight": 0.0}
 
 
 @pytest.fixture
-def network(tiny: TrainingConfig) -> SplineNet:
-    """Random in all layers: the last ones start at zero and let no gradient through."""
-    torch.manual_seed(0)
-    network = SplineNet(tiny.network)
-    for parameter in network.parameters():
-        if not parameter.any():
-            nn.init.normal_(parameter, std=0.1)
-    return network
+def network() -> SplineNet:
+    return random_network().train()
 
 
 @pytest.fixture
