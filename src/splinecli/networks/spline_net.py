@@ -1,15 +1,8 @@
 """SPLINE-Net (Zheng et al., ICCV 2019): from observations to maps, through LI-Net and NE-Net, to normals.
 
-The compact size differs from the paper's in four ways. Each helps it learn more from each pixel.
-
-1. Canonical azimuth: the lights of each pixel are turned about the view axis until its robust Lambertian normal has
-   azimuth zero. The estimate is turned back. The network therefore sees normals of one azimuth only.
-2. Both networks correct the Lambertian fit: LI-Net its map, NE-Net its normal. A matte pixel is right from the start.
-   NE-Net may also weigh the normals of further fits.
-3. Two more channels accompany the sparse map: which cells have an observation, and the residual of the fit there. The
-   residual uses the exact light directions, which a 32 x 32 grid rounds by up to 2 degrees.
-4. The dense map has the scale of the sparse map, its largest observation. Values above 1 are cut off, so that a
-   highlight under some other light does not change the scale of all other values.
+docs/method.md says what the compact size does differently. Its dense map has the scale of the sparse map, the largest
+observation. Values above 1 are cut off, so that a highlight under some other light does not change the scale of all
+other values.
 """
 
 from __future__ import annotations
