@@ -95,22 +95,12 @@ class SplineNet(nn.Module):
         self.config = config
         self.li_net: nn.Module | None = None
         self.ne_net: nn.Module
-        width, size, maps = config.width, config.map_size, int(config.interpolates)
         if config.size == "paper":
             self.li_net = PaperLINet() if config.interpolates else None
-            self.ne_net = PaperNENet(1 + maps, size)
+            self.ne_net = PaperNENet(1 + config.interpolates, config.map_size)
         else:
-            self.li_net = CompactLINet(4, width, config.li_blocks, size) if config.interpolates else None
-            self.ne_net = CompactNENet(
-                4 + maps,
-                width,
-                config.ne_blocks,
-                config.head_width,
-                size,
-                len(config.fits) + int(config.set_width > 0),
-                set_width=config.set_width,
-                error_head=config.error_head,
-            )
+            self.li_net = CompactLINet(config) if config.interpolates else None
+            self.ne_net = CompactNENet(config)
         self.set_branch: SetBranch | None = None
         if config.set_width:
             self.set_branch = SetBranch(config.set_width, config.set_layers, 1 + len(config.fits))

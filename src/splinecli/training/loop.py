@@ -15,6 +15,7 @@ from torch import Tensor
 from splinecli.errors import ModelError, OutputError
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
+from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.system.devices import choose_precision
 from splinecli.system.files import check_writable, write_text
 from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
@@ -23,7 +24,7 @@ from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, 
 from splinecli.training.distributed import Workers
 from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_log import Metrics, RunLog, none_for_nan
-from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask, stream_seed
+from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:

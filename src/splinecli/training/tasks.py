@@ -15,6 +15,7 @@ from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg
 from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.synthesis.batches import PixelBatch
+from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.losses import angles
 from splinecli.training.objective import Losses, compute_losses, dense_truth_in_frame, fixed, part_of_step
@@ -35,15 +36,6 @@ SHOWN_PIXELS = 8
 # Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
 # other processes follow it.
 _BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 - 1, 2**31 + 2
-
-
-def stream_seed(seed: int, step: int, stream: int) -> int:
-    """Return the seed of one of a step's random streams.
-
-    A step's batch depends on these three numbers alone. A resumed run, or one that is shared among processes in
-    another way, therefore sees the same batches.
-    """
-    return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
 
 
 class SampleMaps(NamedTuple):
