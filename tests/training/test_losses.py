@@ -9,10 +9,10 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from splinecli.maths.observation_map import cell_directions
-from splinecli.training.losses import (
+from splinecli.training.config import Norm
+from splinecli.training.objective import (
     AXIS_LENGTH,
-    Norm,
-    angular_loss,
+    angles,
     asymmetric_loss,
     asymmetries,
     map_loss,
@@ -34,13 +34,13 @@ def random_maps(*shape: int, seed: int = 0) -> Tensor:
 # A sine of 1e-6 stands in for zero, so that the gradient is bounded: 6e-5 degrees.
 @pytest.mark.parametrize("degrees", [0.0, 0.01, 10.0, 90.0, 179.0, 180.0])
 def test_angle(degrees: float) -> None:
-    assert math.degrees(angular_loss(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
+    assert math.degrees(angles(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 10.0, 180.0])
 def test_gradient_of_the_angle_is_finite_and_at_most_one(degrees: float) -> None:
     normals = at(degrees).requires_grad_()
-    angular_loss(normals, at(0)).backward()
+    angles(normals, at(0)).backward()
     assert normals.grad is not None
     assert torch.isfinite(normals.grad).all()
     assert normals.grad.norm() <= 1 + 1e-9

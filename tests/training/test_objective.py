@@ -14,8 +14,14 @@ from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import TrainingConfig, preset
 from splinecli.training.loop import Trainer
-from splinecli.training.losses import asymmetric_loss, asymmetries
-from splinecli.training.objective import Part, compute_losses, dense_truth_in_frame, part_of_step
+from splinecli.training.objective import (
+    Part,
+    asymmetric_loss,
+    asymmetries,
+    compute_losses,
+    dense_truth_in_frame,
+    part_of_step,
+)
 from tiny_networks import random_network
 
 CPU = torch.device("cpu")

@@ -10,10 +10,12 @@ from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
-from splinecli.training.losses import Norm
 
 GENERATOR = "generator"
 """The name among the sources of the online pixel generator; every other is the path of a pixel set."""
+
+Norm = Literal["mean", "sum"]
+"""Whether the values of a map's cells are averaged or summed."""
 
 
 @dataclass(frozen=True)

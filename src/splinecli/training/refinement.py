@@ -23,7 +23,7 @@ from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
 from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.synthesis.whole_capture import add_background, photograph_scene
-from splinecli.training.losses import angles
+from splinecli.training.objective import angles
 
 FIRST_EXAMPLES = 64
 """Captures that are photographed before the first step."""

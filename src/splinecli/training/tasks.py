@@ -17,8 +17,7 @@ from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.losses import angles
-from splinecli.training.objective import Losses, compute_losses, dense_truth_in_frame, fixed, part_of_step
+from splinecli.training.objective import Losses, angles, compute_losses, dense_truth_in_frame, fixed, part_of_step
 from splinecli.training.refinement import (
     FIRST_EXAMPLES,
     STEPS_PER_EXAMPLE,
