@@ -41,11 +41,15 @@ _LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
 Floats = NDArray[np.float64]
 
 
-def decimate(
-    mesh: SurfaceMesh,
+def decimated_mesh(
+    depth: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    camera_matrix: NDArray[np.floating] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+    *,
     n_triangles: int,
     normal_map: NDArray[np.floating],
-    camera_matrix: NDArray[np.floating] | None = None,
+    largest_step: float | None = None,
 ) -> SurfaceMesh:
     """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal map.
 
@@ -53,15 +57,17 @@ def decimate(
     error metrics, SIGGRAPH 1997). A mesh that has no more triangles is returned as it is.
 
     Args:
-        mesh: what surface_mesh or mesh_to_decimate returned.
+        depth, mask, camera_matrix, colours, largest_step: see surface_mesh.
         n_triangles: at least 1.
         normal_map: (H, W, 3), unit on the object, zero outside.
-        camera_matrix: (3, 3), the one that surface_mesh had, or None.
 
     Raises:
-        UsageError: fast-simplification is not installed.
+        UsageError: fast-simplification is not installed, or the largest step is negative.
         InputError: no triangle is left.
     """
+    mesh = _mesh_of_blocks(depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step)
+    if mesh is None:
+        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
     if n_triangles >= len(mesh.triangles):
         return mesh
     simplify = import_extra("fast_simplification", "mesh").simplify
@@ -86,48 +92,44 @@ def decimate(
     )
 
 
-def mesh_to_decimate(
+def _mesh_of_blocks(
     depth: NDArray[np.floating],
     mask: NDArray[np.bool_],
-    camera_matrix: NDArray[np.floating] | None = None,
-    colours: NDArray[np.uint8] | None = None,
-    *,
+    camera_matrix: NDArray[np.floating] | None,
+    colours: NDArray[np.uint8] | None,
     n_triangles: int,
     normal_map: NDArray[np.floating],
-    largest_step: float | None = None,
-) -> SurfaceMesh:
-    """Return a mesh for `decimate`: that of surface_mesh or, of large maps, one of blocks of pixels.
+    largest_step: float | None,
+) -> SurfaceMesh | None:
+    """Return a mesh of blocks of a large map's pixels; None where they would be too few, or the map is small.
 
     Collapsing all edges of a large map takes much memory. If far fewer triangles are wanted, those of the blocks, which
     are at least TRIANGLES_LEFT times as many, have the same shape, and the normal texture keeps the detail.
-
-    Args:
-        depth, mask, camera_matrix, colours, normal_map, largest_step: see surface_mesh.
-        n_triangles: see decimate.
     """
     step = int((2 * np.count_nonzero(mask) / (TRIANGLES_LEFT * n_triangles)) ** 0.5)
-    if step >= 2 and np.count_nonzero(mask) > LARGE_MAP:
-        blocks = Blocks.of_step(mask, step)
-        of_blocks = np.zeros((*blocks.mask.shape, 4))
-        pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
-        of_blocks[blocks.mask] = blocks.average(pixels, mask)
-        # Without a camera, a step counts in blocks, as a pixel does.
-        scale = step if camera_matrix is None else 1
-        mesh = surface_mesh(
-            of_blocks[..., 0] / scale,
-            blocks.mask,
-            blocks.shrink_camera(camera_matrix),
-            normal_map=unit(of_blocks[..., 1:]),
-            largest_step=largest_step,
-        )
-        if len(mesh.triangles) > n_triangles:
-            shift = np.zeros(3)
-            if camera_matrix is None:
-                shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
-            vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
-            texture = None if colours is None else fill_outside(colours, mask)
-            return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
-    return surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+    if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
+        return None
+    blocks = Blocks.of_step(mask, step)
+    of_blocks = np.zeros((*blocks.mask.shape, 4))
+    pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
+    of_blocks[blocks.mask] = blocks.average(pixels, mask)
+    # Without a camera, a step counts in blocks, as a pixel does.
+    scale = step if camera_matrix is None else 1
+    mesh = surface_mesh(
+        of_blocks[..., 0] / scale,
+        blocks.mask,
+        blocks.shrink_camera(camera_matrix),
+        normal_map=unit(of_blocks[..., 1:]),
+        largest_step=largest_step,
+    )
+    if len(mesh.triangles) <= n_triangles:
+        return None
+    shift = np.zeros(3)
+    if camera_matrix is None:
+        shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
+    vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
+    texture = None if colours is None else fill_outside(colours, mask)
+    return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
 
 
 def _tangents(

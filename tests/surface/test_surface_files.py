@@ -1,4 +1,4 @@
-"""Files of meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
+"""Files of surfaces: meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
 
 import io
 from pathlib import Path
