@@ -56,8 +56,6 @@ def photograph_scene(
     Args:
         radiance: (P, F).
         directions: (F, 3), unit.
-        config: the shares of captures with each fault.
-        generator: source of all random numbers.
     """
 
     uniform = partial(draw_number, generator)

@@ -101,9 +101,8 @@ def configure(
     A table of sources is replaced as a whole. Other tables are merged key by key.
 
     Args:
-        preset_name: name of the preset. None takes the file's entry "preset", or else `base`.
-        file: TOML or JSON, see read_config_file.
-        changes: further settings.
+        preset_name: None takes the file's entry "preset", or else `base`.
+        file: see read_config_file.
         base: None for DEFAULT_PRESET.
 
     Raises:

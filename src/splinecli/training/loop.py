@@ -17,7 +17,7 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
 from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.system.devices import choose_precision
-from splinecli.system.files import check_writable, write_text
+from splinecli.system.files import write_text
 from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
@@ -66,7 +66,6 @@ class Trainer:
         tensorboard: bool = False,
     ) -> None:
         """Start a run, or resume one. Raises ModelError, OutputError, InputError, UsageError."""
-        check_writable(folder)
         self.config = config
         self.folder = folder
         self.device = device
