@@ -9,7 +9,7 @@ import torch
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.principled import CLASSES, draw_class
+from splinecli.synthesis.principled import CLASSES, draw_material, with_one_gloss
 from splinecli.synthesis.scenes import MIN_LIGHT_Z, SceneConfig, draw_lights, draw_patches, draw_scene, render_scene
 
 SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
@@ -67,7 +67,7 @@ def test_lights_cover_the_upper_hemisphere() -> None:
 
 
 def test_patches_of_one_gloss_differ_in_their_base_alone() -> None:
-    material = draw_class("specular", 50, torch.Generator().manual_seed(0), one_gloss=True)
+    material = with_one_gloss(draw_material(50, torch.Generator().manual_seed(0), CLASSES["specular"]))
     for field in fields(material):
         values = getattr(material, field.name)
         assert values.shape == (50, 1)

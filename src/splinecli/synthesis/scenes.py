@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_class
+from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
@@ -98,7 +98,8 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     materials: dict[str, PrincipledMaterial] = {}
     for name in CLASSES:
         torch.rand((), generator=generator)  # not used, but drawn by earlier versions, whose scenes stay the same
-        materials[name] = draw_class(name, patches, generator, one_gloss=one_gloss)
+        material = draw_material(patches, generator, CLASSES[name])
+        materials[name] = with_one_gloss(material) if one_gloss else material
     # The shape comes last, because the number of random values that it needs varies.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
