@@ -24,13 +24,13 @@ from torch.utils.data import DataLoader, IterableDataset
 from splinecli.networks.light_net import LightNet, network_inputs, square_images
 from splinecli.networks.weights import LIGHT_FORMAT, save_module
 from splinecli.synthesis import shapes
-from splinecli.synthesis.background import add_background
 from splinecli.synthesis.fields import ellipsoid, smooth_union, triangulate
 from splinecli.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.synthesis.meshes import Mesh, fit_to_frame
 from splinecli.synthesis.principled import CLASSES
 from splinecli.synthesis.random_numbers import draw_number
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.whole_capture import add_background
 
 CONFIG = SceneConfig(size=72, lights=64, samples=2, directions=24, bounces=2)
 SPACING, FEWEST_FACES = 0.025, 1500  # coarser than other scenes: the network sees 48 pixels
@@ -50,10 +50,11 @@ def render(folder: Path, scenes: int, seed: int = 1) -> None:
             continue
         rng = np.random.default_rng([seed, index, 77])
         mesh = draw_smooth(rng) if rng.random() < SMOOTH_SHARE else None
-        done = render_scene(draw_scene(seed, index, CONFIG, mesh), CONFIG)
+        scene = draw_scene(seed, index, CONFIG, mesh)
+        done = render_scene(scene, CONFIG)
         observations = {name: values.astype(np.float16) for name, values in done.observations.items()}
         new = path.with_suffix(".tmp.npz")
-        np.savez(new, mask=done.mask, lights=done.light_directions, **observations)
+        np.savez(new, mask=done.mask, lights=scene.lights, **observations)
         new.replace(path)
         print(path, flush=True)
 

@@ -4,28 +4,13 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import angle_between_deg
 from splinecli.methods.networks import NetworkEstimator, rotations_of
-from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
-
-COMPACT = NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)
-PAPER = NetworkConfig(size="paper", map_size=8)
-CNN_PS = NetworkConfig(size="paper", map_size=8, interpolates=False)
-
-
-def random_network(config: NetworkConfig) -> LoadedNetwork:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        network = SplineNet(config).eval()
-        for parameter in network.parameters():
-            if not parameter.any():
-                torch.nn.init.normal_(parameter, std=0.1)
-    return LoadedNetwork(network, "random", "0" * 64)
+from tiny_networks import random_network
 
 
 def pixels(count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -35,14 +20,15 @@ def pixels(count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     return observations, lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
 
-def estimator(loaded: LoadedNetwork, **options: Any) -> NetworkEstimator:
-    return NetworkEstimator("spline-net", loaded, **options)
+def estimator(network: SplineNet | None = None, **options: Any) -> NetworkEstimator:
+    loaded = LoadedNetwork(network or random_network(), "random", "0" * 64)
+    return NetworkEstimator("spline-net", loaded, **{"precision": "float32", **options})
 
 
 def test_bfloat16_costs_little() -> None:
     observations, lights = pixels(50)
-    exact = estimator(random_network(COMPACT), precision="float32").estimate(observations, lights)
-    coarse = estimator(random_network(COMPACT), precision="bfloat16").estimate(observations, lights)
+    exact = estimator().estimate(observations, lights)
+    coarse = estimator(precision="bfloat16").estimate(observations, lights)
     error = angle_between_deg(coarse, exact)
     # 8 bits of mantissa on the correction alone, not on the fit.
     assert 0 < error.max() < 1
@@ -65,7 +51,7 @@ def test_four_rotations_of_the_paper_network_make_it_fourfold_symmetric() -> Non
     observations, lights = pixels(4)
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     for rotations, symmetric in ((4, True), (1, False)):
-        network = NetworkEstimator("spline-net", random_network(PAPER), precision="float32", rotations=rotations)
+        network = estimator(random_network(size="paper", map_size=8), rotations=rotations)
         here, there = (network.estimate(observations, lights), network.estimate(observations, lights @ quarter.T))
         assert np.allclose(there, here @ quarter.T, atol=1e-4) == symmetric
 
@@ -73,14 +59,14 @@ def test_four_rotations_of_the_paper_network_make_it_fourfold_symmetric() -> Non
 def test_two_rotations_of_a_canonical_network_make_it_mirror_symmetric() -> None:
     observations, lights = pixels(10)
     for rotations, symmetric in ((2, True), (1, False)):
-        network = NetworkEstimator("spline-net", random_network(COMPACT), precision="float32", rotations=rotations)
+        network = estimator(rotations=rotations)
         here, there = (network.estimate(observations, lights), network.estimate(observations, lights * (1, -1, 1)))
         assert np.allclose(there, here * (1, -1, 1), atol=1e-4) == symmetric
 
 
 def test_progress_changes_no_bit() -> None:
     observations, lights = pixels(150)
-    network = estimator(random_network(COMPACT), precision="float32", batch_size=100)
+    network = estimator(batch_size=100)
     done: list[int] = []
     watched = network.estimate(observations, lights, progress=done.append)
     assert watched.tobytes() == network.estimate(observations, lights).tobytes()
@@ -89,7 +75,7 @@ def test_progress_changes_no_bit() -> None:
 
 def test_networks_in_several_threads_count_apart() -> None:
     observations, lights = pixels(60)
-    network = estimator(random_network(COMPACT), precision="float32", batch_size=20)
+    network = estimator(batch_size=20)
     done: list[list[int]] = [[], [], []]
     with ThreadPoolExecutor() as pool:
         for counts in done:

@@ -1,6 +1,7 @@
 """Refinement of a whole capture: tiles, masks, dark pixels, and the scores of single pixels."""
 
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -23,11 +24,13 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import LoadedNetwork
 from splinecli.refinement import refiner
 from splinecli.refinement.refiner import NetworkRefiner
+from tiny_networks import TINY
 
 LIGHTS = spiral_lights(6, 60)
+Network = TypeVar("Network", bound=torch.nn.Module)
 
 
-def lively(network: torch.nn.Module) -> torch.nn.Module:
+def lively(network: Network) -> Network:
     """Fill every parameter with small random numbers."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -48,7 +51,6 @@ def refine(
     if dark is not None:
         observations[dark], errors[dark] = 0, UNKNOWN_ERROR
     net = lively(RefineNet())
-    assert isinstance(net, RefineNet)
     refined = normals.copy()
     done: list[int] = []
     NetworkRefiner(net, "float32", tile=tile, margin=REACH).refine(
@@ -90,7 +92,6 @@ def test_a_turned_capture_gets_turned_normals() -> None:
     mask = rng.random((24, 32)) < 0.9
     normals = unit(rng.normal((0, 0, 3), 1, (*mask.shape, 3))).astype(np.float32)
     net = lively(RefineNet())
-    assert isinstance(net, RefineNet)
 
     def refined(turns: int) -> NDArray[np.float32]:
         """Refine the map turned counterclockwise by quarters, and turn the result back."""
@@ -117,7 +118,6 @@ def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -
     observations = (normals @ LIGHTS.T).clip(0).astype(np.float32)
     turns = np.linalg.qr(rng.normal(size=(900, 3, 3)))[0].astype(np.float32)
     net = lively(RefineNet())
-    assert isinstance(net, RefineNet)
     asked: list[int] = []
 
     def refined(turned: bool) -> NDArray[np.float32]:
@@ -140,9 +140,7 @@ def test_the_light_of_few_pixels_is_in_memory(monkeypatch: pytest.MonkeyPatch) -
 
 
 def estimator(*, refines: bool) -> NetworkEstimator:
-    tiny = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width": 16, "error_head": True, "refines": True}
-    network = lively(SplineNet(NetworkConfig.from_dict(tiny)))
-    assert isinstance(network, SplineNet)
+    network = lively(SplineNet(NetworkConfig(**TINY, error_head=True, refines=True)))
     name = "spline-net" if refines else "spline-net-pixelwise"
     return NetworkEstimator(name, LoadedNetwork(network, "tiny", "0"), precision="float32", refines=refines)
 

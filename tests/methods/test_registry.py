@@ -13,6 +13,7 @@ from splinecli.methods import MethodOptions, make_estimator, method_names
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import save_weights
+from tiny_networks import TINY
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 
@@ -20,8 +21,7 @@ LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]]
 def save_tiny(path: Path, **settings: Any) -> str:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16, **settings))
-    save_weights(network, path)
+        save_weights(SplineNet(NetworkConfig(**TINY, **settings)), path)
     return str(path)
 
 

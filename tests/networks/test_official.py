@@ -303,23 +303,19 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
             import_official(missing, files[1])
 
 
-def parameters(network: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in network.parameters())
+# LI-Net. Weights: 1*64*7*7, 64*128*4*4, 128*256*4*4; 12 times 256*256*3*3; 256*128*4*4, 128*64*4*4, 64*1*7*7.
+LI_NET_WEIGHTS = 3_136 + 131_072 + 524_288 + 12 * 589_824 + 524_288 + 131_072 + 3_136
+# A scale and an offset for each normalised channel.
+LI_NET_NORMS = 2 * (64 + 128 + 256 + 12 * 256 + 128 + 64)
+# 2*16*9 + 16; dense block 16*16*9 + 16, 32*16*9 + 16; 48*48 + 48; dense block 48*16*9 + 16, 64*16*9 + 16;
+# 80*80 + 80; 80*16*16 * 128 + 128; 128*3 + 3.
+NE_NET = 304 + 2_320 + 4_624 + 2_352 + 6_928 + 9_232 + 6_480 + 2_621_568 + 387
 
 
-def test_paper_li_net_has_the_published_number_of_parameters() -> None:
-    # Weights: 1*64*7*7, 64*128*4*4, 128*256*4*4; 12 times 256*256*3*3; 256*128*4*4, 128*64*4*4, 64*1*7*7.
-    weights = 3_136 + 131_072 + 524_288 + 12 * 589_824 + 524_288 + 131_072 + 3_136
-    # A scale and an offset for each normalised channel.
-    norms = 2 * (64 + 128 + 256 + 12 * 256 + 128 + 64)
-    expected = weights + norms
-    assert parameters(PaperLINet()) == expected == 8_402_304
-    assert expected / 1e6 == pytest.approx(8.40, abs=0.01)
-
-
-def test_paper_ne_net_has_the_published_number_of_parameters() -> None:
-    # 2*16*9 + 16; dense block 16*16*9 + 16, 32*16*9 + 16; 48*48 + 48; dense block 48*16*9 + 16, 64*16*9 + 16;
-    # 80*80 + 80; 80*16*16 * 128 + 128; 128*3 + 3.
-    expected = 304 + 2_320 + 4_624 + 2_352 + 6_928 + 9_232 + 6_480 + 2_621_568 + 387
-    assert parameters(PaperNENet(2, 32)) == expected == 2_654_195
-    assert expected / 1e6 == pytest.approx(2.65, abs=0.01)
+@pytest.mark.parametrize(
+    ("network", "expected", "published"),
+    [(PaperLINet(), LI_NET_WEIGHTS + LI_NET_NORMS, 8.40), (PaperNENet(2, 32), NE_NET, 2.65)],
+)
+def test_the_published_number_of_parameters(network: nn.Module, expected: int, published: float) -> None:
+    assert sum(parameter.numel() for parameter in network.parameters()) == expected
+    assert expected / 1e6 == pytest.approx(published, abs=0.01)

@@ -1,7 +1,6 @@
 """The whole network between observations and normals: shapes, limits, symmetries, and the error that it tells."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,8 +14,8 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import error_negative_log_likelihood, probability_within
 from splinecli.networks.spline_net import Rotation, SplineNet, to_capture_frame, to_pixel_frame
 from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+from tiny_networks import TINY, random_network
 
-Make = Callable[..., SplineNet]
 PAPER = {"size": "paper", "map_size": 8}
 SET = {"set_width": 16, "set_layers": 2, "fits": ["ls"]}
 FLIP = torch.tensor((1.0, -1.0, 1.0))
@@ -38,9 +37,7 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
 
 
 @pytest.mark.parametrize("settings", [{}, SET, PAPER])
-def test_dense_map_ends_with_the_unit_disc(
-    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
-) -> None:
+def test_dense_map_ends_with_the_unit_disc(pixels: tuple[Tensor, Tensor], settings: dict[str, object]) -> None:
     network = random_network(**settings)
     with torch.no_grad():
         dense = network.interpolate(network.build_maps(pixels[0].float(), pixels[1].float()))
@@ -53,7 +50,7 @@ def test_dense_map_ends_with_the_unit_disc(
 
 def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels: tuple[Tensor, Tensor]) -> None:
     observations, lights = pixels
-    network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)).double()
+    network = SplineNet(NetworkConfig(**TINY)).double()
     expected = torch.nn.functional.normalize(fit_lambertian(observations / map_scale(observations), lights), dim=1)
     visible = expected[:, 2] > 0.05
     assert visible.sum() > 50
@@ -72,7 +69,7 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels:
 @pytest.mark.parametrize("settings", [{}, SET])
 @pytest.mark.parametrize("degrees", [90.0, 33.0, -171.5])
 def test_compact_estimates_turn_with_the_lights(
-    random_network: Make, pixels: tuple[Tensor, Tensor], degrees: float, settings: dict[str, object]
+    pixels: tuple[Tensor, Tensor], degrees: float, settings: dict[str, object]
 ) -> None:
     observations, lights = pixels
     network = random_network(**settings).double()
@@ -86,7 +83,7 @@ def test_compact_estimates_turn_with_the_lights(
 
 @pytest.mark.parametrize("settings", [{}, SET])
 def test_observations_that_are_not_valid_do_not_matter(
-    random_network: Make, pixels: tuple[Tensor, Tensor], settings: dict[str, object]
+    pixels: tuple[Tensor, Tensor], settings: dict[str, object]
 ) -> None:
     observations, lights = pixels
     network = random_network(**settings).double()
@@ -97,9 +94,7 @@ def test_observations_that_are_not_valid_do_not_matter(
         torch.testing.assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
 
 
-def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
-    random_network: Make, pixels: tuple[Tensor, Tensor]
-) -> None:
+def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor, Tensor]) -> None:
     # Turned by t and then mirrored is mirrored and then turned by -t.
     observations, lights = pixels
     network = random_network().double()
@@ -113,7 +108,7 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
+def test_frames_there_and_back(pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
     observations, lights = pixels
     network = random_network().double()
     views = network.build_maps(observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror))
@@ -127,7 +122,7 @@ def test_frames_there_and_back(random_network: Make, pixels: tuple[Tensor, Tenso
     torch.testing.assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
 
 
-def test_autocast_does_not_round_the_geometry(random_network: Make, pixels: tuple[Tensor, Tensor]) -> None:
+def test_autocast_does_not_round_the_geometry(pixels: tuple[Tensor, Tensor]) -> None:
     observations, lights = pixels[0].float(), pixels[1].float()
     network = random_network()
     torch.nn.init.zeros_(network.ne_net.out.weight)  # type: ignore[union-attr,arg-type]
@@ -151,7 +146,7 @@ def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
     np.testing.assert_allclose(found, -logistic.logpdf(np.log(angles_deg + 0.1)))
 
 
-def test_it_changes_no_normal(random_network: Callable[..., SplineNet]) -> None:
+def test_it_changes_no_normal() -> None:
     plain, telling = random_network(fits=["ls"]), random_network(fits=["ls"], error_head=True)
     telling.load_state_dict(plain.state_dict(), strict=False)
     generator = torch.Generator().manual_seed(1)

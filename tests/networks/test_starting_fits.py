@@ -7,9 +7,9 @@ from splinecli.methods import MethodOptions, make_estimator
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import Rotation, SplineNet
 from splinecli.networks.starting_fits import STARTING_FITS, fit_normals
+from tiny_networks import TINY
 
 NAMES = tuple(STARTING_FITS)
-TINY = NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16)
 
 
 def pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,7 +51,7 @@ def test_pixels_that_no_fit_can_tell_anything_of() -> None:
 
 
 def test_the_network_can_take_any_fit() -> None:
-    network = SplineNet(replace_fits(TINY))
+    network = SplineNet(NetworkConfig(**TINY, fits=NAMES))
     observations, directions = pixels(30, 10)
     weigh = network.ne_net.weigh
     assert isinstance(weigh, torch.nn.Linear)
@@ -61,7 +61,3 @@ def test_the_network_can_take_any_fit() -> None:
             for mirror in (False, True):
                 found = network(observations, directions, rotation=Rotation(20.0, mirror=mirror)).normals
                 torch.testing.assert_close(found, fit_normals([name], observations, directions)[:, 0])
-
-
-def replace_fits(config: NetworkConfig) -> NetworkConfig:
-    return NetworkConfig.from_dict({**config.to_dict(), "fits": list(NAMES)})

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,11 @@ from splinecli.networks import weights
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import FORMAT, load_weights, resolve_weights, save_weights, tensors_sha256
-
-Make = Callable[..., SplineNet]
+from tiny_networks import TINY, random_network
 
 
 @pytest.fixture
-def saved(random_network: Make, tmp_path: Path) -> Path:
+def saved(tmp_path: Path) -> Path:
     save_weights(random_network(), tmp_path / "tiny.safetensors")
     return tmp_path / "tiny.safetensors"
 
@@ -38,7 +36,7 @@ def write_like_splinecli(path: Path, network: SplineNet, tensors: dict[str, Tens
 
 
 @pytest.mark.parametrize("settings", [{}, {"size": "paper", "map_size": 8}])
-def test_round_trip(random_network: Make, tmp_path: Path, settings: dict[str, object]) -> None:
+def test_round_trip(tmp_path: Path, settings: dict[str, object]) -> None:
     network = random_network(**settings)
     path = tmp_path / "tiny.safetensors"
     save_weights(network, path)
@@ -58,25 +56,21 @@ def test_round_trip(random_network: Make, tmp_path: Path, settings: dict[str, ob
         )
 
 
-def test_every_tensor_and_no_other(random_network: Make, tmp_path: Path) -> None:
+def test_every_tensor_and_no_other(tmp_path: Path) -> None:
     network, path = random_network(), tmp_path / "odd.safetensors"
     tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
     write_like_splinecli(path, network, tensors)
     load_weights(path)
-    write_like_splinecli(path, network, tensors | {"extra": torch.zeros(1)})
-    with pytest.raises(ModelError, match="do not fit the configuration"):
-        load_weights(path)
-    write_like_splinecli(path, network, {name: tensors[name] for name in list(tensors)[1:]})
-    with pytest.raises(ModelError, match="do not fit the configuration"):
-        load_weights(path)
-    first = next(iter(tensors))
-    write_like_splinecli(path, network, tensors | {first: tensors[first][:-1].clone()})
-    with pytest.raises(ModelError, match="do not fit the configuration"):
-        load_weights(path)
+    first, *others = tensors
+    more, less = tensors | {"extra": torch.zeros(1)}, {name: tensors[name] for name in others}
+    for changed in (more, less, tensors | {first: tensors[first][:-1].clone()}):
+        write_like_splinecli(path, network, changed)
+        with pytest.raises(ModelError, match="do not fit the configuration"):
+            load_weights(path)
 
 
 @pytest.mark.parametrize("config", ["", "{", "3", '["width"]', '{"width": -1}', '{"height": 3}'])
-def test_a_configuration_that_cannot_be(random_network: Make, tmp_path: Path, config: str) -> None:
+def test_a_configuration_that_cannot_be(tmp_path: Path, config: str) -> None:
     network = random_network()
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     write_like_splinecli(tmp_path / "odd.safetensors", network, tensors, config=config)
@@ -93,9 +87,7 @@ def test_a_configuration_that_cannot_be(random_network: Make, tmp_path: Path, co
         {"li_blocks": 65},
     ],
 )
-def test_a_configuration_far_larger_than_the_tensors(
-    random_network: Make, tmp_path: Path, settings: dict[str, int]
-) -> None:
+def test_a_configuration_far_larger_than_the_tensors(tmp_path: Path, settings: dict[str, int]) -> None:
     """It is refused without making its tensors, which would take gigabytes."""
     network, path = random_network(), tmp_path / "a.safetensors"
     config = json.dumps({**network.config.to_dict(), **settings})
@@ -184,7 +176,7 @@ def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_weights_that_are_not_finite(tmp_path: Path) -> None:
-    network = SplineNet(NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=8))
+    network = SplineNet(NetworkConfig(**TINY))
     with torch.no_grad():
         network.ne_net.out.bias[0] = float("nan")  # type: ignore[union-attr, operator, index]
     save_weights(network, tmp_path / "nan.safetensors")

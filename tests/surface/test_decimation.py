@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from glb_file import read_glb
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.surface import decimation
-from splinecli.surface.decimation import decimate, mesh_to_decimate
+from splinecli.surface.decimation import decimated_mesh
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
-from splinecli.surface.mesh_files import encode_glb
+from splinecli.surface.surface_files import Surface, encode_surface
 
 SIDE = 90
 CAMERA = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
@@ -31,15 +31,14 @@ def height_of_dome(columns: Floats, rows: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(60.0**2 - (columns - 44.5) ** 2 - (rows - 44.5) ** 2, 0)))
 
 
-def dome(camera: NDArray[np.float64] | None) -> tuple[SurfaceMesh, NDArray[np.float64]]:
-    """Return a mesh with the shape of the dome alone, and the normal map with the relief."""
-    rows, columns = np.mgrid[:SIDE, :SIDE].astype(float)
+def dome(camera: NDArray[np.float64] | None, odd: int = 0) -> tuple[tuple[Any, ...], NDArray[np.float64]]:
+    """Return what surface_mesh takes of the shape of a dome alone, and the normal map with the relief."""
+    rows, columns = np.mgrid[: SIDE + odd, :SIDE].astype(float)
     mask = np.hypot(columns - 44.5, rows - 44.5) < 42
     height = height_of_dome(columns, rows)
     normal_map = measured(columns, rows) * mask[..., None]
     depth = height if camera is None else 3 - height / 125
-    colours = np.full((SIDE, SIDE, 3), 90, np.uint8)
-    return surface_mesh(depth, mask, camera, colours, normal_map=normal_map), normal_map
+    return (depth, mask, camera, np.full((*mask.shape, 3), 90, np.uint8)), normal_map
 
 
 @pytest.fixture(scope="module", params=[None, CAMERA], ids=["orthographic", "perspective"])
@@ -49,14 +48,15 @@ def camera(request: pytest.FixtureRequest) -> Any:
 
 @pytest.fixture(scope="module")
 def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
-    mesh, normal_map = dome(camera)
-    return decimate(mesh, len(mesh.triangles) // 20, normal_map, camera)
+    surface, normal_map = dome(camera)
+    return decimated_mesh(*surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map)
 
 
 def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
-    full, _ = dome(None)
+    full = surface_mesh(*dome(None)[0])
     assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
-    _, arrays = read_glb(encode_glb(decimated, metres=0.001))
+    ((_, content),) = encode_surface(Surface(np.zeros((1, 1)), decimated, "pixel", 1.0), ["glb"])
+    _, arrays = read_glb(content)
     assert (arrays["TANGENT"][:, 3] == 1).all()
     # Ten points in each triangle.
     weights = np.random.default_rng(0).dirichlet((1, 1, 1), (10, len(arrays["indices"])))
@@ -117,14 +117,11 @@ def test_blocks_of_a_large_map_have_its_shape(
 ) -> None:
     """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their places."""
     monkeypatch.setattr(decimation, "LARGE_MAP", 0)
-    rows, columns = np.mgrid[: SIDE + odd, :SIDE].astype(float)
-    mask = np.hypot(columns - 44.5, rows - 44.5) < 42
-    height, normal_map = height_of_dome(columns, rows), measured(columns, rows) * mask[..., None]
-    depth = height if camera is None else 3 - height / 125
-    colours = np.full((*mask.shape, 3), 90, np.uint8)
-    fine = mesh_to_decimate(depth, mask, camera, colours, n_triangles=300, normal_map=normal_map)
-    assert 4 * 300 <= len(fine.triangles) < np.count_nonzero(mask)
-    mesh = decimate(fine, 300, normal_map, camera)
+    surface, normal_map = dome(camera, odd)
+    mask = surface[1]
+    blocks = decimation._mesh_of_blocks(*surface, 300, normal_map, None)
+    assert blocks is not None and 4 * 300 <= len(blocks.triangles) < np.count_nonzero(mask)
+    mesh = decimated_mesh(*surface, n_triangles=300, normal_map=normal_map)
     assert mesh.texture is not None and mesh.normal_texture is not None
     assert mesh.texture.shape == mesh.normal_texture.shape == (*mask.shape, 3)
     columns, rows = (mesh.uvs * mask.shape[::-1] - 0.5).T

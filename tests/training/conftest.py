@@ -11,6 +11,7 @@ from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training import tasks
 from splinecli.training.config import TrainingConfig
 from splinecli.training.run_log import RunLog
+from tiny_networks import TINY
 
 __all__ = ["_matte_pixels", "make_set"]
 
@@ -38,7 +39,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def tiny() -> TrainingConfig:
     return TrainingConfig(
-        network=NetworkConfig(width=8, li_blocks=1, ne_blocks=1, head_width=16),
+        network=NetworkConfig(**TINY),
         pixels=PixelGeneratorConfig(max_lights=16),
         batch_size=16,
         steps=6,

@@ -7,7 +7,7 @@ import pytest
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
-from splinecli.training import defaults, loop
+from splinecli.training import defaults
 from splinecli.training.config import PRESETS, TrainingConfig, preset
 
 
@@ -54,9 +54,6 @@ def test_refused(values: dict[str, Any], message: str) -> None:
 
 
 def test_presets_by_name() -> None:
-    compact = preset("compact")
-    assert compact.network == NetworkConfig(map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64)
-    assert (compact.pixels.min_lights, compact.pixels.usual_lights, compact.pixels.max_lights) == (4, 10, 96)
     # The paper's section 4; its code where that is silent (docs/train.md).
     paper = preset("paper")
     assert (paper.batch_size, paper.learning_rate, paper.steps) == (128, 1e-4, 200_000)
@@ -73,8 +70,3 @@ def test_presets_by_name() -> None:
 def test_the_names_of_presets_are_those_of_the_presets() -> None:
     assert tuple(PRESETS) == defaults.PRESET_NAMES
     assert defaults.DEFAULT_PRESET in PRESETS
-
-
-def test_the_loop_keeps_the_intervals_that_the_help_gives() -> None:
-    assert loop.CHECKPOINT_SECONDS == defaults.CHECKPOINT_SECONDS
-    assert loop.REPORT_STEPS == defaults.REPORT_STEPS

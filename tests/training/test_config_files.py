@@ -9,8 +9,8 @@ import pytest
 from splinecli.errors import ModelError, UsageError
 from splinecli.training.config import GENERATOR, TrainingConfig, preset
 from splinecli.training.config_files import (
+    check_resumable,
     configure,
-    configure_resumed,
     parse_light_counts,
     parse_parameter,
     parse_sources,
@@ -119,23 +119,23 @@ def test_another_run_is_refused_by_the_name_of_the_setting(
 ) -> None:
     path = tmp_path / "checkpoint.safetensors"
     with pytest.raises(ModelError, match=f"the run was started with {message}") as caught:
-        configure_resumed(TrainingConfig(), path, changes=[change])
+        check_resumable(TrainingConfig(), configure(changes=[change], base=TrainingConfig()), path)
     assert caught.value.path == path
 
 
-def test_a_setting_that_is_not_given_stays_as_it_was(tmp_path: Path) -> None:
+def test_a_setting_that_is_not_given_stays_as_it_was() -> None:
     started = preset("compact", seed=5, batch_size=32)
-    assert configure_resumed(started, tmp_path) == started
-    assert configure_resumed(started, tmp_path, changes=[{"batch_size": 32}]) == started
+    assert configure(base=started) == configure(changes=[{"batch_size": 32}], base=started) == started
     # A preset gives all settings.
-    with pytest.raises(ModelError, match="batch_size = 32, not 512"):
-        configure_resumed(started, tmp_path, "compact", changes=[{"seed": 5}])
+    assert configure("compact", changes=[{"seed": 5}], base=started) == preset("compact", seed=5)
 
 
 def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
     file = write(tmp_path / "a.toml", "steps = 12\nlearning_rate = 1e-4")
-    asked = configure_resumed(preset("compact", seed=5), tmp_path, None, file, [{"minutes": 3.0}])
+    started = preset("compact", seed=5)
+    asked = configure(None, file, [{"minutes": 3.0}], base=started)
     assert asked == preset("compact", seed=5, steps=12, learning_rate=1e-4, minutes=3.0)
+    check_resumable(started, asked, tmp_path)
 
 
 def test_the_home_folder_is_expanded_in_every_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,6 @@ from splinecli.training.defaults import METRICS
 from splinecli.training.loop import CHECKPOINT, WEIGHTS, Trainer, learning_rate
 from splinecli.training.objective import compute_losses
 from splinecli.training.run_log import Metrics, read_metrics
-from splinecli.training.validation import validation_deg
 
 CPU = torch.device("cpu")
 MakeSet = Callable[..., PixelSet]
@@ -44,33 +43,31 @@ class OneBatch(PixelGenerator):
         return self.batch
 
 
+COSINE = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
+
+
 @pytest.mark.parametrize(
-    ("step", "progress", "expected"),
-    [(0, 0.0, 1.5e-3 / 300), (149, 0.0, 1.5e-3 / 2), (10_000, 0.5, 1.5e-3 * 0.505), (40_000, 1.0, 1.5e-5)],
+    ("config", "step", "progress", "expected"),
+    [
+        (COSINE, 0, 0.0, 1.5e-3 / 300),
+        (COSINE, 149, 0.0, 1.5e-3 / 2),
+        (COSINE, 10_000, 0.5, 1.5e-3 * 0.505),
+        (COSINE, 40_000, 1.0, 1.5e-5),
+        (preset("paper"), 0, 0.899, 1e-4),
+        (preset("paper"), 0, 0.9, 1e-5),
+    ],
 )
-def test_cosine_schedule(step: int, progress: float, expected: float) -> None:
-    config = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
+def test_schedules(config: TrainingConfig, step: int, progress: float, expected: float) -> None:
     assert learning_rate(config, step, progress) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("progress", "expected"), [(0.0, 1e-4), (0.899, 1e-4), (0.9, 1e-5), (1.0, 1e-5)])
-def test_the_authors_schedule(progress: float, expected: float) -> None:
-    assert learning_rate(preset("paper"), 0, progress) == pytest.approx(expected)
-
-
-def learn(config: TrainingConfig, folder: Path) -> list[float]:
-    """Loss, angle, map error and its share at the lights after a run on one batch, over those at its start."""
-    trainer = Trainer(replace(config, turn_jitter_deg=0.0, shards=1), folder, CPU)
-    trainer.task.source = OneBatch(config)
-    results = torch.stack([trainer.step() for _ in range(config.steps)])
-    shares: list[float] = (results[-5:].mean(dim=0) / results[:3].mean(dim=0)).tolist()[:4]
-    return shares
 
 
 def test_normals_of_one_batch_are_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path) -> None:
     # At 1e-2 all units of so small a network may fall silent.
-    config = replace(tiny, steps=300, seed=6, learning_rate=3e-3)
-    loss, angle, _, _ = learn(config, tmp_path)
+    config = replace(tiny, steps=300, seed=6, learning_rate=3e-3, turn_jitter_deg=0.0, shards=1)
+    trainer = Trainer(config, tmp_path, CPU)
+    trainer.task.source = OneBatch(config)
+    results = torch.stack([trainer.step() for _ in range(config.steps)])
+    loss, angle, *_ = results[-5:].mean(dim=0) / results[:3].mean(dim=0)
     assert angle < 0.5
     # The maps of 16 pixels are more than so few channels can hold.
     assert loss < 0.7
@@ -146,23 +143,6 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
             replace(tiny, **settings)
 
 
-def test_a_network_can_get_a_set_branch_that_changes_no_normal_at_first(tiny: TrainingConfig, tmp_path: Path) -> None:
-    first = Trainer(tiny, tmp_path / "first", CPU)
-    first.run()
-    grown = replace(tiny.network, set_width=16, set_layers=1)
-    config = replace(tiny, network=grown, start_from=str(tmp_path / "first" / WEIGHTS))
-    second = Trainer(config, tmp_path / "second", CPU)
-    (batch, _), *_ = second.task.draw(second.counters.step)[0]
-    with torch.no_grad():
-        plain, with_set = (
-            network.eval()(batch.observations, batch.light_directions, batch.valid).normals
-            for network in (load_weights(tmp_path / "first" / WEIGHTS).network, second.network)
-        )
-    torch.testing.assert_close(with_set, plain, atol=1e-6, rtol=0)
-    second.run()
-    assert any(value.any() for value in second.network.ne_net.join.parameters())
-
-
 def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "REPORT_STEPS", 4)
     seen: list[tuple[float, Metrics]] = []
@@ -182,7 +162,7 @@ def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatc
     assert [row.validation_deg is not None for row in rows] == [False, False, True]
     assert last.validation_deg is not None
     loaded = load_weights(tmp_path / WEIGHTS).network
-    again = validation_deg(loaded, trainer.task.validation)
+    again = trainer.task.validation_deg(loaded, bfloat16=False)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
     assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
     assert TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text())) == trainer.config
@@ -270,7 +250,7 @@ def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path
     expected = losses(plain, 3)
     found = []
     for _ in range(3):
-        validation_deg(checked.average, checked.task.validation)
+        checked.task.validation_deg(checked.average, bfloat16=False)
         found += losses(checked, 1)
     assert found == expected
 

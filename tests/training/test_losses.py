@@ -9,10 +9,10 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from splinecli.maths.observation_map import cell_directions
-from splinecli.training.losses import (
+from splinecli.training.config import Norm
+from splinecli.training.objective import (
     AXIS_LENGTH,
-    Norm,
-    angular_loss,
+    angles,
     asymmetric_loss,
     asymmetries,
     map_loss,
@@ -34,13 +34,13 @@ def random_maps(*shape: int, seed: int = 0) -> Tensor:
 # A sine of 1e-6 stands in for zero, so that the gradient is bounded: 6e-5 degrees.
 @pytest.mark.parametrize("degrees", [0.0, 0.01, 10.0, 90.0, 179.0, 180.0])
 def test_angle(degrees: float) -> None:
-    assert math.degrees(angular_loss(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
+    assert math.degrees(angles(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 10.0, 180.0])
 def test_gradient_of_the_angle_is_finite_and_at_most_one(degrees: float) -> None:
     normals = at(degrees).requires_grad_()
-    angular_loss(normals, at(0)).backward()
+    angles(normals, at(0)).backward()
     assert normals.grad is not None
     assert torch.isfinite(normals.grad).all()
     assert normals.grad.norm() <= 1 + 1e-9
@@ -61,18 +61,7 @@ def test_map_loss_is_over_the_known_cells_of_each_pixel(norm: Norm, expected: fl
     # Three cells off by 0.3 and one by 0.7; two cells off by 0.3. Every pixel counts alike.
     assert map_loss(dense, truth, known, norm).item() == pytest.approx(expected)
     assert map_loss(truth, truth, known, norm) == 0
-
-
-@pytest.mark.parametrize(("norm", "expected"), [("mean", (0.15 + 0.6) / 2), ("sum", (0.3 + 0.6) / 2)])
-def test_masked_map_loss_is_over_observed_cells_of_known_truth(norm: Norm, expected: float) -> None:
-    occupied, truth = torch.zeros(2, 1, 4, 4), torch.zeros(2, 1, 4, 4)
-    occupied[0, 0, 0, 1] = occupied[0, 0, 2, 2] = occupied[1, 0, 3, 3] = occupied[1, 0, 1, 1] = 1
-    known = torch.ones_like(occupied)
-    known[1, 0, 1, 1] = 0
-    dense = torch.full((2, 1, 4, 4), 5.0)
-    dense[0, 0, 0, 1], dense[0, 0, 2, 2], dense[1, 0, 3, 3] = 0.1, -0.2, 0.6
-    assert map_loss(dense, truth, known * occupied, norm).item() == pytest.approx(expected)
-    assert map_loss(dense, truth, torch.zeros(2, 1, 4, 4), norm) == 0
+    assert map_loss(dense, truth, torch.zeros_like(known), norm) == 0
 
 
 @pytest.mark.parametrize("azimuth_deg", [17, 90, 211])
@@ -201,7 +190,6 @@ def four_cells(**cells: float) -> Tensor:
 def test_asymmetries_by_hand(maps: Tensor, fine: float, coarse: float) -> None:
     found = asymmetries(maps, at(30, 0), torch.ones_like(maps))
     assert [value.item() for value in found] == pytest.approx([fine, coarse], abs=1e-12)
-    assert found[0].mean().item() == pytest.approx(fine, abs=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -9,41 +9,28 @@ import torch
 
 from distributions import generator as seeded
 from splinecli.errors import InputError
-from splinecli.pixel_sets.source import SampledPixels
 from splinecli.pixel_sets.store import Entry, PixelSet
-from splinecli.synthesis.batches import PixelBatch, join_batches
+from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
-from splinecli.training.sources import open_sources, split_scenes
+from splinecli.training.sources import PixelSource, open_sets, pixel_source, split_scenes
 
 MakeSet = Callable[..., PixelSet]
+
+
+def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, PixelSource]:
+    """The sources of training and validation pixels."""
+    opened = open_sets(config)
+    return (
+        pixel_source(config, opened.training, seeded(seed)),
+        pixel_source(config, opened.validation, seeded(seed + 1), validates=True),
+    )
 
 
 def assert_same(one: PixelBatch, other: PixelBatch) -> None:
     for name in ("observations", "light_directions", "valid", "exposure"):
         assert torch.equal(getattr(one, name), getattr(other, name))
     assert torch.equal(one.truth.normals, other.truth.normals)
-
-
-class Constant:
-    """A source whose pixels have an exposure that identifies it."""
-
-    def __init__(self, number: float, lights: int) -> None:
-        self.number, self.lights = number, lights
-
-    def draw(self, pixels: int) -> PixelBatch:
-        lights = torch.tensor((0.0, 0.0, 1.0)).expand(pixels, self.lights, 3)
-        ones = torch.ones(pixels, self.lights)
-        scene = SampledPixels(lights[:, 0], ones, lights, ones > 0)
-        return PixelBatch(ones, lights, ones > 0, scene, torch.full((pixels, 1), self.number))
-
-
-def test_batches_of_other_numbers_of_lights_are_padded() -> None:
-    batch = join_batches([Constant(1.0, 3).draw(2), Constant(2.0, 5).draw(3)])
-    assert batch.observations.shape == (5, 5)
-    # Pixels with fewer lights are padded with lights that are not valid.
-    assert batch.valid.sum(dim=1).tolist() == [3, 3, 5, 5, 5]
-    assert not batch.observations[~batch.valid].any()
 
 
 def entries_of(*scenes: str) -> list[Entry]:
@@ -88,21 +75,21 @@ def normals_of(batch: PixelBatch) -> set[tuple[float, ...]]:
 
 def test_training_never_draws_from_validation_scenes(make_set: MakeSet, tiny: TrainingConfig) -> None:
     pixel_set = make_set(entries=[("a1", "a", 20, 20), ("b1", "b", 20, 20), ("b2", "b", 20, 20)])
-    opened = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}), seeded(1), seeded(2))
-    training, validation = opened.training.draw(500), opened.validation.draw(300)
+    source, held = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}))
+    training, validation = source.draw(500), held.draw(300)
     for_validation = {entry.name for entry in split_scenes(pixel_set.entries, tiny.held_share)[1]}
     assert for_validation in ({"a1"}, {"b1", "b2"})
     assert normals_of(training) == rows_of(pixel_set, *({"a1", "b1", "b2"} - for_validation))
     assert normals_of(validation) == rows_of(pixel_set, *for_validation)
     assert (validation.valid.sum(dim=1) == tiny.pixels.usual_lights).all()
-    counts = {int(opened.training.draw(1).valid.sum()) for _ in range(30)}
+    counts = {int(source.draw(1).valid.sum()) for _ in range(30)}
     assert len(counts) > 3
 
 
 def test_a_single_scene_is_validated_on_itself(make_set: MakeSet, tiny: TrainingConfig) -> None:
     pixel_set = make_set(entries=[("a", "one", 20, 20)])
-    opened = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}), seeded(1), seeded(2))
-    assert normals_of(opened.validation.draw(300)) == normals_of(opened.training.draw(300))
+    source, held = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}))
+    assert normals_of(held.draw(300)) == normals_of(source.draw(300))
 
 
 def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfig) -> None:
@@ -110,8 +97,8 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     config = replace(tiny, sources={str(pixel_set.folder): 1.0, GENERATOR: 3.0})
 
     def draw(seed: int, count: int) -> tuple[list[PixelBatch], list[PixelBatch]]:
-        opened = open_sources(config, seeded(seed), seeded(seed + 1))
-        return [opened.training.draw(5) for _ in range(count)], [opened.validation.draw(5) for _ in range(count // 4)]
+        source, held = open_sources(config, seed)
+        return [source.draw(5) for _ in range(count)], [held.draw(5) for _ in range(count // 4)]
 
     (training, validation), again = draw(5, 60), draw(5, 8)
     for batches, others in ((training, again[0]), (validation, again[1])):
@@ -135,18 +122,17 @@ def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(make_set: Ma
     one = make_set("one", entries=[("a", "a", 20, 20), ("b", "b", 20, 20), ("c", "c", 20, 20)])
     other = make_set("other", entries=[("x", "x", 20, 20), ("y", "y", 20, 20), ("z", "z", 20, 20)])
     sources = {str(one.folder): 1.0, str(other.folder): 1.0}
-    opened = open_sources(replace(tiny, sources=sources), seeded(1), seeded(2))
-    assert not normals_of(opened.training.draw(600)) & normals_of(opened.validation.draw(600))
-    assert set(opened.sets) == set(sources)
+    source, held = open_sources(replace(tiny, sources=sources))
+    assert not normals_of(source.draw(600)) & normals_of(held.draw(600))
     # The only scene of "alone" is a validation scene of the other set, so nothing is left for training.
     validation_scene = "p" if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else "q"
     order = ("p", "q") if validation_scene == "p" else ("q", "p")
     rest = make_set("rest", entries=[(name, name, 20, 20) for name in order])
     alone = make_set("alone", entries=[("a", "a", 20, 20)])
     with pytest.raises(InputError, match="all scenes of the set are used for validation"):
-        open_sources(replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}), seeded(), seeded())
+        open_sets(replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}))
 
 
 def test_sources_without_weight_are_not_opened(tiny: TrainingConfig) -> None:
-    opened = open_sources(replace(tiny, sources={"/no/such/set": 0.0, GENERATOR: 1.0}), seeded(), seeded(1))
-    assert isinstance(opened.training, PixelGenerator)
+    source, _ = open_sources(replace(tiny, sources={"/no/such/set": 0.0, GENERATOR: 1.0}))
+    assert isinstance(source, PixelGenerator)

@@ -9,7 +9,7 @@ from splinecli.networks.spline_net import SplineNet
 from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import TrainingConfig
-from splinecli.training.validation import SHOWN_PIXELS, sample_maps, validation_deg
+from splinecli.training.tasks import SHOWN_PIXELS, PixelTask
 
 
 @pytest.fixture
@@ -23,9 +23,16 @@ def batch(tiny: TrainingConfig) -> PixelBatch:
     return PixelGenerator(tiny.pixels, torch.Generator().manual_seed(3)).draw(40)
 
 
-def test_validation_is_the_mean_angle_to_the_truth(network: SplineNet, batch: PixelBatch) -> None:
+@pytest.fixture
+def task(tiny: TrainingConfig, batch: PixelBatch) -> PixelTask:
+    made = PixelTask(tiny, range(1), torch.device("cpu"))
+    made.validation = [batch]
+    return made
+
+
+def test_validation_is_the_mean_angle_to_the_truth(task: PixelTask, network: SplineNet, batch: PixelBatch) -> None:
     network.train()
-    found = validation_deg(network, batch)
+    found = task.validation_deg(network, bfloat16=False)
     assert not network.training
     with torch.no_grad():
         normals = network(batch.observations, batch.light_directions, batch.valid).normals
@@ -34,8 +41,8 @@ def test_validation_is_the_mean_angle_to_the_truth(network: SplineNet, batch: Pi
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
-def test_the_maps_of_some_pixels(network: SplineNet, batch: PixelBatch) -> None:
-    shown = sample_maps(network, batch)
+def test_the_maps_of_some_pixels(task: PixelTask, network: SplineNet, batch: PixelBatch) -> None:
+    shown = task.sample_maps(network)
     assert len(shown.sparse) == len(shown.dense) == len(shown.truth) == len(shown.error_deg) == SHOWN_PIXELS
     views = network.build_maps(batch.observations, batch.light_directions, batch.valid)
     inside = cell_directions()[1].numpy()

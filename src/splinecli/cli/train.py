@@ -110,8 +110,8 @@ def train(
 
 
 def _run(trainer: Trainer, messages: Messages) -> None:
-    if trainer.single_scene_sets:
-        names = ", ".join(trainer.single_scene_sets)
+    if single := trainer.task.sets.single_scene_sets:
+        names = ", ".join(single)
         messages.warn(f"{names}: the set has a single scene, so training and validation use the same pixels")
     if trainer.workers.leads and trainer.log.set_aside:
         messages.warn(f"metrics.csv was damaged and is now {trainer.log.set_aside}")

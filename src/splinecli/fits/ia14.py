@@ -16,6 +16,7 @@ from splinecli.fits.shadows import lit_observations
 DEGREE_OBSERVATION = 2  # N1 in the paper
 DEGREE_LIGHT = 4  # N2 in the paper
 SHADOW_SHARE = 0.2  # of the pixel's quantile UNSHADED; observations below it are left out as shadows
+_MOST_EXCHANGES = 100
 _RIDGE = 1e-10  # determines the normal and the polynomial of a pixel without light
 
 
@@ -105,19 +106,18 @@ def _bernstein(values: Tensor, degree: int) -> Tensor:
     return torch.stack(terms, dim=-1)
 
 
-def minimise_nonnegative(hessian: Tensor, linear: Tensor, *, iterations: int = 100) -> Tensor:
+def minimise_nonnegative(hessian: Tensor, linear: Tensor) -> Tensor:
     """Return the x >= 0 (P, K) that minimise x'Hx / 2 - q'x, for P programmes with a hessian H and a linear term q
     each.
 
     Block principal pivoting (Júdice and Pires 1994; the backup rule as in Kim and Park 2011, SIAM J. Sci. Comput.,
     algorithm 2): guess which variables are free, solve for them with the others at zero, and exchange those that
-    violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum.
+    violate x >= 0 or the sign of the gradient. Without rounding errors, this ends at the optimum. They may cause cycles
+    if a hessian is nearly singular; the result is then feasible and close to the optimum.
 
     Args:
         hessian: (P, K, K), symmetric and positive definite.
         linear: (P, K).
-        iterations: a limit, because rounding errors may cause cycles if a hessian is nearly singular. The result is
-            then feasible and close to the optimum.
     """
     count, size = linear.shape
     eye = torch.eye(size, dtype=hessian.dtype, device=hessian.device)
@@ -127,7 +127,7 @@ def minimise_nonnegative(hessian: Tensor, linear: Tensor, *, iterations: int = 1
     fewest_wrong = linear.new_full((count,), size + 1)
     patience = linear.new_full((count,), 3)
     x = torch.zeros_like(linear)
-    for _ in range(iterations):
+    for _ in range(_MOST_EXCHANGES):
         system = torch.where(free[:, :, None] & free[:, None, :], hessian, eye)
         right_side = torch.where(free, linear, 0)[..., None]
         x = torch.cholesky_solve(right_side, torch.linalg.cholesky(system))[..., 0]

@@ -18,10 +18,6 @@ def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
 
     Iteratively reweighted least squares comes close to the minimum. There, three residuals are zero. So the b of the
     three smallest residuals is used where it is better.
-
-    Args:
-        observations: (P, F) float64, the largest of each pixel 1.
-        light_directions: (F, 3) or (P, F, 3) float64, unit.
     """
     weight = torch.ones_like(observations)
     for step in range(ITERATIONS):

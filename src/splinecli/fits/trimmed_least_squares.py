@@ -21,10 +21,6 @@ def solve(observations: Tensor, light_directions: Tensor) -> Tensor:
     """Return scaled normals b (P, 3) that minimise |I - L b| over the remaining observations.
 
     Equal observations are kept or left out together, so the order of the lights does not matter.
-
-    Args:
-        observations: (P, F) float64, the largest of each pixel 1.
-        light_directions: (F, 3) or (P, F, 3) float64, unit.
     """
     count = observations.shape[1]
     trimmed = max(0, min(int(TRIMMED_SHARE * count), (count - FEWEST) // 2))

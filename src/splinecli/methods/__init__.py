@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Literal
 
@@ -69,60 +70,46 @@ def _least_squares(*_: object) -> Estimator:
     return LeastSquares()
 
 
-@dataclass(frozen=True)
-class _Solver:
-    """A method whose `solve` is in a module of `splinecli.fits`, and its default batch size."""
+def _solver(name: str, options: MethodOptions, *, module: str, batch_size: int) -> Estimator:
+    """Return a method whose `solve` is in a module of `splinecli.fits`."""
+    from splinecli.methods.batched import BatchedEstimator
+    from splinecli.system.devices import choose_device, use_available_cores
 
-    module: str
-    batch_size: int
-
-    def __call__(self, name: str, options: MethodOptions) -> Estimator:
-        from splinecli.methods.batched import BatchedEstimator
-        from splinecli.system.devices import choose_device, use_available_cores
-
-        use_available_cores()
-        solve = import_module(f"splinecli.fits.{self.module}").solve
-        size = self.batch_size if options.batch_size is None else options.batch_size
-        return BatchedEstimator(name, solve, str(choose_device(options.device)), size)
+    use_available_cores()
+    solve = import_module(f"splinecli.fits.{module}").solve
+    size = batch_size if options.batch_size is None else options.batch_size
+    return BatchedEstimator(name, solve, str(choose_device(options.device)), size)
 
 
-@dataclass(frozen=True)
-class _Network:
-    """A network: its default weights and averaged rotations, and whether it refines the map."""
+def _network(name: str, options: MethodOptions, *, weights: str, rotations: int, refines: bool = True) -> Estimator:
+    from splinecli.methods.networks import NetworkEstimator
+    from splinecli.networks.weights import resolve_weights
+    from splinecli.system.devices import choose_device, choose_precision, use_available_cores
 
-    weights: str
-    rotations: int
-    refines: bool = True
-
-    def __call__(self, name: str, options: MethodOptions) -> Estimator:
-        from splinecli.methods.networks import NetworkEstimator
-        from splinecli.networks.weights import resolve_weights
-        from splinecli.system.devices import choose_device, choose_precision, use_available_cores
-
-        use_available_cores()
-        device = choose_device(options.device)
-        return NetworkEstimator(
-            name,
-            resolve_weights(options.weights or self.weights),
-            device=device,
-            precision=choose_precision(options.precision, device),
-            refines=self.refines,
-            rotations=self.rotations if options.rotations is None else options.rotations,
-            batch_size=_BATCH[device.type] if options.batch_size is None else options.batch_size,
-        )
+    use_available_cores()
+    device = choose_device(options.device)
+    return NetworkEstimator(
+        name,
+        resolve_weights(options.weights or weights),
+        device=device,
+        precision=choose_precision(options.precision, device),
+        refines=refines,
+        rotations=rotations if options.rotations is None else options.rotations,
+        batch_size=_BATCH[device.type] if options.batch_size is None else options.batch_size,
+    )
 
 
 _BATCH = {"cpu": 256, "cuda": 1024}
 """Pixels in a network's batch. Processors compute a batch on each core."""
 
 _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
-    "spline-net": _Network("spline-net", rotations=1),
-    "cnn-ps": _Network("cnn-ps", rotations=10),
+    "spline-net": partial(_network, weights="spline-net", rotations=1),
+    "cnn-ps": partial(_network, weights="cnn-ps", rotations=10),
     "ls": _least_squares,
-    "ls-trimmed": _Solver("trimmed_least_squares", 8192),
-    "l1": _Solver("least_absolute", 8192),
-    "iw12": _Solver("iw12", 8192),
-    "st14": _Solver("st14", 1024),
-    "ia14": _Solver("ia14", 1024),
-    "spline-net-pixelwise": _Network("spline-net", rotations=1, refines=False),
+    "ls-trimmed": partial(_solver, module="trimmed_least_squares", batch_size=8192),
+    "l1": partial(_solver, module="least_absolute", batch_size=8192),
+    "iw12": partial(_solver, module="iw12", batch_size=8192),
+    "st14": partial(_solver, module="st14", batch_size=1024),
+    "ia14": partial(_solver, module="ia14", batch_size=1024),
+    "spline-net-pixelwise": partial(_network, weights="spline-net", rotations=1, refines=False),
 }

@@ -33,8 +33,6 @@ class BatchedEstimator:
         name: the method's name in the registry.
         solve: see Solve. Each pixel is first divided by its largest observation. Thresholds and priors then mean
             the same for dark and bright pixels, and the scale of the images does not matter.
-        device: the torch device.
-        batch_size: pixels per batch.
 
     Raises:
         UsageError: batch_size is below 1.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splinecli.system.progress import Progress
 
 if TYPE_CHECKING:
-    from splinecli.light.lamp_light import LightOf
+    from splinecli.refinement.refiner import NetworkRefiner
 
 Observations = NDArray[np.float32]
 """(P, F): linear, already divided by the light intensities."""
@@ -88,26 +88,9 @@ class ConfidentEstimator(Estimator, Protocol):
         ...
 
 
-class Refiner(Protocol):
-    """Corrects a map of normals by what lies around each pixel."""
-
-    def refine(
-        self,
-        mask: NDArray[np.bool_],
-        observations: Observations,
-        light_of: LightOf,
-        normals: NDArray[np.float32],
-        errors: NDArray[np.float32],
-        *,
-        progress: Progress | None = None,
-    ) -> None:
-        """Replace normals (P, 3) and the distributions (P, 2) of their errors by refined ones."""
-        ...
-
-
-def refiner_of(estimator: Estimator) -> Refiner | None:
+def refiner_of(estimator: Estimator) -> NetworkRefiner | None:
     """Return what corrects the estimator's map of normals by what lies around each pixel, if anything does."""
-    refiner: Refiner | None = getattr(estimator, "refiner", None)
+    refiner: NetworkRefiner | None = getattr(estimator, "refiner", None)
     return refiner
 
 

@@ -29,8 +29,6 @@ class NetworkEstimator:
 
     Args:
         name: the method's name in the registry.
-        loaded: the network with its name and checksum.
-        device: the torch device.
         precision: the number format of the convolutions.
         refines: whether the refinement net, if the weights have one, corrects the map afterwards.
         rotations: number R of averaged estimates, see `rotations_of`.
@@ -78,7 +76,7 @@ class NetworkEstimator:
         self, observations: Observations, light_directions: Directions, *, progress: Progress | None = None
     ) -> NDArray[np.float32]:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); see Estimator."""
-        return self._in_batches(observations, light_directions, progress)[:, :3]
+        return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
     @property
     def tells_confidence(self) -> bool:
@@ -89,23 +87,9 @@ class NetworkEstimator:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see ConfidentEstimator.
 
-        The numbers of the distributions are means over the rotations.
-
-        Raises:
-            UsageError: the weights have no error head.
+        The numbers of the distributions are means over the rotations, and 0 without an error head.
         """
-        if not self.tells_confidence:
-            raise UsageError(f"the weights {self.weights['name']!r} cannot estimate the confidence")
-        results = self._in_batches(observations, light_directions, progress)
-        return results[:, :3], results[:, 3:]
-
-    def _in_batches(
-        self,
-        observations: Observations,
-        light_directions: Directions,
-        progress: Progress | None,
-    ) -> NDArray[np.float32]:
-        return estimate_in_batches(
+        results = estimate_in_batches(
             self._average_rotations,
             observations,
             light_directions,
@@ -115,6 +99,7 @@ class NetworkEstimator:
             columns=5,
             progress=progress,
         )
+        return results[:, :3], results[:, 3:]
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
         """Return normals and the distributions of their errors (P, 5). The latter are 0 without an error head."""

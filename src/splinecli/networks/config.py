@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args, get_type_hints
 
 from splinecli.errors import ModelError
 from splinecli.maths.observation_map import MAP_SIZE, Grid
 from splinecli.networks.set_branch import HEAD_WIDTH
 from splinecli.networks.starting_fits import STARTING_FITS
 
-_CHOICES = {
-    "size": ("paper", "compact"),
-    "grid": get_args(Grid),
-    "interpolates": (True, False),
-    "error_head": (True, False),
-    "refines": (True, False),
-}
-
-
-_LEAST = {"set_width": 0}
-"""Smallest values of settings that may be below 1."""
-
-_MOST = {"li_blocks": 64, "ne_blocks": 64, "set_layers": 64}
-"""Largest values of settings that count layers. Each layer is an object in memory, whatever its size."""
-
-_MOST_OTHERS = 4096
+_RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "set_layers": (1, 64)}
+"""Smallest and largest values of settings, of others 1 and 4096. Each layer takes memory, whatever its size."""
 
 
 @dataclass(frozen=True)
@@ -74,25 +60,23 @@ class NetworkConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
         """Rebuild a configuration from plain values. Raises ModelError for an unknown key or value."""
-        known = {field.name: field.type for field in fields(cls)}
+        known = get_type_hints(cls)
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
         values = dict(values)
         fits = _fits(values.pop("fits", ()))
         for name, value in values.items():
-            if name in _CHOICES:
-                if value not in _CHOICES[name]:
-                    expected = " or ".join(map(repr, _CHOICES[name]))
+            choices = (True, False) if known[name] is bool else get_args(known[name])
+            if choices:
+                if value not in choices:
+                    expected = " or ".join(map(repr, choices))
                     raise ModelError(f"network {name} is {value!r}; expected {expected}")
-            elif (
-                not isinstance(value, int)
-                or isinstance(value, bool)
-                or not _LEAST.get(name, 1) <= value <= _MOST.get(name, _MOST_OTHERS)
-            ):
+                continue
+            least, most = _RANGES.get(name, (1, 4096))
+            if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
                 raise ModelError(
-                    f"network setting {name!r} is {value!r}; expected a whole number"
-                    f" from {_LEAST.get(name, 1)} to {_MOST.get(name, _MOST_OTHERS)}"
+                    f"network setting {name!r} is {value!r}; expected a whole number from {least} to {most}"
                 )
         config = cls(**values, fits=fits)
         # Both sizes halve the map twice. An instance norm needs more than one cell after that.
@@ -100,14 +84,11 @@ class NetworkConfig:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
         if config.width < 2:
             raise ModelError(f"network setting 'width' is {config.width}; expected at least 2")
-        if config.fits and config.size != "compact":
-            raise ModelError("network setting 'fits' needs the size 'compact'")
-        if config.error_head and config.size != "compact":
-            raise ModelError("network setting 'error_head' needs the size 'compact'")
+        for name in ("fits", "error_head", "set_width"):
+            if getattr(config, name) and config.size != "compact":
+                raise ModelError(f"network setting {name!r} needs the size 'compact'")
         if config.refines and not config.error_head:
             raise ModelError("network setting 'refines' needs 'error_head'")
-        if config.set_width and config.size != "compact":
-            raise ModelError("network setting 'set_width' needs the size 'compact'")
         if config.set_width % HEAD_WIDTH:
             raise ModelError(f"network setting 'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}")
         if config.grid != "even" and config.size != "paper":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from splinecli.networks.config import NetworkConfig
 from splinecli.networks.layers import PATCH, MapEncoder, zeroed
 
 
@@ -54,12 +55,12 @@ class _PaperResidualBlock(nn.Module):
 
 
 class CompactLINet(nn.Module):
-    """An encoder-decoder on 4 x 4 patches, from (P, C, w, w) to a correction (P, 1, w, w) that is zero at first."""
+    """An encoder-decoder on 4 x 4 patches, from (P, 4, w, w) to a correction (P, 1, w, w) that is zero at first."""
 
-    def __init__(self, channels: int, width: int, blocks: int, map_size: int) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.encoder = MapEncoder(channels, width, blocks, map_size)
-        self.decoder = zeroed(nn.Conv2d(width, PATCH**2, 1))
+        self.encoder = MapEncoder(4, config.width, config.li_blocks, config.map_size)
+        self.decoder = zeroed(nn.Conv2d(config.width, PATCH**2, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
         return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)

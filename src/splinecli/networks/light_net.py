@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -31,10 +30,6 @@ class LightGuess(NamedTuple):
     directions: Tensor
     sharpness: Tensor
     log_intensities: Tensor
-
-    def expected_rad(self) -> Tensor:
-        """Return the expected errors (B, F) of the directions in radians, those of a normal distribution."""
-        return (math.pi / 2 / self.sharpness.exp()).sqrt()
 
 
 class LightNet(nn.Module):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import ErrorHead
 from splinecli.networks.layers import PATCH, MapEncoder, zeroed
 
@@ -57,29 +58,20 @@ class _DenseBlock(nn.Module):
 
 
 class CompactNENet(nn.Module):
-    """Maps (P, C, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit length.
+    """Maps (P, 4 or 5, w, w) and starting normals (P, K + 1, 3) to normals (P, 3), not of unit length.
 
     The result is a weighted sum of the starting normals plus a correction. At first the first normal has weight 1, and
     all else is zero. With K = 0 this weight is fixed. Features (P, set_width) of the set branch join the hidden layer.
     The second result is that of the error head (P, 2), None without one.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        width: int,
-        blocks: int,
-        head_width: int,
-        map_size: int,
-        fits: int = 0,
-        *,
-        set_width: int = 0,
-        error_head: bool = False,
-    ) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.encoder = MapEncoder(channels, width, blocks, map_size)
+        width, head_width = config.width, config.head_width
+        fits = len(config.fits) + bool(config.set_width)
+        self.encoder = MapEncoder(4 + config.interpolates, width, config.ne_blocks, config.map_size)
         self.squeeze = nn.Conv2d(width, width // 2, 1)
-        side = map_size // PATCH
+        side = config.map_size // PATCH
         self.hidden = nn.Linear(width // 2 * side * side, head_width)
         self.out = zeroed(nn.Linear(head_width, 3))
         self.compare: nn.Linear | None = None
@@ -90,8 +82,8 @@ class CompactNENet(nn.Module):
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
                 self.weigh.bias.copy_(torch.arange(fits + 1) == 0)
-        self.join = nn.Linear(set_width, head_width, bias=False) if set_width else None
-        self.error_head = ErrorHead(head_width, fits + 2) if error_head else None
+        self.join = nn.Linear(config.set_width, head_width, bias=False) if config.set_width else None
+        self.error_head = ErrorHead(head_width, fits + 2) if config.error_head else None
 
     def forward(
         self, maps: Tensor, normals: Tensor, set_features: Tensor | None = None

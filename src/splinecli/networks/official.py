@@ -29,8 +29,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import check_length, load_strictly
 
-# Our module names and theirs. LI-Net differs in the name of its sequences, NE-Net in the name of each module.
-_LI_NET_SEQUENCE = ("layers", "main")
+# Our module names and theirs of NE-Net. LI-Net differs in the name of its sequences.
 _NE_NET_MODULES = {
     "stem": "conv1",
     "dense1.first": "denseblock1_1.1",
@@ -42,9 +41,6 @@ _NE_NET_MODULES = {
     "hidden": "dense.0",
     "out": "dense.1",
 }
-# Statistics that their instance norms collect in training. The authors' code normalises by the statistics of each
-# map, also at test time (it never leaves the training mode), so these values are not used.
-_TRACKED = ("running_mean", "running_var", "num_batches_tracked")
 _MOST_NAMES = 5
 _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
 """Records of an archive, bytes and instructions of a pickle. The authors' have some dozens, 10 kB and 2,000."""
@@ -82,16 +78,15 @@ def _flip_rows(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
-    ours, theirs = _LI_NET_SEQUENCE
-    names = {name: name.replace(ours, theirs) for name in li_net.state_dict()}
+    names = {name: name.replace("layers", "main") for name in li_net.state_dict()}
+    # Statistics that their instance norms collect in training. The authors' code normalises by the statistics of each
+    # map, also at test time (it never leaves the training mode), so these values are not used.
     tracked: dict[str, torch.Size] = {}
-    for name, module in li_net.named_modules():
-        if isinstance(module, nn.InstanceNorm2d):
-            width = torch.Size([module.num_features])
-            shapes = (width, width, torch.Size([]))
-            tracked |= {
-                f"{name}.{key}".replace(ours, theirs): shape for key, shape in zip(_TRACKED, shapes, strict=True)
-            }
+    for name, tensor in li_net.state_dict().items():
+        norm, _, kind = names[name].rpartition(".")
+        if kind == "weight" and tensor.ndim == 1:
+            tracked |= {f"{norm}.running_mean": tensor.shape, f"{norm}.running_var": tensor.shape}
+            tracked[f"{norm}.num_batches_tracked"] = torch.Size([])
     return _rename(path, _read_state(path), li_net, names, tracked)
 
 

@@ -46,7 +46,10 @@ class SetBranch(nn.Module):
             valid: (P, F) bool; None for all.
             normals: (P, K, 3), the starting normals, unit or zero.
         """
-        features = torch.cat((_token_features(observed, lights, residual, normals)), dim=-1)
+        half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
+        log_observed = (observed.clamp(min=0) + DARKEST).log()
+        values = torch.stack((observed, log_observed, residual), dim=-1)
+        features = torch.cat((lights, values, lights @ normals.mT, half @ normals.mT), dim=-1)
         count = observed.shape[1] if valid is None else valid.sum(dim=1, keepdim=True)
         log_count = torch.as_tensor(count, dtype=observed.dtype, device=observed.device).log()
         pixel = torch.cat((normals.flatten(1), log_count.expand(len(observed), 1)), dim=1)
@@ -88,18 +91,6 @@ class _AttentionLayer(nn.Module):
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
         return out
-
-
-def _token_features(observed: Tensor, lights: Tensor, residual: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
-    half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
-    return (
-        lights,
-        observed[..., None],
-        (observed.clamp(min=0) + DARKEST).log()[..., None],
-        residual[..., None],
-        lights @ normals.mT,
-        half @ normals.mT,
-    )
 
 
 def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor:

@@ -1,15 +1,8 @@
 """SPLINE-Net (Zheng et al., ICCV 2019): from observations to maps, through LI-Net and NE-Net, to normals.
 
-The compact size differs from the paper's in four ways. Each helps it learn more from each pixel.
-
-1. Canonical azimuth: the lights of each pixel are turned about the view axis until its robust Lambertian normal has
-   azimuth zero. The estimate is turned back. The network therefore sees normals of one azimuth only.
-2. Both networks correct the Lambertian fit: LI-Net its map, NE-Net its normal. A matte pixel is right from the start.
-   NE-Net may also weigh the normals of further fits.
-3. Two more channels accompany the sparse map: which cells have an observation, and the residual of the fit there. The
-   residual uses the exact light directions, which a 32 x 32 grid rounds by up to 2 degrees.
-4. The dense map has the scale of the sparse map, its largest observation. Values above 1 are cut off, so that a
-   highlight under some other light does not change the scale of all other values.
+docs/method.md says what the compact size does differently. Its dense map has the scale of the sparse map, the largest
+observation. Values above 1 are cut off, so that a highlight under some other light does not change the scale of all
+other values.
 """
 
 from __future__ import annotations
@@ -102,22 +95,12 @@ class SplineNet(nn.Module):
         self.config = config
         self.li_net: nn.Module | None = None
         self.ne_net: nn.Module
-        width, size, maps = config.width, config.map_size, int(config.interpolates)
         if config.size == "paper":
             self.li_net = PaperLINet() if config.interpolates else None
-            self.ne_net = PaperNENet(1 + maps, size)
+            self.ne_net = PaperNENet(1 + config.interpolates, config.map_size)
         else:
-            self.li_net = CompactLINet(4, width, config.li_blocks, size) if config.interpolates else None
-            self.ne_net = CompactNENet(
-                4 + maps,
-                width,
-                config.ne_blocks,
-                config.head_width,
-                size,
-                len(config.fits) + int(config.set_width > 0),
-                set_width=config.set_width,
-                error_head=config.error_head,
-            )
+            self.li_net = CompactLINet(config) if config.interpolates else None
+            self.ne_net = CompactNENet(config)
         self.set_branch: SetBranch | None = None
         if config.set_width:
             self.set_branch = SetBranch(config.set_width, config.set_layers, 1 + len(config.fits))

@@ -40,7 +40,6 @@ class LoadedNetwork:
     """A network that is ready to estimate normals (float32, evaluation mode).
 
     Attributes:
-        network: the network.
         name: the shipped name, or the file name without its suffix.
         sha256: SHA-256 of the weight file.
     """
@@ -90,15 +89,9 @@ def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None
 
 
 def read_tensors(path: Path, expected_format: str, hint: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read the tensors and the metadata of a safetensors file of splinecli, and verify its checksum.
+    """Read the tensors and the metadata of a safetensors file of splinecli, and verify its format and checksum.
 
-    Args:
-        path: the file.
-        expected_format: the format entry that the file must have.
-        hint: advice to add to an error.
-
-    Raises:
-        ModelError: the file is missing, has another format, or is damaged.
+    Raises ModelError, with the hint, for a file that is missing, of another format, or damaged.
     """
     try:
         if path.is_dir():
@@ -153,15 +146,7 @@ def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) ->
 
 
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
-    """Load the network of a weight file.
-
-    Args:
-        path: the file.
-        name: the name of the result. None takes the file name without its suffix.
-
-    Raises:
-        ModelError: the file cannot be used.
-    """
+    """Load the network of a weight file, under a name or that of the file without its suffix. Raises ModelError."""
     names = ", ".join(shipped_names())
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"

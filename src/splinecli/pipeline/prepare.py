@@ -145,7 +145,7 @@ def _render_on_workers(
                     shape = rendered[position]
                     if isinstance(shape, str):
                         path = _path(writer.folder, position)
-                        add_rendered(writer, plan, position, shape, partial(load_rendered, path))
+                        add_rendered(writer, plan, position, shape, load_rendered(path))
                         path.unlink()
                     if not isinstance(shape, LostError):
                         for name in plan.entry_names(position).values():
@@ -167,6 +167,6 @@ def _path(folder: Path, position: int) -> Path:
 def _render(plan: ScenePlan, folder: Path, position: int) -> str:
     """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
     plan.check_inputs()
-    rendered = render_planned(plan, position)
-    save_rendered(rendered, _path(folder, position))
-    return rendered.shape
+    shape, pixels = render_planned(plan, position)
+    save_rendered(pixels, _path(folder, position))
+    return shape

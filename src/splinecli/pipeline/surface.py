@@ -13,7 +13,7 @@ from splinecli.capture.window import parse_window
 from splinecli.errors import UsageError
 from splinecli.surface.bilateral_equations import STIFFNESS
 from splinecli.surface.camera import focal_length
-from splinecli.surface.decimation import decimate, mesh_to_decimate
+from splinecli.surface.decimation import decimated_mesh
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.mesh import surface_mesh
 from splinecli.surface.surface_files import Surface
@@ -40,33 +40,25 @@ def make_surface(
     Args:
         normal_map, mask, camera_matrix, stiffness, prior_detail, progress: see integrate_normals.
         colours, largest_step: see surface_mesh.
-        n_triangles: see decimate. None keeps all triangles.
+        n_triangles: see decimated_mesh. None keeps all triangles.
         pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a surface in pixels,
             or, with a camera matrix, in mean depths.
         prior: see integrate_normals; in the unit of the surface. With a camera matrix this is the millimetre, so that
             pixel_size_mm is not needed.
 
     Raises:
-        InputError, UsageError: see integrate_normals, surface_mesh and decimate.
+        InputError, UsageError: see integrate_normals, surface_mesh and decimated_mesh.
     """
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
     depth = integrate_normals(
         normal_map, mask, camera_matrix, stiffness=stiffness, prior=prior, prior_detail=prior_detail, progress=progress
     )
+    surface = depth, mask, camera_matrix, colours
     if n_triangles is None:
-        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+        mesh = surface_mesh(*surface, normal_map=normal_map, largest_step=largest_step)
     else:
-        fine = mesh_to_decimate(
-            depth,
-            mask,
-            camera_matrix,
-            colours,
-            n_triangles=n_triangles,
-            normal_map=normal_map,
-            largest_step=largest_step,
-        )
-        mesh = decimate(fine, n_triangles, normal_map, camera_matrix)
+        mesh = decimated_mesh(*surface, n_triangles=n_triangles, normal_map=normal_map, largest_step=largest_step)
     pixel = 1.0 if camera_matrix is None else 1 / focal_length(camera_matrix)
     unit, millimetres = "pixel" if camera_matrix is None else "mean depth", 1 / pixel
     if prior is not None and camera_matrix is not None:

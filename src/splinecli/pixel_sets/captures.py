@@ -25,14 +25,11 @@ class CaptureChangedError(OutputError):
 
 
 def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
-    """Choose the name of the entry of each capture.
+    """Choose the name of the entry of each capture, and return the folders by name.
 
     A capture that is in the set keeps its name. A new capture is named after its folder, with a number if another
     capture has that name. A folder that is given twice counts once, because its pixels must not both train and
     validate.
-
-    Returns:
-        Folders by name.
     """
     captures: dict[str, Path] = {}
     for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
@@ -66,9 +63,6 @@ def add_capture(
     half their size.
 
     Args:
-        writer: the set.
-        name: the name of the entry.
-        folder: the capture.
         as_stored: use the stored values alone. By default, saturated observations are restored and unknown light
             intensities are estimated, as `infer` does.
         white_level: stored value from which a pixel counts as saturated; None to find it in the images.

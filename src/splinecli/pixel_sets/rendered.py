@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.principled import CLASSES
-from splinecli.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
+from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 from splinecli.system.extras import import_extra
 from splinecli.system.files import file_sha256, replacing
 
@@ -29,14 +29,7 @@ _FIRST_MESH_INDEX = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The scenes to render: first one of each mesh, then `count` random ones.
-
-    Args:
-        config: size, lights and quality of all scenes.
-        seed: seed of all random numbers.
-        count: number of random scenes.
-        meshes: mesh files of the user.
-    """
+    """The scenes to render: first one of each mesh file, then `count` random ones."""
 
     config: SceneConfig
     seed: int
@@ -93,21 +86,11 @@ class ScenePlan:
 
 
 def add_scene(
-    writer: PixelSetWriter,
-    plan: ScenePlan,
-    position: int,
-    progress: Callable[[float], None] | None = None,
+    writer: PixelSetWriter, plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None
 ) -> list[str]:
-    """Render a scene of the plan in each class of materials, unless the set has it.
+    """Render scene number `position` of the plan, unless the set has it, and return the names of its entries.
 
-    Args:
-        writer: the set, which `plan.check_set` has checked.
-        plan: all scenes.
-        position: the number of the scene in the plan.
-        progress: called with the finished share of the rendering, 0 to 1.
-
-    Returns:
-        The names of the scene's entries.
+    The set has passed `plan.check_set`. `progress` is called with the finished share of the rendering, 0 to 1.
 
     Raises:
         InputError: the mesh cannot be used, or the camera sees nothing.
@@ -115,8 +98,7 @@ def add_scene(
         UsageError: the packages of the extra `render` are not installed.
     """
     if not has_scene(writer, plan, position):
-        rendered = render_planned(plan, position, progress)
-        add_rendered(writer, plan, position, rendered.shape, partial(_pixels, rendered))
+        add_rendered(writer, plan, position, *render_planned(plan, position, progress))
     return list(plan.entry_names(position).values())
 
 
@@ -126,38 +108,31 @@ def has_scene(writer: PixelSetWriter, plan: ScenePlan, position: int) -> bool:
 
 
 def add_rendered(
-    writer: PixelSetWriter, plan: ScenePlan, position: int, shape: str, pixels: Callable[[str], Pixels]
+    writer: PixelSetWriter, plan: ScenePlan, position: int, shape: str, pixels: Mapping[str, Pixels]
 ) -> None:
-    """Add the entries of a rendered scene.
-
-    Args:
-        writer, plan, position: see add_scene.
-        shape: what was rendered.
-        pixels: returns the pixels of a class of materials.
-
-    Raises:
-        OutputError: an entry cannot be written.
-    """
+    """Add the entries of a scene, with the results of render_planned. Raises OutputError."""
     recipe = plan.recipe(position)
     for kind, name in plan.entry_names(position).items():
-        writer.add(name, plan.names[position], f"rendered: {shape}", recipe, pixels(kind))
+        writer.add(name, plan.names[position], f"rendered: {shape}", recipe, pixels[kind])
 
 
-def save_rendered(rendered: RenderedScene, path: Path) -> None:
-    """Write the pixels of all classes of materials to a file, for load_rendered. Raises OutputError."""
-    arrays = {f"{kind}.{name}": getattr(_pixels(rendered, kind), name) for kind in CLASSES for name in ARRAYS}
+def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
+    """Write what render_planned returned to a file, for load_rendered. Raises OutputError."""
+    arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in CLASSES for name in ARRAYS}
     with replacing(path) as file:
         np.savez(file, **arrays)
 
 
-def load_rendered(path: Path, kind: str) -> Pixels:
-    """Return the pixels of a class of materials from a file that save_rendered wrote. Raises OSError."""
+def load_rendered(path: Path) -> dict[str, Pixels]:
+    """Return the pixels in a file that save_rendered wrote. Raises OSError."""
     with np.load(path, allow_pickle=False) as arrays:
-        return Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS})
+        return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in CLASSES}
 
 
-def render_planned(plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None) -> RenderedScene:
-    """Render a scene of the plan. Raises what add_scene raises."""
+def render_planned(
+    plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None
+) -> tuple[str, dict[str, Pixels]]:
+    """Render a scene; return its shape in words, and the pixels by class of material. Raises what add_scene raises."""
     mesh_file = plan.meshes[position] if position < len(plan.meshes) else None
     mesh = None if mesh_file is None else read_mesh(mesh_file)
     index = position - len(plan.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
@@ -169,14 +144,7 @@ def render_planned(plan: ScenePlan, position: int, progress: Callable[[float], N
             path=mesh_file or plan.names[position],
             hint="The camera looks along -z. A face is visible if its corners run anticlockwise towards the camera",
         )
-    return rendered
-
-
-def _pixels(rendered: RenderedScene, kind: str) -> Pixels:
-    return Pixels(
-        # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
-        observations=rendered.observations[kind].astype(np.float16),
-        normals=rendered.normals.astype(np.float32),
-        light_directions=rendered.light_directions.astype(np.float32),
-        mask=rendered.mask,
-    )
+    normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
+    # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
+    observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
+    return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}

@@ -83,13 +83,7 @@ def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
 class PixelSetSource:
     """Draws pixels of some entries of a set, all with the same probability, under newly drawn lights.
 
-    The lights of a pixel are drawn within a cone; see choose_in_cone.
-
-    Args:
-        pixel_set: the set.
-        entries: the entries to draw from.
-        config: number of lights and the faults of the capture.
-        generator: source of all random numbers; its device is that of the batches.
+    The lights of a pixel are drawn within a cone; see choose_in_cone. Batches are on the device of the generator.
     """
 
     def __init__(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,22 +135,26 @@ def parse_entries(manifest: dict[str, Any], folder: Path) -> list[Entry]:
     """Return the entries of a manifest. Raises InputError if one is incomplete."""
     try:
         entries = [Entry(**values) for values in manifest["entries"]]
-        # A file without a checksum would go unchecked.
-        complete = all(isinstance(entry.sha256.get(array), str) for entry in entries for array in ARRAYS)
+        problem = next((problem for entry in entries for problem in _problems(entry)), None)
     except (AttributeError, KeyError, TypeError) as error:
         raise InputError(f"an entry is incomplete ({error})", path=folder / MANIFEST) from error
-    if not complete:
-        raise InputError("an entry is incomplete (a checksum is missing)", path=folder / MANIFEST)
-    for entry in entries:
-        if not all(type(count) is int and count > 0 for count in (entry.n_pixels, entry.n_lights)):
-            raise InputError("a count of an entry is no whole number above 0", path=folder / MANIFEST)
-        if not isinstance(entry.recipe, dict):
-            raise InputError("the recipe of an entry is no table", path=folder / MANIFEST)
-        if not all(isinstance(text, str) for text in (entry.name, entry.scene, entry.source)):
-            raise InputError("the name, scene or source of an entry is no text", path=folder / MANIFEST)
-        if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
-            raise InputError(f"{entry.name!r} is not the name of a folder", path=folder / MANIFEST)
+    if problem:
+        raise InputError(problem, path=folder / MANIFEST)
     return entries
+
+
+def _problems(entry: Any) -> Iterator[str]:
+    # A file without a checksum would go unchecked.
+    if not all(isinstance(entry.sha256.get(array), str) for array in ARRAYS):
+        yield "an entry is incomplete (a checksum is missing)"
+    if not all(type(count) is int and count > 0 for count in (entry.n_pixels, entry.n_lights)):
+        yield "a count of an entry is no whole number above 0"
+    if not isinstance(entry.recipe, dict):
+        yield "the recipe of an entry is no table"
+    if not all(isinstance(text, str) for text in (entry.name, entry.scene, entry.source)):
+        yield "the name, scene or source of an entry is no text"
+    if not entry.name or entry.name == ".." or "\0" in entry.name or Path(entry.name).name != entry.name:
+        yield f"{entry.name!r} is not the name of a folder"
 
 
 def _check_checksums(entry: Entry, folder: Path) -> None:

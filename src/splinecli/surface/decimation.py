@@ -1,7 +1,14 @@
-"""Meshes of fewer triangles, whose normal texture keeps the detail."""
+"""Meshes of fewer triangles, whose normal texture keeps the detail.
+
+The texture has measured normals in the tangent frame of the coarser mesh. A viewer interpolates the unit normal N and
+the tangent T of the vertices over a triangle and scales both to unit length. The bitangent is B = N x T, which points
+up in the image. A texel (x, y, z) then stands for the normal x T + y B + z N, and its colour is (x + 1) / 2 and so on
+(glTF 2.0, section 3.9.3).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +25,6 @@ from splinecli.surface.mesh import (
     texture_coordinates,
     vertex_normals,
 )
-from splinecli.surface.normal_texture import normal_texture
 from splinecli.system.extras import import_extra
 
 TRIANGLES_LEFT = 4
@@ -27,12 +33,23 @@ TRIANGLES_LEFT = 4
 LARGE_MAP = 500_000
 """Pixels from which the triangles of a map are so many that those of blocks are decimated."""
 
+_TRIANGLES = 50_000  # at a time
+_OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
+_FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing
+_LOWEST = 1 / 255  # smallest z: glTF allows no normal below the surface
 
-def decimate(
-    mesh: SurfaceMesh,
+Floats = NDArray[np.float64]
+
+
+def decimated_mesh(
+    depth: NDArray[np.floating],
+    mask: NDArray[np.bool_],
+    camera_matrix: NDArray[np.floating] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+    *,
     n_triangles: int,
     normal_map: NDArray[np.floating],
-    camera_matrix: NDArray[np.floating] | None = None,
+    largest_step: float | None = None,
 ) -> SurfaceMesh:
     """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal map.
 
@@ -40,15 +57,17 @@ def decimate(
     error metrics, SIGGRAPH 1997). A mesh that has no more triangles is returned as it is.
 
     Args:
-        mesh: what surface_mesh or mesh_to_decimate returned.
+        depth, mask, camera_matrix, colours, largest_step: see surface_mesh.
         n_triangles: at least 1.
         normal_map: (H, W, 3), unit on the object, zero outside.
-        camera_matrix: (3, 3), the one that surface_mesh had, or None.
 
     Raises:
-        UsageError: fast-simplification is not installed.
+        UsageError: fast-simplification is not installed, or the largest step is negative.
         InputError: no triangle is left.
     """
+    mesh = _mesh_of_blocks(depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step)
+    if mesh is None:
+        mesh = surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
     if n_triangles >= len(mesh.triangles):
         return mesh
     simplify = import_extra("fast_simplification", "mesh").simplify
@@ -69,52 +88,48 @@ def decimate(
         normals=normals.astype(np.float32),
         uvs=texture_coordinates(points, shape),
         tangents=tangents.astype(np.float32),
-        normal_texture=normal_texture(points, triangles, normals, tangents, normal_map),
+        normal_texture=_normal_texture(points, triangles, normals, tangents, normal_map),
     )
 
 
-def mesh_to_decimate(
+def _mesh_of_blocks(
     depth: NDArray[np.floating],
     mask: NDArray[np.bool_],
-    camera_matrix: NDArray[np.floating] | None = None,
-    colours: NDArray[np.uint8] | None = None,
-    *,
+    camera_matrix: NDArray[np.floating] | None,
+    colours: NDArray[np.uint8] | None,
     n_triangles: int,
     normal_map: NDArray[np.floating],
-    largest_step: float | None = None,
-) -> SurfaceMesh:
-    """Return a mesh for `decimate`: that of surface_mesh or, of large maps, one of blocks of pixels.
+    largest_step: float | None,
+) -> SurfaceMesh | None:
+    """Return a mesh of blocks of a large map's pixels; None where they would be too few, or the map is small.
 
     Collapsing all edges of a large map takes much memory. If far fewer triangles are wanted, those of the blocks, which
     are at least TRIANGLES_LEFT times as many, have the same shape, and the normal texture keeps the detail.
-
-    Args:
-        depth, mask, camera_matrix, colours, normal_map, largest_step: see surface_mesh.
-        n_triangles: see decimate.
     """
     step = int((2 * np.count_nonzero(mask) / (TRIANGLES_LEFT * n_triangles)) ** 0.5)
-    if step >= 2 and np.count_nonzero(mask) > LARGE_MAP:
-        blocks = Blocks.of_step(mask, step)
-        of_blocks = np.zeros((*blocks.mask.shape, 4))
-        pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
-        of_blocks[blocks.mask] = blocks.average(pixels, mask)
-        # Without a camera, a step counts in blocks, as a pixel does.
-        scale = step if camera_matrix is None else 1
-        mesh = surface_mesh(
-            of_blocks[..., 0] / scale,
-            blocks.mask,
-            blocks.shrink_camera(camera_matrix),
-            normal_map=unit(of_blocks[..., 1:]),
-            largest_step=largest_step,
-        )
-        if len(mesh.triangles) > n_triangles:
-            shift = np.zeros(3)
-            if camera_matrix is None:
-                shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
-            vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
-            texture = None if colours is None else fill_outside(colours, mask)
-            return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
-    return surface_mesh(depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step)
+    if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
+        return None
+    blocks = Blocks.of_step(mask, step)
+    of_blocks = np.zeros((*blocks.mask.shape, 4))
+    pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
+    of_blocks[blocks.mask] = blocks.average(pixels, mask)
+    # Without a camera, a step counts in blocks, as a pixel does.
+    scale = step if camera_matrix is None else 1
+    mesh = surface_mesh(
+        of_blocks[..., 0] / scale,
+        blocks.mask,
+        blocks.shrink_camera(camera_matrix),
+        normal_map=unit(of_blocks[..., 1:]),
+        largest_step=largest_step,
+    )
+    if len(mesh.triangles) <= n_triangles:
+        return None
+    shift = np.zeros(3)
+    if camera_matrix is None:
+        shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
+    vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
+    texture = None if colours is None else fill_outside(colours, mask)
+    return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
 
 
 def _tangents(
@@ -130,3 +145,89 @@ def _tangents(
     tangents = unit(np.cross(np.cross(along, rays), normals))
     tangents[~tangents.any(axis=1)] = unit(along)
     return tangents
+
+
+def _normal_texture(
+    points: Floats,
+    triangles: NDArray[np.integer],
+    normals: Floats,
+    tangents: Floats,
+    normal_map: NDArray[np.floating],
+) -> NDArray[np.uint8]:
+    """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
+
+    Args:
+        points: (V, 2), the columns and rows of the vertices in the image.
+        triangles: (T, 3), numbers of vertices.
+        normals, tangents: (V, 3), unit.
+        normal_map: (H, W, 3), unit on the object, zero outside.
+    """
+    texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
+    known = np.zeros(normal_map.shape[:2], np.bool_)
+    on_object = np.asarray(normal_map.any(axis=2))
+    for number, weights, rows, columns in _covered_pixels(points, triangles, known.shape):
+        seen = on_object[rows, columns]
+        corners, weights, rows, columns = triangles[number[seen]], weights[seen], rows[seen], columns[seen]
+        frames = (unit(np.einsum("qc,qcx->qx", weights, of[corners])) for of in (normals, tangents))
+        texels = _in_frame(normal_map[rows, columns].astype(np.float64), *frames)
+        texture[rows, columns] = np.rint((texels + 1) / 2 * 255)
+        known[rows, columns] = True
+    return fill_outside(texture, known)
+
+
+def _in_frame(measured: Floats, normals: Floats, tangents: Floats) -> Floats:
+    """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be perpendicular to N."""
+    bitangents = np.cross(normals, tangents)
+    along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals))
+    skew = np.einsum("qx,qx->q", tangents, normals)
+    square = np.maximum(1 - skew**2, 1e-6)
+    texels = np.stack((along - skew * out, up, out - skew * along), axis=1) / square[:, None]
+    texels[:, 2] = np.maximum(texels[:, 2], _LOWEST)
+    return unit(texels)
+
+
+def _covered_pixels(
+    points: Floats, triangles: NDArray[np.integer], shape: tuple[int, ...]
+) -> Iterator[tuple[NDArray[np.intp], Floats, NDArray[np.intp], NDArray[np.intp]]]:
+    """Yield the pixels whose centres lie in triangles: triangle (Q,), barycentric coordinates (Q, 3), row, column."""
+    for start in range(0, len(triangles), _TRIANGLES):
+        numbers = np.arange(start, min(start + _TRIANGLES, len(triangles)))
+        corners = points[triangles[numbers]]
+        forms = _barycentric_forms(corners)
+        seen = np.isfinite(forms).all(axis=(1, 2))
+        numbers, corners, forms = numbers[seen], corners[seen], forms[seen]
+        # The rows of each triangle, and in each row the columns in which all three coordinates are positive.
+        first = np.ceil(corners[..., 1].min(axis=1) - _OUTSIDE).clip(0, shape[0])
+        last = np.floor(corners[..., 1].max(axis=1) + _OUTSIDE).clip(-1, shape[0] - 1)
+        which, rows = _ranges(first, last)
+        slope, rest = forms[which, :, 0], forms[which, :, 1] * rows[:, None] + forms[which, :, 2] + _OUTSIDE
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = -rest / slope
+        low = np.where(slope > 0, crossing, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)).max(axis=1)
+        high = np.where(slope < 0, crossing, np.inf).min(axis=1)
+        span, columns = _ranges(np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1))
+        which, rows = which[span], rows[span]
+        place = np.stack((columns, rows, np.ones(len(rows))), axis=1)
+        yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
+
+
+def _barycentric_forms(corners: Floats) -> Floats:
+    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates.
+
+    They are not finite for triangles that cover nothing.
+    """
+    following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
+    edge = last - following
+    normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
+    area = np.einsum("tcx,tcx->tc", normal, corners - following)
+    area[np.abs(area) < _FLATTEST] = np.nan
+    normal = normal / area[..., None]
+    return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
+
+
+def _ranges(first: Floats, last: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the whole numbers from each first to its last, and before them the number of the range of each."""
+    lengths = np.maximum(last - first + 1, 0).astype(np.intp)
+    which = np.repeat(np.arange(len(lengths)), lengths)
+    within = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return which, first.astype(np.intp)[which] + within

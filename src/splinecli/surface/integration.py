@@ -95,25 +95,22 @@ def integrate_normals(
     return _depth_map(_integrate(surface, stiffness, progress), mask, camera_matrix, known)
 
 
-def relief_of_normals(
-    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], width: float = RELIEF_WIDTH
-) -> NDArray[np.float32]:
+def relief_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask.
 
     Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals, pulled to
     height zero. Of a wave of k radians per pixel, this share is kept:
-    k^2 / (k^2 + (2 pi / width)^2).
+    k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2).
 
     Args:
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W).
-        width: see RELIEF_WIDTH.
 
     Raises:
         InputError: the mask is empty.
     """
     flat = np.zeros(mask.shape)
-    return integrate_normals(normal_map, mask, stiffness=0, prior=flat, prior_detail=width).astype(np.float32)
+    return integrate_normals(normal_map, mask, stiffness=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(np.float32)
 
 
 class _Surface(NamedTuple):

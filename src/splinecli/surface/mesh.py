@@ -29,7 +29,7 @@ class SurfaceMesh:
             0 at the top to 1 at the bottom, as in glTF.
         texture: (H, W, 3) uint8, sRGB colours, or None.
         normal_texture: (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where
-            `normals` are exact. See normal_texture.py.
+            `normals` are exact. See decimation.py.
         tangents: (V, 3) float32, unit, where there is a normal texture.
     """
 
@@ -77,10 +77,10 @@ def surface_mesh(
             all triangles.
 
     Raises:
-        UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
-        InputError: a depth in the mask is not finite or not positive, or the camera matrix is not valid.
+        UsageError: the largest step is negative.
     """
-    _check(depth, mask, colours, largest_step)
+    if largest_step is not None and not largest_step >= 0:
+        raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
     values = depth[mask].astype(np.float64)
     if camera_matrix is None:
         rows, columns = np.nonzero(mask)
@@ -89,11 +89,6 @@ def surface_mesh(
         vertices = np.stack((columns - last_column / 2, last_row / 2 - rows, values), axis=1)
     else:
         vertices = values[:, None] * pixel_rays(mask, camera_matrix)
-        if not (values > 0).all():
-            raise InputError(
-                "a depth in the mask is not positive",
-                hint="With a camera matrix, give depths along the viewing axis instead of heights",
-            )
         heights = -focal_length(camera_matrix) * np.log(values)
     triangles = _triangles(heights, mask)
     if largest_step is not None:
@@ -173,23 +168,3 @@ def _triangles(heights: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray
     three = inside.sum(axis=1) == 3
     parts.append(squares[three][inside[three]].reshape(-1, 3))
     return np.concatenate(parts)
-
-
-def _check(
-    depth: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    colours: NDArray[np.uint8] | None,
-    largest_step: float | None,
-) -> None:
-    if mask.ndim != 2 or mask.dtype != np.bool_:
-        raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
-    if depth.shape != mask.shape:
-        raise UsageError(f"the depth has shape {depth.shape}, expected {mask.shape} for this mask")
-    if colours is not None and (colours.shape != (*mask.shape, 3) or colours.dtype != np.uint8):
-        raise UsageError(f"the colours are {colours.dtype} {colours.shape}, expected uint8 {(*mask.shape, 3)}")
-    if largest_step is not None and not largest_step >= 0:
-        raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
-    if not mask.any():
-        raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
-    if not np.isfinite(depth[mask]).all():
-        raise InputError("a depth in the mask is not finite", hint="Give the mask that integrate_normals had")

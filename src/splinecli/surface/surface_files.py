@@ -1,11 +1,14 @@
-"""The files of a surface: meshes, the depth map as float32 NPY, TIFF and EXR, and as a 16-bit PNG picture."""
+"""The files of a surface: meshes as glTF (GLB), PLY, OBJ and STL; depth maps as float32 NPY, TIFF and EXR, and as PNG.
+
+The command line needs the names in this file, so everything heavy is imported in functions.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +35,11 @@ DEFAULT_MESHES = ("glb", "ply")
 DEPTH_FORMATS = ("npy", "tiff", "png")
 DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
 
+GRAY = 204
+"""Colour of a mesh without a texture, of 255."""
+
 _WHITE = 65535  # of 16 bits
+_FLOAT = 5126  # of glTF
 
 
 @dataclass(frozen=True)
@@ -58,52 +65,107 @@ def file_names(formats: Sequence[str]) -> tuple[str, ...]:
 
 
 def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, bytes]]:
-    """Yield the name and the content of each file of a surface.
-
-    Args:
-        surface: the surface.
-        formats: keys of SURFACE_FILES.
+    """Yield the name and the content of each file of a surface, in formats that are keys of SURFACE_FILES.
 
     Raises:
         InputError: a mesh without triangles cannot be written as GLB.
     """
     for form in formats:
-        yield from _encode(surface, form).items()
+        if form == "obj":
+            yield from _encode_obj(surface).items()
+        else:
+            yield SURFACE_FILES[form][0], _ENCODERS[form](surface)
 
 
-def _encode(surface: Surface, form: str) -> dict[str, bytes]:
+def _encode_glb(surface: Surface) -> bytes:
+    """Encode binary glTF 2.0, in metres: a matte material with the textures, lit from both sides."""
+    import trimesh
+
+    from splinecli.surface.mesh import no_triangles
+
+    mesh = surface.mesh
+    if not len(mesh.triangles):
+        raise no_triangles()
+    textures = {"baseColorTexture": mesh.texture, "normalTexture": mesh.normal_texture}
+    material = trimesh.visual.material.PBRMaterial(
+        name="surface",
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        doubleSided=True,
+        baseColorFactor=[GRAY] * 3 + [255] if mesh.texture is None else None,
+        **{name: _image(picture) for name, picture in textures.items() if picture is not None},
+    )
+    shown = _trimesh(mesh, _textured(mesh, material), surface.millimetres / 1000)
+    glb: bytes = trimesh.exchange.gltf.export_glb(
+        shown.scene(), include_normals=True, buffer_postprocessor=_tangent_writer(mesh)
+    )
+    return glb
+
+
+def _encode_ply(surface: Surface) -> bytes:
+    """Encode binary PLY, with the normals and colours of the vertices. A comment has the unit's name."""
+    import trimesh
+
+    mesh = surface.mesh
+    colours = None if mesh.colours is None else trimesh.visual.ColorVisuals(vertex_colors=mesh.colours)
+    ply: bytes = trimesh.exchange.ply.export_ply(_trimesh(mesh, colours), vertex_normal=True)
+    return ply.replace(b" 1.0\n", f" 1.0\ncomment unit: {surface.unit}\n".encode(), 1)
+
+
+def _encode_stl(surface: Surface) -> bytes:
+    """Encode binary STL, which has positions alone."""
+    import trimesh
+
+    stl: bytes = trimesh.exchange.stl.export_stl(_trimesh(surface.mesh))
+    return stl
+
+
+def _encode_obj(surface: Surface) -> dict[str, bytes]:
+    """Encode OBJ with normals, texture coordinates and, with colours, a texture. A comment has the unit's name."""
+    import trimesh
+
+    mesh = surface.mesh
+    image = None if mesh.texture is None else _image(mesh.texture)
+    diffuse = (GRAY if image is None else 255,) * 3
+    material = trimesh.visual.material.SimpleMaterial(image, diffuse, specular=(0, 0, 0), name="mesh")
+    text, files = trimesh.exchange.obj.export_obj(
+        _trimesh(mesh, _textured(mesh, material)),
+        include_normals=True,
+        return_texture=True,
+        mtl_name="mesh.mtl",
+        header=f"unit: {surface.unit}",
+    )
+    return {"mesh.obj": text.encode(), **files}
+
+
+def _encode_npy(surface: Surface) -> bytes:
     import numpy as np
 
-    from splinecli.surface import mesh_files
-
-    if form == "obj":
-        return mesh_files.encode_obj(surface.mesh, name="mesh", unit=surface.unit)
-    buffer = io.BytesIO()
-    if form == "glb":
-        buffer.write(mesh_files.encode_glb(surface.mesh, metres=surface.millimetres / 1000))
-    elif form == "ply":
-        buffer.write(mesh_files.encode_ply(surface.mesh, unit=surface.unit))
-    elif form == "stl":
-        buffer.write(mesh_files.encode_stl(surface.mesh))
-    elif form == "png":
-        _save_depth_picture(surface, buffer)
-    elif form == "npy":
-        np.save(buffer, surface.depth.astype(np.float32), allow_pickle=False)
-    elif form == "exr":
-        from splinecli.system.exr import encode_exr
-
-        low = np.nanmin(surface.depth)
-        heights = np.where(np.isfinite(surface.depth), surface.depth, low).astype(np.float32)
-        buffer.write(encode_exr(heights, {"unit": surface.unit, "outside": f"{low:.7g}"}))
-    else:
-        import tifffile
-
-        tifffile.imwrite(buffer, surface.depth.astype(np.float32), description=f"unit: {surface.unit}")
-    return {SURFACE_FILES[form][0]: buffer.getvalue()}
+    file = io.BytesIO()
+    np.save(file, surface.depth.astype(np.float32), allow_pickle=False)
+    return file.getvalue()
 
 
-def _save_depth_picture(surface: Surface, file: io.BytesIO) -> None:
-    """Write the depth map as 16-bit gray: 0 outside the object, from 1 for the smallest value to 65535 for the largest.
+def _encode_tiff(surface: Surface) -> bytes:
+    import tifffile
+
+    file = io.BytesIO()
+    tifffile.imwrite(file, surface.depth.astype("f4"), description=f"unit: {surface.unit}")
+    return file.getvalue()
+
+
+def _encode_exr(surface: Surface) -> bytes:
+    import numpy as np
+
+    from splinecli.system.exr import encode_exr
+
+    low = np.nanmin(surface.depth)
+    heights = np.where(np.isfinite(surface.depth), surface.depth, low).astype(np.float32)
+    return encode_exr(heights, {"unit": surface.unit, "outside": f"{low:.7g}"})
+
+
+def _encode_png(surface: Surface) -> bytes:
+    """Encode the depth map as 16-bit gray: 0 outside the object, 1 for the smallest value to 65535 for the largest.
 
     The text `depth` of the PNG file has these values and their unit.
     """
@@ -112,7 +174,71 @@ def _save_depth_picture(surface: Surface, file: io.BytesIO) -> None:
 
     low, high = float(np.nanmin(surface.depth)), float(np.nanmax(surface.depth))
     share = (surface.depth - low) / max(high - low, np.finfo(np.float64).tiny)
-    text = PngImagePlugin.PngInfo()
+    file, text = io.BytesIO(), PngImagePlugin.PngInfo()
     text.add_text("depth", f"0 outside, 1 = {low:.7g}, {_WHITE} = {high:.7g}; unit: {surface.unit}")
     gray = np.where(np.isfinite(share), np.rint(1 + np.nan_to_num(share) * (_WHITE - 1)), 0)
     Image.fromarray(gray.astype(np.uint16)).save(file, "PNG", pnginfo=text)
+    return file.getvalue()
+
+
+_ENCODERS: dict[str, Callable[[Surface], bytes]] = {
+    "glb": _encode_glb,
+    "ply": _encode_ply,
+    "stl": _encode_stl,
+    "npy": _encode_npy,
+    "tiff": _encode_tiff,
+    "png": _encode_png,
+    "exr": _encode_exr,
+}
+
+
+def _trimesh(mesh: SurfaceMesh, visual: Any = None, scale: float = 1) -> Any:
+    import numpy as np
+    import trimesh
+
+    return trimesh.Trimesh(
+        mesh.vertices * np.float32(scale),
+        mesh.triangles,
+        vertex_normals=mesh.normals,
+        visual=visual,
+        process=False,
+    )
+
+
+def _textured(mesh: SurfaceMesh, material: Any) -> Any:
+    import trimesh
+
+    # v runs up in trimesh and OBJ.
+    return trimesh.visual.TextureVisuals(mesh.uvs * (1, -1) + (0, 1), material)
+
+
+def _image(picture: NDArray[np.uint8]) -> Any:
+    from PIL import Image
+
+    return Image.fromarray(picture)
+
+
+def _tangent_writer(mesh: SurfaceMesh) -> Callable[[Any, Any], None] | None:
+    """Return the function that adds the tangents to the buffers and the tree of a glTF file, or None without any.
+
+    Without them, viewers derive their own tangents in different ways.
+    """
+    import numpy as np
+
+    tangents = mesh.tangents
+    if tangents is None:
+        return None
+
+    def add(buffers: Any, tree: Any) -> None:
+        for part in (part for shape in tree["meshes"] for part in shape["primitives"]):
+            part["attributes"]["TANGENT"] = len(tree["accessors"])
+        tree["accessors"]["tangents"] = {
+            "bufferView": len(buffers),
+            "componentType": _FLOAT,
+            "type": "VEC4",
+            "count": len(tangents),
+        }
+        # The last number is the sign of the bitangent.
+        buffers["tangents"] = np.insert(tangents, 3, 1, axis=1).astype("<f4").tobytes()
+
+    return add

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 
@@ -95,50 +94,6 @@ class PixelBatch:
     valid: Tensor
     truth: PixelTruth
     exposure: Tensor
-
-
-@dataclass(frozen=True)
-class JoinedTruth:
-    """The truth of several batches after one another."""
-
-    parts: tuple[PixelTruth, ...]
-
-    @property
-    def normals(self) -> Tensor:
-        return torch.cat([part.normals for part in self.parts])
-
-    def rotate(self, cosine: Tensor, sine: Tensor) -> JoinedTruth:
-        counts = [len(part.normals) for part in self.parts]
-        angles = zip(self.parts, torch.split(cosine, counts), torch.split(sine, counts), strict=True)
-        return JoinedTruth(tuple(part.rotate(c, s) for part, c, s in angles))
-
-    def dense_truth(self, size: int) -> DenseMap:
-        maps = zip(*(part.dense_truth(size) for part in self.parts), strict=True)
-        return DenseMap(*(torch.cat(cells) for cells in maps))
-
-
-def join_batches(batches: Sequence[PixelBatch]) -> PixelBatch:
-    """Join batches into one. Pixels with fewer lights get further ones that are not valid."""
-    if len(batches) == 1:
-        return batches[0]
-    lights = max(batch.valid.shape[1] for batch in batches)
-
-    def join(name: str) -> Tensor:
-        fields = [getattr(batch, name) for batch in batches]
-        return torch.cat(
-            [
-                torch.cat((field, field.new_zeros(len(field), lights - field.shape[1], *field.shape[2:])), dim=1)
-                for field in fields
-            ]
-        )
-
-    return PixelBatch(
-        join("observations"),
-        join("light_directions"),
-        join("valid"),
-        JoinedTruth(tuple(batch.truth for batch in batches)),
-        torch.cat([batch.exposure for batch in batches]),
-    )
 
 
 def photograph(

@@ -77,11 +77,12 @@ def smooth_cut(shape: Floats, tool: Floats, blend: float) -> Floats:
     return -smooth_union(-shape, tool, blend)
 
 
-def waves(rng: np.random.Generator, frequency: float, outputs: int = 1, count: int = 10) -> Field:
+def waves(rng: np.random.Generator, frequency: float, outputs: int = 1) -> Field:
     """Draw a smooth random function (N, outputs) of about unit variance: plane waves of random directions.
 
     The wave numbers are U(0.6, 1.4) * frequency, in cycles per unit length. A single output has shape (N,).
     """
+    count = 10
     directions = rng.normal(size=(3, count))
     directions *= 2 * np.pi * frequency * rng.uniform(0.6, 1.4, count) / np.linalg.norm(directions, axis=0)
     phases = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
@@ -95,13 +96,13 @@ def waves(rng: np.random.Generator, frequency: float, outputs: int = 1, count: i
     return value
 
 
-def ridges(rng: np.random.Generator, frequency: float, octaves: int = 2) -> Field:
-    """Draw sharp crests between round valleys (N,), about -1 to 1: octaves of 1 - 2 |waves|, each half as high."""
-    layers = [waves(rng, frequency * 2**octave) for octave in range(octaves)]
+def ridges(rng: np.random.Generator, frequency: float) -> Field:
+    """Draw sharp crests between round valleys (N,), about -1 to 1: 1 - 2 |waves| of two octaves, one half as high."""
+    low, high = waves(rng, frequency), waves(rng, 2 * frequency)
 
     def value(points: Floats) -> Floats:
-        total = sum(0.5**octave * (1 - 2 * np.abs(layer(points))) for octave, layer in enumerate(layers))
-        return np.asarray(total / (2 - 0.5 ** (octaves - 1)), dtype=np.float32)
+        total = (1 - 2 * np.abs(low(points))) + 0.5 * (1 - 2 * np.abs(high(points)))
+        return np.asarray(total / 1.5, dtype=np.float32)
 
     return value
 

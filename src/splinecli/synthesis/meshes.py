@@ -104,10 +104,10 @@ def _read_known(path: Path) -> tuple[str, bytes]:
     return kind, content
 
 
-def fit_to_frame(mesh: Mesh, *, reach: float = REACH) -> Mesh:
-    """Scale and centre a mesh: its larger extent in x and y becomes 2 * reach, and its centre the origin."""
+def fit_to_frame(mesh: Mesh) -> Mesh:
+    """Scale and centre a mesh: its larger extent in x and y becomes 2 * REACH, and its centre the origin."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    scale = 2 * reach / float((high - low)[:2].max())
+    scale = 2 * REACH / float((high - low)[:2].max())
     vertices = (mesh.vertices - (low + high) / 2) * np.float32(scale)
     return Mesh(vertices.astype(np.float32), mesh.faces, mesh.vertex_normals)
 

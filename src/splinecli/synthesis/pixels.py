@@ -68,19 +68,13 @@ class PixelScene:
         walls = tuple(wall.rotate(cosine, sine) for wall in self.walls)
         return replace(self, normals=rotate_about_view_axis(self.normals, cosine, sine), walls=walls, mixed=mixed)
 
-    def dense_map(self, size: int = MAP_SIZE) -> Tensor:
-        """Return the complete map (P, 1, size, size): radiance at the cells' centres, zero outside the unit disc."""
-        directions, inside = cell_directions(size)
-        directions, inside = directions.to(self.normals.device), inside.to(self.normals.device)
+    def dense_truth(self, size: int = MAP_SIZE) -> DenseMap:
+        """Return the complete maps: radiance at the cells' centres, known in the whole disc."""
+        directions, inside = (part.to(self.normals.device) for part in cell_directions(size))
         dense = self.normals.new_zeros(len(self.normals), 1, size, size)
         dense[:, 0, inside] = self.radiance(directions[inside])
-        return dense
-
-    def dense_truth(self, size: int) -> DenseMap:
-        """Return the complete map, which is known in the whole disc."""
-        _, inside = cell_directions(size)
-        known = inside.to(self.normals).expand(len(self.normals), 1, size, size)
-        return DenseMap(self.dense_map(size), known, known)
+        known = inside.to(self.normals).expand_as(dense)
+        return DenseMap(dense, known, known)
 
 
 def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:

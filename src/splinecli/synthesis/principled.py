@@ -166,16 +166,6 @@ def draw_material(
     )
 
 
-def draw_class(name: str, patches: int, generator: torch.Generator, *, one_gloss: bool = False) -> PrincipledMaterial:
-    """Draw materials of one of CLASSES; see draw_material.
-
-    Args:
-        one_gloss: all patches have the material of the first but for their base.
-    """
-    material = draw_material(patches, generator, CLASSES[name])
-    return with_one_gloss(material) if one_gloss else material
-
-
 def with_one_gloss(material: PrincipledMaterial) -> PrincipledMaterial:
     """Give all rows the material of the first but for their base, as of a painted or printed object.
 

@@ -1,7 +1,8 @@
-"""Random numbers of a range, from a generator."""
+"""Random numbers of a range, from a generator, and the seeds of generators."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,3 +15,12 @@ def draw_uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high
 def draw_number(generator: torch.Generator, low: float = 0.0, high: float = 1.0) -> float:
     """Draw one number from U(low, high)."""
     return low + (high - low) * float(torch.rand((), generator=generator))
+
+
+def stream_seed(*numbers: int) -> int:
+    """Return the seed of one of many random streams, such as that of a run's seed, a step and the step's stream.
+
+    What a step draws depends on these numbers alone. A resumed run, or one that is shared among processes in another
+    way, therefore sees the same.
+    """
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)

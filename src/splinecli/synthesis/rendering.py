@@ -108,8 +108,6 @@ def render_indirect(
     Args:
         patch_of_face: (T,), row of the materials of each face.
         directions: number of paths per pixel.
-        generator: source of the random directions.
-        progress: called with the finished share, from 0 to 1.
     """
     pixels = len(visible.normals)
     soft = {name: soften(material) for name, material in materials.items()}

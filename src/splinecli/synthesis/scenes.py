@@ -13,10 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.errors import UsageError
 from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_class
+from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
 from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
@@ -35,9 +34,6 @@ class SceneConfig:
         samples: k of the k x k samples per pixel.
         directions: number of paths per pixel for indirect light.
         bounces: largest number of reflections before the visible surface; 0 for direct light only.
-
-    Raises:
-        UsageError: a number is out of range.
     """
 
     size: int = 128
@@ -46,18 +42,11 @@ class SceneConfig:
     directions: int = 256
     bounces: int = 4
 
-    def __post_init__(self) -> None:
-        low = {"size": 4, "lights": 1, "samples": 1, "directions": 1, "bounces": 0}
-        for name, least in low.items():
-            if getattr(self, name) < least:
-                raise UsageError(f"{name} is {getattr(self, name)} and has to be at least {least}")
-
 
 @dataclass(frozen=True)
 class Scene:
     """A scene before rendering.
 
-    name: unique within a set.
     shape: kind of the shape.
     mesh: the shape.
     lights: (F, 3), unit directions towards the lights.
@@ -66,7 +55,6 @@ class Scene:
     seed: seed of the paths of indirect light.
     """
 
-    name: str
     shape: str
     mesh: Mesh
     lights: Floats
@@ -79,18 +67,13 @@ class Scene:
 class RenderedScene:
     """The images of a scene.
 
-    name, shape: as in Scene.
     mask: (H, W).
     normals: (P, 3), unit; pixels row-major.
-    light_directions: (F, 3).
     observations: by class, (P, F) float32; 1 is a matte white surface that faces the light.
     """
 
-    name: str
-    shape: str
     mask: NDArray[np.bool_]
     normals: Floats
-    light_directions: Floats
     observations: dict[str, Floats]
 
 
@@ -115,20 +98,18 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     materials: dict[str, PrincipledMaterial] = {}
     for name in CLASSES:
         torch.rand((), generator=generator)  # not used, but drawn by earlier versions, whose scenes stay the same
-        materials[name] = draw_class(name, patches, generator, one_gloss=one_gloss)
+        material = draw_material(patches, generator, CLASSES[name])
+        materials[name] = with_one_gloss(material) if one_gloss else material
     # The shape comes last, because the number of random values that it needs varies.
     # With multiples of the golden ratio, even a small set has several kinds of shapes.
     place = (np.random.default_rng(seed).random() + index * (np.sqrt(5) - 1) / 2) % 1
     shape, mesh = ("given", mesh) if mesh is not None else draw_shape(rng, place)
     patch_of_face = draw_patches(mesh, patches, rng)
-    return Scene(f"{index:05d}", shape, mesh, lights, materials, patch_of_face, render_seed)
+    return Scene(shape, mesh, lights, materials, patch_of_face, render_seed)
 
 
 def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
-    """Render the scene in all its materials.
-
-    Args:
-        progress: called with the finished share, from 0 to 1.
+    """Render the scene in all its materials. `progress` is called with the finished share, from 0 to 1.
 
     Raises:
         UsageError: the extra `render` is not installed.
@@ -149,8 +130,7 @@ def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], 
             )
             for name, received in indirect.items():
                 radiance[name] += received
-    observations = {name: values.numpy() for name, values in radiance.items()}
-    return RenderedScene(scene.name, scene.shape, visible.mask, visible.normals, scene.lights, observations)
+    return RenderedScene(visible.mask, visible.normals, {name: values.numpy() for name, values in radiance.items()})
 
 
 def draw_lights(count: int, rng: np.random.Generator) -> Floats:

@@ -59,15 +59,10 @@ def draw_shape_of_kind(name: str, rng: np.random.Generator) -> Mesh:
 
 def draw_rotation(rng: np.random.Generator) -> Floats:
     """Draw a rotation matrix (3, 3), uniform over all rotations (Shoemake 1992)."""
-    w, x, y, z = (quaternion := rng.normal(size=4)) / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=np.float32,
-    )
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = rng.normal(size=4)
+    return np.asarray(Rotation.from_quat((x, y, z, w)).as_matrix(), dtype=np.float32)
 
 
 def turn(mesh: Mesh, rotation: Floats) -> Mesh:
@@ -220,10 +215,10 @@ def _draw_profile(rng: np.random.Generator) -> Callable[[Floats], Floats]:
 
 def _tilt(angle: float, azimuth: float) -> Floats:
     """Return the rotation that tilts +z by an angle towards an azimuth in the image."""
-    c, s, a, b = np.cos(angle), np.sin(angle), np.cos(azimuth), np.sin(azimuth)
-    about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    about_z = np.array([[a, -b, 0], [b, a, 0], [0, 0, 1]])
-    return np.asarray(about_z @ about_y @ about_z.T, dtype=np.float32)
+    from scipy.spatial.transform import Rotation
+
+    axis = np.array((-np.sin(azimuth), np.cos(azimuth), 0))
+    return np.asarray(Rotation.from_rotvec(angle * axis).as_matrix(), dtype=np.float32)
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Mesh | None]] = {

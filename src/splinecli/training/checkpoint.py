@@ -41,19 +41,9 @@ def save_checkpoint(
     counters: RunCounters,
     sets: dict[str, str],
 ) -> None:
-    """Write the whole state of a run.
+    """Write the whole state of a run: the network with its running average, and the SHA-256 of each pixel set by path.
 
-    Args:
-        path: the checkpoint file, replaced as a whole.
-        config: the configuration of the run.
-        network: the network that is trained.
-        average: the running average of its weights.
-        optimizer: the optimiser of `network`.
-        counters: how far the run has come.
-        sets: SHA-256 of each pixel set by path.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Raises OutputError.
     """
     tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", network), ("average", average)):
@@ -99,16 +89,11 @@ def load_checkpoint(
                 path=path,
                 hint="Restore the pixel set, or start another run with another -o",
             )
-    groups: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimizer": {}}
-    for name, tensor in tensors.items():
-        prefix, _, rest = name.partition(".")
-        if prefix in groups:
-            groups[prefix][rest] = tensor
-    load_strictly(network, groups["network"], path)
-    load_strictly(average, groups["average"], path)
+    load_strictly(network, _under("network.", tensors), path)
+    load_strictly(average, _under("average.", tensors), path)
     states: dict[int, dict[str, Tensor]] = {}
     try:
-        for name, tensor in groups["optimizer"].items():
+        for name, tensor in _under("optimizer.", tensors).items():
             index, _, key = name.partition(".")
             states.setdefault(int(index), {})[key] = tensor
         optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
@@ -116,6 +101,10 @@ def load_checkpoint(
         return RunCounters(int(counters.step), int(counters.pixels), float(counters.seconds))
     except (TypeError, ValueError, KeyError) as error:
         raise ModelError(f"the checkpoint is incomplete ({error})", path=path) from error
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from splinecli.errors import ModelError, UsageError
 from splinecli.networks.config import NetworkConfig
 from splinecli.synthesis.pixels import PixelGeneratorConfig
 from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
-from splinecli.training.losses import Norm
 
 GENERATOR = "generator"
 """The name among the sources of the online pixel generator; every other is the path of a pixel set."""
+
+Norm = Literal["mean", "sum"]
+"""Whether the values of a map's cells are averaged or summed."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +141,6 @@ class TrainingConfig:
         )
 
 
-_CHOICES = {
-    "updates": ("joint", "alternating", "error_head", "refine_net"),
-    "schedule": ("cosine", "stepped"),
-    "precision": ("bfloat16", "float32"),
-    "li_net_norm": ("mean", "sum"),
-    "ne_net_norm": ("mean", "sum"),
-}
 _LOWEST = {
     "batch_size": 1, "shards": 1, "steps": 1, "ne_net_updates": 1,
     "min_lights": 3, "max_lights": 3, "usual_lights": 3,
@@ -162,7 +157,7 @@ def _is_number(value: Any) -> bool:
 
 def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGeneratorConfig) -> None:
     """Raise ModelError for a setting that `defaults` lacks, or whose type or range differs."""
-    known = vars(defaults)
+    known, types = vars(defaults), get_type_hints(type(defaults))
     for name, value in values.items():
         if name in _REMOVED:
             raise ModelError(
@@ -172,8 +167,9 @@ def _check_settings(values: dict[str, Any], defaults: TrainingConfig | PixelGene
         if name not in known or name in ("network", "pixels", "sources"):
             raise ModelError(f"unknown training setting {name!r}; known are {', '.join(sorted(known))}")
         default = known[name]
-        if name in _CHOICES:
-            expected, fits = " or ".join(map(repr, _CHOICES[name])), value in _CHOICES[name]
+        if get_origin(types[name]) is Literal:
+            choices = get_args(types[name])
+            expected, fits = " or ".join(map(repr, choices)), value in choices
         elif isinstance(default, bool):
             expected, fits = "true or false", isinstance(value, bool)
         elif isinstance(default, str):

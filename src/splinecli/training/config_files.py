@@ -90,24 +90,29 @@ def parse_sources(sets: Sequence[Path], generator_weight: float | None) -> dict[
 
 
 def configure(
-    preset_name: str | None = None, file: Path | None = None, changes: Sequence[Settings] = ()
+    preset_name: str | None = None,
+    file: Path | None = None,
+    changes: Sequence[Settings] = (),
+    *,
+    base: TrainingConfig | None = None,
 ) -> TrainingConfig:
     """Return a preset, changed by the settings of a file and then by `changes`, in their order.
 
     A table of sources is replaced as a whole. Other tables are merged key by key.
 
     Args:
-        preset_name: name of the preset. None takes the file's entry "preset", or else DEFAULT_PRESET.
-        file: TOML or JSON, see read_config_file.
-        changes: further settings.
+        preset_name: None takes the file's entry "preset", or else `base`.
+        file: see read_config_file.
+        base: None for DEFAULT_PRESET.
 
     Raises:
         UsageError: there is no such preset.
         ModelError: a setting is unknown or its value is not allowed. The message names the file it is in.
     """
     settings = read_config_file(file) if file else {}
-    named = settings.pop("preset", DEFAULT_PRESET)
-    values = preset(preset_name or str(named)).to_dict()
+    named = settings.pop("preset", DEFAULT_PRESET if base is None else None)
+    named = preset_name or named
+    values = (base if base is not None and named is None else preset(str(named))).to_dict()
     try:
         values = _merge(values, settings)
         TrainingConfig.from_dict(values)
@@ -120,34 +125,8 @@ def configure(
     return _with_absolute_paths(TrainingConfig.from_dict(values))
 
 
-def configure_resumed(
-    started: TrainingConfig,
-    path: Path,
-    preset_name: str | None = None,
-    file: Path | None = None,
-    changes: Sequence[Settings] = (),
-) -> TrainingConfig:
-    """Return the configuration with which a run continues.
-
-    Without a preset, every setting that is not given stays as it was.
-
-    Args:
-        started: the configuration in the run's checkpoint.
-        path: the checkpoint, for messages.
-        preset_name, file, changes: as for `configure`.
-
-    Raises:
-        UsageError, ModelError: as for `configure`.
-        ModelError: a setting differs that is not in CHANGEABLE. The message names it.
-    """
-    settings = read_config_file(file) if file else {}
-    if preset_name is None and "preset" not in settings:
-        values = started.to_dict()
-        for change in (settings, *changes):
-            values = _merge(values, change)
-        asked = _with_absolute_paths(TrainingConfig.from_dict(values))
-    else:
-        asked = configure(preset_name, file, changes)
+def check_resumable(started: TrainingConfig, asked: TrainingConfig, path: Path) -> None:
+    """Raise ModelError, with the path of the checkpoint, for a setting that differs and is not in CHANGEABLE."""
     old, new = _flat(started.to_dict()), _flat(asked.to_dict())
     # In the order of the configuration, where the most important settings, such as the network's size, come first.
     for name in [*new, *(name for name in old if name not in new)]:
@@ -157,7 +136,6 @@ def configure_resumed(
                 path=path,
                 hint="Leave the setting out to continue, or choose another -o",
             )
-    return asked
 
 
 def _with_absolute_paths(config: TrainingConfig) -> TrainingConfig:

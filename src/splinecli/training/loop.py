@@ -15,15 +15,16 @@ from torch import Tensor
 from splinecli.errors import ModelError, OutputError
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
+from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.system.devices import choose_precision
-from splinecli.system.files import check_writable, write_text
+from splinecli.system.files import write_text
 from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
 from splinecli.training.config import TrainingConfig
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
 from splinecli.training.distributed import Workers
 from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_log import Metrics, RunLog, none_for_nan
-from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask, stream_seed
+from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
 
 
 def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
@@ -35,31 +36,17 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def _start_from(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network. A set branch that they lack changes no normal at first."""
+    """Copy the weights into the network. It may have an error head and a refinement net that they lack."""
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
-    adds_set = bool(wanted["set_width"]) and not found["set_width"]
-    allowed = {"error_head", "refines"} | ({"set_width", "set_layers"} if adds_set else set())
-    differing = [name for name in wanted if wanted[name] != found[name] and name not in allowed]
-    if differing:
-        name = differing[0]
-        raise ModelError(
-            f"the weights {weights!r} are of a network with {name} = {found[name]!r}, the run's has {wanted[name]!r}",
-            hint="Choose the preset, or the settings network.*, that the weights were trained with",
-        )
-    state = loaded.state_dict()
-    if adds_set:
-        # The set branch's normal comes last among those that NE-Net weighs; its columns start at zero.
-        fresh = network.state_dict()
-        for name in ("ne_net.compare.weight", "ne_net.weigh.weight", "ne_net.weigh.bias"):
-            if name in state:
-                old, state[name] = state[name], torch.zeros_like(fresh[name])
-                state[name][tuple(slice(size) for size in old.shape)] = old
-            elif "compare" in name:  # a network without fits, whose only normal has the weight 1 at first
-                state[name] = torch.zeros_like(fresh[name])
-        for parameter in network.ne_net.join.parameters():  # type: ignore[union-attr]
-            torch.nn.init.zeros_(parameter)
-    network.load_state_dict(state, strict=False)
+    for name in wanted:
+        if wanted[name] != found[name] and name not in ("error_head", "refines"):
+            problem = f"with {name} = {found[name]!r}, the run's has {wanted[name]!r}"
+            raise ModelError(
+                f"the weights {weights!r} are of a network {problem}",
+                hint="Choose the preset, or the settings network.*, that the weights were trained with",
+            )
+    network.load_state_dict(loaded.state_dict(), strict=False)
 
 
 class Trainer:
@@ -79,7 +66,6 @@ class Trainer:
         tensorboard: bool = False,
     ) -> None:
         """Start a run, or resume one. Raises ModelError, OutputError, InputError, UsageError."""
-        check_writable(folder)
         self.config = config
         self.folder = folder
         self.device = device
@@ -91,7 +77,6 @@ class Trainer:
             )
         task = RefinementTask if config.updates == "refine_net" else PixelTask
         self.task: PixelTask | RefinementTask = task(config, self.shards, device)
-        self.sets, self.single_scene_sets = self.task.sets, self.task.single_scene_sets
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         if config.start_from and not resume:
@@ -108,7 +93,8 @@ class Trainer:
         self.bfloat16 = config.precision == "bfloat16" and choose_precision("auto", device) == "bfloat16"
         self.counters = RunCounters()
         if resume:
-            self.counters = load_checkpoint(folder / CHECKPOINT, self.network, self.average, self.optimizer, self.sets)
+            state = self.network, self.average, self.optimizer
+            self.counters = load_checkpoint(folder / CHECKPOINT, *state, self.task.sets.sha256)
         self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
@@ -190,7 +176,7 @@ class Trainer:
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
         state = self.network, self.average, self.optimizer, self.counters
-        save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.sets)
+        save_checkpoint(self.folder / CHECKPOINT, self.config, *state, self.task.sets.sha256)
 
     def _check_weights(self) -> None:
         """Raise ModelError where a weight is not finite, before it is saved."""

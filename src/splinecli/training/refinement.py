@@ -18,12 +18,12 @@ from splinecli.networks.refine_channels import channels, split_features
 from splinecli.networks.spline_net import SplineNet
 from splinecli.pixel_sets.store import Entry, PixelSet
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps
-from splinecli.synthesis.background import add_background
 from splinecli.synthesis.batches import CaptureConfig
 from splinecli.synthesis.engraved import draw_engraved
 from splinecli.synthesis.lights import choose_in_cone, draw_light_counts, draw_light_directions
-from splinecli.synthesis.whole_capture import photograph_scene
-from splinecli.training.losses import angles
+from splinecli.synthesis.random_numbers import stream_seed
+from splinecli.synthesis.whole_capture import add_background, photograph_scene
+from splinecli.training.objective import angles
 
 FIRST_EXAMPLES = 64
 """Captures that are photographed before the first step."""
@@ -84,8 +84,6 @@ class ScenePool:
     Args:
         scenes: pixel sets with some of their entries, and the weight of each set.
         network: a SPLINE-Net with an error head, on the device of the captures.
-        config: number of lights and the faults of a capture.
-        seed: seed of all captures.
         first: the number of the first capture. A run that continues begins with its newest captures.
     """
 
@@ -107,18 +105,50 @@ class ScenePool:
 
     def add(self) -> None:
         """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
-        seeds = np.random.SeedSequence((self.seed, self._made)).generate_state(1, np.uint64)
-        generator = torch.Generator().manual_seed(int(seeds[0] >> np.uint64(1)))
+        generator = torch.Generator().manual_seed(stream_seed(self.seed, self._made))
         self.examples.append(self._draw_example(generator))
         self._made += 1
 
     def _draw_example(self, generator: torch.Generator) -> SceneMaps:
         if float(torch.rand((), generator=generator)) < _ENGRAVED_SHARE:
-            return _photograph_engraved(self.network, self.config, generator)
+            return self._photograph_engraved(generator)
         weights = torch.tensor([weight for _, _, weight in self.scenes])
         pixel_set, entries, _ = self.scenes[int(torch.multinomial(weights, 1, generator=generator))]
         entry = entries[int(torch.randint(len(entries), (), generator=generator))]
-        return _photograph(pixel_set, entry, self.network, self.config, generator)
+        return self._photograph(pixel_set, entry, generator)
+
+    def _photograph(self, pixel_set: PixelSet, entry: Entry, generator: torch.Generator) -> SceneMaps:
+        pixels = pixel_set.load(entry)
+        lights = torch.from_numpy(np.array(pixels.light_directions))
+        most = min(self.config.max_lights, entry.n_lights)
+        counts = draw_light_counts(1, self.config.min_lights, most, min(self.config.usual_lights, most), generator)
+        chosen = choose_in_cone(lights, int(counts), generator)
+        mask = torch.from_numpy(np.array(pixels.mask))
+        scale = 1 + (_MOST_ENLARGED - 1) * float(torch.rand((), generator=generator))
+        scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
+        box = _draw_box(mask, round(CROP / scale), generator)
+        kept = torch.zeros_like(mask)
+        kept[box] = mask[box]
+        rows = kept[mask].numpy()
+        values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(np.float32)
+        maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
+        return self._after_network(maps, lights[chosen], mask, generator)
+
+    def _photograph_engraved(self, generator: torch.Generator) -> SceneMaps:
+        config = self.config
+        count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
+        lights = draw_light_directions(1, int(count), generator)[0]
+        truth, radiance, mask = draw_engraved(_ENGRAVED_SIZE, lights, generator)
+        return self._after_network(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask, generator)
+
+    def _after_network(self, maps: Tensor, lights: Tensor, mask: Tensor, generator: torch.Generator) -> SceneMaps:
+        """Return what is estimated from photographs of maps (F + 3, H, W) of radiance and true normals."""
+        if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
+            maps, mask = add_background(maps, mask, lights, generator)
+        radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
+        observations, lights = photograph_scene(radiance, lights, self.config, generator)
+        features = pixel_features(self.network, observations, lights)
+        return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
         """Draw `count` captures, turn and mirror each, and stack them as float32 (count, ...)."""
@@ -127,55 +157,6 @@ class ScenePool:
             for index in torch.randint(len(self.examples), (count,), generator=generator, device=generator.device)
         ]
         return stack_maps(drawn)
-
-
-def _photograph(
-    pixel_set: PixelSet,
-    entry: Entry,
-    network: SplineNet,
-    config: CaptureConfig,
-    generator: torch.Generator,
-) -> SceneMaps:
-    pixels = pixel_set.load(entry)
-    lights = torch.from_numpy(np.array(pixels.light_directions))
-    most = min(config.max_lights, entry.n_lights)
-    counts = draw_light_counts(1, config.min_lights, most, min(config.usual_lights, most), generator)
-    chosen = choose_in_cone(lights, int(counts), generator)
-    mask = torch.from_numpy(np.array(pixels.mask))
-    scale = 1 + (_MOST_ENLARGED - 1) * float(torch.rand((), generator=generator))
-    scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
-    box = _draw_box(mask, round(CROP / scale), generator)
-    kept = torch.zeros_like(mask)
-    kept[box] = mask[box]
-    rows = kept[mask].numpy()
-    values = np.hstack([pixels.observations[rows][:, chosen.numpy()], pixels.normals[rows]]).astype(np.float32)
-    maps, mask = _enlarged(_placed(torch.from_numpy(values), mask[box]), mask[box], scale)
-    return _after_network(network, maps, lights[chosen], mask, config, generator)
-
-
-def _photograph_engraved(network: SplineNet, config: CaptureConfig, generator: torch.Generator) -> SceneMaps:
-    count = draw_light_counts(1, config.min_lights, config.max_lights, config.usual_lights, generator)
-    lights = draw_light_directions(1, int(count), generator)[0]
-    truth, radiance, mask = draw_engraved(_ENGRAVED_SIZE, lights, generator)
-    maps = _placed(torch.cat((radiance, truth), dim=1), mask)
-    return _after_network(network, maps, lights, mask, config, generator)
-
-
-def _after_network(
-    network: SplineNet,
-    maps: Tensor,
-    lights: Tensor,
-    mask: Tensor,
-    config: CaptureConfig,
-    generator: torch.Generator,
-) -> SceneMaps:
-    """Return what is estimated from photographs of maps (F + 3, H, W) of radiance and true normals."""
-    if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
-        maps, mask = add_background(maps, mask, lights, generator)
-    radiance, truth = maps[:-3, mask].T.contiguous(), torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-    observations, lights = photograph_scene(radiance, lights, config, generator)
-    features = pixel_features(network, observations, lights)
-    return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
 
 def _placed(values: Tensor, mask: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from splinecli.system.files import check_writable
 from splinecli.system.publishing import held_folder
 from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import TrainingConfig
-from splinecli.training.config_files import Settings, configure, configure_resumed
+from splinecli.training.config_files import Settings, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT
 from splinecli.training.distributed import join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.loop import Trainer
@@ -33,11 +33,16 @@ def configure_run(
     *,
     resume: bool,
 ) -> TrainingConfig:
-    """Return the configuration of a run that starts or continues. Raises ModelError, UsageError."""
+    """Return the configuration of a run that starts or continues. Raises ModelError, UsageError.
+
+    Of a run that continues without a preset, every setting that is not given stays as it was.
+    """
     if not resume:
         return configure(preset_name, file, changes)
-    path = folder / CHECKPOINT
-    return configure_resumed(read_checkpoint_config(path), path, preset_name, file, changes)
+    started = read_checkpoint_config(folder / CHECKPOINT)
+    asked = configure(preset_name, file, changes, base=started)
+    check_resumable(started, asked, folder / CHECKPOINT)
+    return asked
 
 
 @contextmanager
@@ -48,16 +53,13 @@ def open_run(
     *,
     resume: bool,
     tensorboard: bool,
-    warn: Callable[[str], object] = lambda _: None,
+    warn: Callable[[str], object],
 ) -> Iterator[Trainer]:
     """Join the other processes, lock the folder and yield the trainer.
 
     Args:
-        config: the configuration, from `configure_run`.
-        folder: the folder of the run.
+        config: from `configure_run`.
         device_name: "auto", "cpu" or "cuda".
-        resume: continue from the checkpoint.
-        tensorboard: also write TensorBoard's event files.
         warn: receives a sentence about what a killed process had left in the folder.
 
     Raises:

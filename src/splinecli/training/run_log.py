@@ -15,7 +15,7 @@ from splinecli.system.extras import import_extra
 from splinecli.system.files import refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.publishing import refuse_link
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
-from splinecli.training.validation import SampleMaps
+from splinecli.training.tasks import SampleMaps
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,7 @@ class RunLog:
             UsageError: `tensorboard` is set and the package is not installed.
         """
         self.folder = folder
-        self.set_aside = _set_aside_if_damaged(folder / METRICS)
-        _drop_lines_after(step, folder / METRICS)
+        self.set_aside = _drop_lines_after(step, folder / METRICS)
         self._events: Any = _open_events(folder / EVENTS, step) if tensorboard else None
 
     def append(self, metrics: Metrics) -> None:
@@ -100,11 +99,9 @@ class RunLog:
         write_bytes(self.folder / MAPS, figure)
 
 
-def read_metrics(path: Path, *, leave_out_last: bool = False) -> list[Metrics]:
-    """Return the lines of a metrics.csv. Raises ValueError, TypeError, KeyError or csv.Error for a damaged one."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return [_parse(row) for row in (rows[:-1] if leave_out_last else rows)]
+def read_metrics(path: Path) -> list[Metrics]:
+    """Return the lines of a metrics.csv that is whole."""
+    return [_parse(line) for line in path.read_text("utf-8").splitlines()[1:]]
 
 
 def none_for_nan(value: float) -> float | None:
@@ -112,24 +109,21 @@ def none_for_nan(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _parse(row: dict[str, str]) -> Metrics:
+def _parse(line: str) -> Metrics:
+    """Return the numbers of a line. Raises ValueError for a damaged one."""
+    row = dict(zip(_HEADER.split(","), line.split(","), strict=True))
     values: dict[str, Any] = {key: float(value) if value else None for key, value in row.items()}
     return Metrics(**{**values, "step": int(row["step"]), "pixels": int(row["pixels"])})
 
 
-def _set_aside_if_damaged(path: Path) -> Path | None:
-    """Rename a metrics.csv that cannot be read to a name that is free, and return its new path; None if it is whole."""
+def _drop_lines_after(step: int, path: Path) -> Path | None:
+    """Remove the lines of later steps from a metrics.csv, or the whole file where no line is left.
+
+    A file that cannot be read is renamed to a name that is free, which is returned.
+    """
     try:
-        if path.exists():
-            if not path.is_file() or path.stat().st_size > _LONGEST:
-                raise ValueError("it is no such file")
-            # A full disk may cut the last line.
-            read_metrics(path, leave_out_last=True)
-            with path.open(encoding="utf-8") as file:
-                if file.readline().rstrip("\n") != _HEADER:
-                    raise ValueError("another version wrote it")
-        return None
-    except (ValueError, TypeError, KeyError, csv.Error):
+        kept = _lines_until(step, path)
+    except ValueError:
         aside = path.with_suffix(".damaged.csv")
         number = 1
         while aside.exists():
@@ -138,28 +132,32 @@ def _set_aside_if_damaged(path: Path) -> Path | None:
         with refusals_as_output_errors(aside):
             path.replace(aside)
         return aside
-
-
-def _drop_lines_after(step: int, path: Path) -> None:
-    """Remove the lines of later steps from a metrics.csv, or the whole file where no line is left."""
-    lines = path.read_text("utf-8").splitlines()[1:] if path.exists() else []
-    kept = [line for line in lines if _step_of(line) <= step]
     if kept:
         write_text(path, "\n".join([_HEADER, *kept]) + "\n")
     else:  # The run stopped before its first checkpoint, or a link leads nowhere.
         with refusals_as_output_errors(path):
             path.unlink(missing_ok=True)
+    return None
 
 
-def _step_of(line: str) -> float:
-    """Return the step of a line, or infinity for the last line of a file, which a full disk may have cut."""
-    values = line.split(",")
-    if len(values) != _HEADER.count(",") + 1:
-        return math.inf
-    try:
-        return _parse(dict(zip(_HEADER.split(","), values, strict=True))).step
-    except ValueError:
-        return math.inf
+def _lines_until(step: int, path: Path) -> list[str]:
+    """Return the lines up to a step, without the last one if a full disk has cut it. Raises ValueError."""
+    if not path.exists():
+        return []
+    if not path.is_file() or path.stat().st_size > _LONGEST:
+        raise ValueError("it is no such file")
+    header, *lines = path.read_text("utf-8").splitlines()
+    if header != _HEADER:
+        raise ValueError("another version wrote it")
+    kept = []
+    for number, line in enumerate(lines, 1):
+        try:
+            if _parse(line).step <= step:
+                kept.append(line)
+        except ValueError:
+            if number < len(lines):
+                raise
+    return kept
 
 
 def _open_events(folder: Path, step: int) -> Any:

@@ -6,15 +6,14 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import torch
 
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError
 from splinecli.pixel_sets.source import PixelSetSource
 from splinecli.pixel_sets.store import Entry, PixelSet, open_pixel_set
 from splinecli.synthesis.batches import PixelBatch
-from splinecli.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+from splinecli.synthesis.pixels import PixelGenerator
 from splinecli.training.config import GENERATOR, TrainingConfig
 
 
@@ -36,18 +35,10 @@ class MixedSource:
 
 
 def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:
-    """Split entries into training and validation entries, scene by scene.
+    """Split the entries of a set into training and validation entries, scene by scene.
 
-    The scenes with the lowest hashes of their names are for validation. So the choice for one scene hardly
-    depends on the other scenes of the set.
-
-    Args:
-        entries: all entries of a set.
-        share: share of the scenes that is for validation. Above 0, this is at least one scene, and one is
-            always left for training.
-
-    Returns:
-        Training entries, validation entries.
+    The scenes with the lowest hashes of their names are for validation. So the choice for one scene hardly depends on
+    the other scenes of the set. A share above 0 gives at least one scene, and one is always left for training.
     """
     scenes = sorted({entry.scene for entry in entries}, key=lambda scene: hashlib.sha256(scene.encode()).digest())
     count = max(1, round(share * len(scenes))) if share > 0 and len(scenes) > 1 else 0
@@ -61,92 +52,59 @@ def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], l
 PixelSource = PixelGenerator | PixelSetSource | MixedSource
 """Draws batches of pixels. Its random generator determines the batches."""
 
-SceneSource = tuple[tuple[PixelSet, tuple[Entry, ...], float], ...]
-"""Pixel sets for the refinement net: of each its scenes for training or validation, and its weight."""
-
-Source = TypeVar("Source", PixelSource, SceneSource)
+Scenes = dict[str, tuple[PixelSet, list[Entry]]]
+"""By path, the pixel sets of a run, each with its entries for training or for validation."""
 
 
 @dataclass(frozen=True)
-class Sources(Generic[Source]):
-    """The sources of a run.
+class OpenSets:
+    """The pixel sets of a run.
 
     Attributes:
-        training, validation: the sources for either; pixels for validation have a generator of their own.
-        sets: SHA-256 of each pixel set by path.
-        single_scene_sets: the sets without a validation scene, which are validated on their training pixels.
+        training, validation: the scenes for either. A set with a single scene is validated on its training pixels.
+        single_scene_sets: these sets.
     """
 
-    training: Source
-    validation: Source
-    sets: dict[str, str]
+    training: Scenes
+    validation: Scenes
     single_scene_sets: tuple[str, ...]
 
+    @property
+    def sha256(self) -> dict[str, str]:
+        """The checksum of each set by path."""
+        return {name: pixel_set.sha256 for name, (pixel_set, _) in self.training.items()}
 
-def open_sources(
-    config: TrainingConfig, generator: torch.Generator, validation_generator: torch.Generator
-) -> Sources[PixelSource]:
-    """Open the sources of a configuration.
 
-    Validation draws from the validation scenes, under `usual_lights` lights. A set with a single scene has no
-    validation scene and is validated on its training pixels.
+def open_sets(config: TrainingConfig) -> OpenSets:
+    """Open the pixel sets of a configuration.
 
     Raises:
         InputError: a pixel set is missing, unfinished or does not match its manifest, or has no scene left for
             training.
     """
+    names = [name for name, weight in config.sources.items() if weight > 0 and name != GENERATOR]
+    sets = {name: open_pixel_set(Path(name)) for name in names}
+    parts = _split_sets(sets, config.held_share)
+    return OpenSets(
+        {name: (sets[name], training) for name, (training, _) in parts.items()},
+        {name: (sets[name], validation or training) for name, (training, validation) in parts.items()},
+        tuple(name for name, (_, validation) in parts.items() if not validation),
+    )
+
+
+def pixel_source(
+    config: TrainingConfig, scenes: Scenes, generator: torch.Generator, *, validates: bool = False
+) -> PixelSource:
+    """Return the source of a configuration's pixels. Validation pixels all have `usual_lights` lights."""
+    pixels, usual = config.pixels, config.pixels.usual_lights
+    if validates:
+        pixels = replace(pixels, min_lights=usual, max_lights=usual)
     weights = {name: weight for name, weight in config.sources.items() if weight > 0}
-    sets = {name: open_pixel_set(Path(name)) for name in weights if name != GENERATOR}
-    parts = _split_sets(sets, config.held_share)
-    usual = config.pixels.usual_lights
-    validation_pixels = replace(config.pixels, min_lights=usual, max_lights=usual)
-
-    def open_all(pixels: PixelGeneratorConfig, own: torch.Generator, *, validate: bool) -> PixelSource:
-        opened: list[PixelGenerator | PixelSetSource] = []
-        for name in weights:
-            if name == GENERATOR:
-                opened.append(PixelGenerator(pixels, own))
-            else:
-                training, validation = parts[name]
-                entries = validation or training if validate else training
-                opened.append(PixelSetSource(sets[name], entries, pixels, own))
-        return opened[0] if len(opened) == 1 else MixedSource(opened, list(weights.values()), own)
-
-    return Sources(
-        open_all(config.pixels, generator, validate=False),
-        open_all(validation_pixels, validation_generator, validate=True),
-        {name: pixel_set.sha256 for name, pixel_set in sets.items()},
-        tuple(name for name, (_, validation) in parts.items() if not validation),
-    )
-
-
-def open_scenes(config: TrainingConfig) -> Sources[SceneSource]:
-    """Open the pixel sets of a configuration as whole scenes.
-
-    Raises:
-        UsageError: there are no pixel sets, or the generator is among the sources.
-        InputError: as for open_sources.
-    """
-    if config.sources.get(GENERATOR, 0) > 0:
-        raise UsageError(
-            "the refinement net learns from pixel sets of rendered scenes, and the sources name the pixel generator",
-            hint="Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset refine",
-        )
-    sets = {name: open_pixel_set(Path(name)) for name, weight in config.sources.items() if weight > 0}
-    parts = _split_sets(sets, config.held_share)
-
-    def together(validate: bool) -> SceneSource:
-        return tuple(
-            (sets[name], tuple(validation or training if validate else training), config.sources[name])
-            for name, (training, validation) in parts.items()
-        )
-
-    return Sources(
-        together(False),
-        together(True),
-        {name: pixel_set.sha256 for name, pixel_set in sets.items()},
-        tuple(name for name, (_, validation) in parts.items() if not validation),
-    )
+    opened = [
+        PixelGenerator(pixels, generator) if name == GENERATOR else PixelSetSource(*scenes[name], pixels, generator)
+        for name in weights
+    ]
+    return opened[0] if len(opened) == 1 else MixedSource(opened, list(weights.values()), generator)
 
 
 def _split_sets(sets: dict[str, PixelSet], share: float) -> dict[str, tuple[list[Entry], list[Entry]]]:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.networks.spline_net import SplineNet
-from splinecli.synthesis.batches import PixelBatch, join_batches
-from splinecli.training.config import TrainingConfig
-from splinecli.training.objective import Losses, compute_losses, fixed, part_of_step
+from splinecli.errors import UsageError
+from splinecli.maths.normals import angle_between_deg
+from splinecli.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
+from splinecli.synthesis.batches import PixelBatch
+from splinecli.synthesis.random_numbers import stream_seed
+from splinecli.training.config import GENERATOR, TrainingConfig
+from splinecli.training.objective import Losses, angles, compute_losses, dense_truth_in_frame, fixed, part_of_step
 from splinecli.training.refinement import (
     FIRST_EXAMPLES,
     STEPS_PER_EXAMPLE,
@@ -20,25 +25,32 @@ from splinecli.training.refinement import (
     refinement_losses,
     stack_maps,
 )
-from splinecli.training.sources import open_scenes, open_sources
-from splinecli.training.validation import SampleMaps, sample_maps, validation_deg
+from splinecli.training.sources import Scenes, open_sets, pixel_source
 
 VALIDATION_PIXELS = 2048
 _VALIDATION_DRAW = 64  # pixels at a time: a draw has one source
 VALIDATION_SCENES = 12
+SHOWN_PIXELS = 8
 
 # Random streams of a step. Those of its shards are numbered from 0. The last is that of process 0; those of the
 # other processes follow it.
 _BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 + 1, 2**31 - 1, 2**31 + 2
 
 
-def stream_seed(seed: int, step: int, stream: int) -> int:
-    """Return the seed of one of a step's random streams.
+class SampleMaps(NamedTuple):
+    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals.
 
-    A step's batch depends on these three numbers alone. A resumed run, or one that is shared among processes in
-    another way, therefore sees the same batches.
+    Attributes:
+        sparse: the sparse maps, (N, w, w).
+        dense: LI-Net's dense maps, (N, w, w); None without a LI-Net.
+        truth: the true maps with gaps filled, (N, w, w).
+        error_deg: (N,).
     """
-    return int(np.random.SeedSequence((seed, step, stream)).generate_state(1, np.uint64)[0] >> 1)
+
+    sparse: NDArray[np.float32]
+    dense: NDArray[np.float32] | None
+    truth: NDArray[np.float32]
+    error_deg: NDArray[np.float32]
 
 
 class PixelTask:
@@ -46,7 +58,7 @@ class PixelTask:
 
     Attributes:
         source: draws training pixels.
-        validation: the validation pixels.
+        validation: batches of validation pixels.
     """
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
@@ -56,17 +68,15 @@ class PixelTask:
         self.generator = torch.Generator(device)
         held = torch.Generator(device)
         held.manual_seed(stream_seed(config.seed, 0, _VALIDATION_STREAM))
-        sources = open_sources(config, self.generator, held)
-        self.source = sources.training
-        self._held = sources.validation
-        self.sets, self.single_scene_sets = sources.sets, sources.single_scene_sets
+        self.sets = open_sets(config)
+        self.source = pixel_source(config, self.sets.training, self.generator)
+        self._held = pixel_source(config, self.sets.validation, held, validates=True)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
         """Draw what process number `rank` needs before `step`, the first of this run. Only process 0 validates."""
         if rank == 0:
             pixels = min(_VALIDATION_DRAW, VALIDATION_PIXELS)
-            draws = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
-            self.validation = join_batches(draws)
+            self.validation = [self._held.draw(pixels) for _ in range(VALIDATION_PIXELS // pixels)]
 
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
@@ -104,10 +114,52 @@ class PixelTask:
             )
 
     def validation_deg(self, network: SplineNet, *, bfloat16: bool) -> float:
-        return validation_deg(network, self.validation, bfloat16=bfloat16)
+        """Return the mean angular error of the validation pixels, in degrees."""
+        found = []
+        for batch in self.validation:
+            maps, _, normals = _estimate(network, batch, bfloat16=bfloat16)
+            found.append(angles(normals, to_pixel_frame(batch.truth.normals, maps)))
+        return math.degrees(torch.cat(found).mean().item())
 
     def sample_maps(self, network: SplineNet) -> SampleMaps:
-        return sample_maps(network, self.validation)
+        """Return the maps of up to SHOWN_PIXELS validation pixels, evenly spaced."""
+        shown = self.validation[:: max(1, len(self.validation) // SHOWN_PIXELS)][:SHOWN_PIXELS]
+        found = [_sample(network, batch, SHOWN_PIXELS // len(shown)) for batch in shown]
+        maps: list[Any] = [None if parts[0] is None else np.concatenate(parts) for parts in zip(*found, strict=True)]
+        return SampleMaps(*maps)
+
+
+def _sample(network: SplineNet, batch: PixelBatch, count: int) -> SampleMaps:
+    maps, dense, normals = _estimate(network, batch)
+    truth = dense_truth_in_frame(batch, maps, size=network.config.map_size)
+    normal_truth = to_pixel_frame(batch.truth.normals, maps)
+    error_deg = angle_between_deg(normals.cpu().numpy(), normal_truth.cpu().numpy())
+    step = max(1, len(normals) // count)
+
+    def picture(values: Tensor, known: Tensor) -> NDArray[np.float32]:
+        values = values.float().masked_fill(known == 0, torch.nan)
+        picked: NDArray[np.float32] = values[::step, 0][:count].cpu().numpy()
+        return picked
+
+    return SampleMaps(
+        picture(maps.sparse, maps.occupied),
+        None if dense is None else picture(dense, network.inside.expand_as(dense)),
+        picture(truth.values, truth.filled),
+        error_deg[::step][:count].astype(np.float32),
+    )
+
+
+@torch.no_grad()
+def _estimate(
+    network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
+) -> tuple[PixelMaps, Tensor | None, Tensor]:
+    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the frames of the pixels."""
+    network.eval()
+    maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
+    with torch.autocast(batch.observations.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+        dense = network.interpolate(maps)
+        normals = network.estimate(maps, dense).normals
+    return maps, dense, normals
 
 
 class RefinementTask:
@@ -118,22 +170,31 @@ class RefinementTask:
         self.shards = shards
         self.device = device
         self.generator = torch.Generator()
-        self.scenes = open_scenes(config)
-        self.sets, self.single_scene_sets = self.scenes.sets, self.scenes.single_scene_sets
+        if config.sources.get(GENERATOR, 0) > 0:
+            raise UsageError(
+                "the refinement net learns from pixel sets of rendered scenes,"
+                " and the sources name the pixel generator",
+                hint="Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset refine",
+            )
+        self.sets = open_sets(config)
 
     def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        config, scenes = self.config, self.scenes
+        config = self.config
         seed = stream_seed(config.seed, rank, _POOL_STREAM)
         first = -(-step // STEPS_PER_EXAMPLE)  # of the captures, if one is added before step 0 and so on
-        self.pool = ScenePool(scenes.training, network, config.pixels, seed, first=first)
+        self.pool = self._pool(self.sets.training, network, seed, first=first)
         for _ in range(FIRST_EXAMPLES):
             self.pool.add()
         if rank == 0:
             seed = stream_seed(config.seed, 0, _VALIDATION_STREAM)
-            held = ScenePool(scenes.validation, network, config.pixels, seed)
+            held = self._pool(self.sets.validation, network, seed)
             for _ in range(VALIDATION_SCENES):
                 held.add()
             self.validation = [stack_maps([example]) for example in held.examples]
+
+    def _pool(self, scenes: Scenes, network: SplineNet, seed: int, *, first: int = 0) -> ScenePool:
+        weighted = [(*scenes[name], self.config.sources[name]) for name in scenes]
+        return ScenePool(weighted, network, self.config.pixels, seed, first=first)
 
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
         if step % STEPS_PER_EXAMPLE == 0:

@@ -1,4 +1,4 @@
-"""Files of meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
+"""Files of surfaces: meshes as trimesh reads them, and GLB as glTF 2.0 requires it."""
 
 import io
 from pathlib import Path
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from glb_file import read_glb
 from splinecli.errors import InputError
 from splinecli.surface.mesh import SurfaceMesh, surface_mesh
-from splinecli.surface.mesh_files import GRAY, encode_glb, encode_obj, encode_ply, encode_stl
+from splinecli.surface.surface_files import GRAY, Surface, encode_surface
 
 SHAPE = (15, 20)
 DEPTH = 3 * np.sin(np.arange(20) / 4) + np.arange(15)[:, None] / 5
@@ -24,6 +24,10 @@ def wave(coloured: bool = True, mask: NDArray[np.bool_] | None = None) -> Surfac
     return surface_mesh(DEPTH, mask, colours=COLOURS if coloured else None)
 
 
+def encode(mesh: SurfaceMesh, form: str, *, unit: str = "pixel", millimetres: float = 1.0) -> dict[str, bytes]:
+    return dict(encode_surface(Surface(DEPTH, mesh, unit, millimetres), [form]))
+
+
 def load(content: bytes, form: str, **more: Any) -> Any:
     options: dict[str, Any] = {"process": False, "maintain_order": True, **more}
     return trimesh.load_mesh(io.BytesIO(content), file_type=form, **options)
@@ -32,7 +36,7 @@ def load(content: bytes, form: str, **more: Any) -> Any:
 @pytest.mark.parametrize("coloured", [False, True])
 def test_ply(coloured: bool) -> None:
     mesh = wave(coloured)
-    content = encode_ply(mesh, unit="pixel")
+    content = encode(mesh, "ply")["mesh.ply"]
     read = load(content, "ply")
     np.testing.assert_array_equal(read.vertices, mesh.vertices)
     np.testing.assert_array_equal(read.faces, mesh.triangles)
@@ -50,13 +54,13 @@ def test_ply(coloured: bool) -> None:
 
 def test_stl() -> None:
     mesh = wave()
-    np.testing.assert_array_equal(load(encode_stl(mesh), "stl").triangles, mesh.vertices[mesh.triangles])
+    np.testing.assert_array_equal(load(encode(mesh, "stl")["mesh.stl"], "stl").triangles, mesh.vertices[mesh.triangles])
 
 
 @pytest.mark.parametrize("coloured", [False, True])
 def test_obj(coloured: bool, tmp_path: Path) -> None:
     mesh = wave(coloured)
-    files = encode_obj(mesh, name="mesh", unit="millimetre")
+    files = encode(mesh, "obj", unit="millimetre")
     assert sorted(files) == ["mesh.mtl", "mesh.obj", *(["mesh.png"] if coloured else [])]
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -73,7 +77,7 @@ def test_obj(coloured: bool, tmp_path: Path) -> None:
 @pytest.mark.parametrize("coloured", [False, True])
 def test_glb(coloured: bool) -> None:
     mesh = wave(coloured)
-    content = encode_glb(mesh, metres=0.002)
+    content = encode(mesh, "glb", millimetres=2)["mesh.glb"]
     tree, arrays = read_glb(content)
     np.testing.assert_allclose(arrays["POSITION"], mesh.vertices * 0.002, rtol=1e-6)
     np.testing.assert_array_equal(arrays["indices"], mesh.triangles)
@@ -93,8 +97,8 @@ def test_glb(coloured: bool) -> None:
 
 def test_a_mesh_without_triangles() -> None:
     mesh = wave(mask=np.eye(*SHAPE, dtype=bool))
-    assert b"element vertex 15\n" in encode_ply(mesh, unit="pixel")
-    assert encode_obj(mesh, name="mesh", unit="pixel")["mesh.obj"].count(b"\nv ") == 15
-    assert len(encode_stl(mesh)) == 84
+    assert b"element vertex 15\n" in encode(mesh, "ply")["mesh.ply"]
+    assert encode(mesh, "obj")["mesh.obj"].count(b"\nv ") == 15
+    assert len(encode(mesh, "stl")["mesh.stl"]) == 84
     with pytest.raises(InputError, match="the mesh has no triangles: nowhere do three pixels"):
-        encode_glb(mesh, metres=1)
+        encode(mesh, "glb")

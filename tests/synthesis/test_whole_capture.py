@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scenes import spiral_lights
-from splinecli.synthesis.background import _shadows, add_background
+from splinecli.synthesis.whole_capture import _shadows, add_background
 
 LIGHTS = torch.tensor(spiral_lights(6, 60), dtype=torch.float32)
 
