@@ -15,7 +15,7 @@ from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
-from splinecli.capture.restore.white_level import SaturationFinder
+from splinecli.capture.restore.white_level import Saturation
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 
@@ -65,13 +65,12 @@ def measure_light_intensities(
         np.ones((n_lights, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
     )
-    finder = SaturationFinder(len(normals), n_lights, even=True)
     rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.int64)
-    values = []
-    for position, image in enumerate(capture.read_pixels(mask, range(n_lights), lambda pixels: pixels)):
-        finder.add(position, image.values, image.path, stated=image.stated_white_level)
+    values, found = [], []
+    for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels):
+        found.append(image.find_saturated(None))
         values.append(image.linear[rows].astype(np.float64))
-    saturated = finder.finish().choose_pixels(rows).flags
+    saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
     cosines = normals[rows] @ light_directions.T
     intensities = np.empty((n_lights, 3))
     for position, path in enumerate(files.images):

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.capture_warnings import DISPLAY_DECODED, DISPLAY_ENCODED, PROFILE_UNREAD, CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
@@ -46,14 +45,25 @@ class RadiometricCalibration:
             return self, []
         curves = {image.curve.curve for image in images}
         by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
-        unread = [image.path for image in images if image.curve.unread]
-        warnings = [capture_warnings.profile_unread(unread[0].name)] if unread and self.automatic else []
+        unread = [image.path.name for image in images if image.curve.unread]
+        warnings = []
+        if unread and self.automatic:
+            text = f"The colour profile of {unread[0]} has no curve that can be read, so it does not count."
+            warnings.append(CaptureWarning(PROFILE_UNREAD, f"{text} Add --transfer linear, srgb or gamma:G."))
         if self.automatic and len(curves) == 1:
             (curve,) = curves
             if curve not in (1, BT709):  # a film has no other curve
-                warnings.append(capture_warnings.display_decoded(by, curve))
+                how = (
+                    "sRGB" if curve is None else "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}"
+                )
+                text = f"The images say that they are display-encoded ({by}) and are read as {how}."
+                text += " Add --transfer linear if their values are linear."
+                warnings.append(CaptureWarning(DISPLAY_DECODED, text))
             return replace(self, curve=curve), warnings
-        return self, [*warnings, capture_warnings.display_encoded(by)] if by else warnings
+        if by:
+            text = f"The images look display-encoded ({by}) but are read as linear."
+            warnings.append(CaptureWarning(DISPLAY_ENCODED, f"{text} Add --transfer srgb if they are sRGB."))
+        return self, warnings
 
 
 AUTOMATIC = RadiometricCalibration(automatic=True)

@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.restore.white_level import Saturation, SaturationFinder
+from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
+
+BLACK_SHARE = 0.01
+"""The share of pixels without light above which the capture carries a warning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,10 @@ class StoredPixels:
             weights = weights.sum(keepdims=True)
         return self.linear @ weights.astype(np.float32)
 
+    def find_saturated(self, white_level: float | None) -> ImageValues:
+        """Return what decides which pixels are saturated; see look_at. Raises InputError."""
+        return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
+
     def colours(self) -> NDArray[np.float32]:
         """Return linear RGB (P, 3), each channel divided by its intensity."""
         # In float32 and in place: 24 megapixels take noticeably longer in any other way.
@@ -51,47 +58,43 @@ class StoredPixels:
         return colours
 
 
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Observations (P, F) as read, and which of them are saturated."""
-
-    values: NDArray[np.float32]
-    saturation: Saturation
-    any_8_bit: bool
-
-    def warnings(self) -> list[CaptureWarning]:
-        n_saturated = int(self.saturation.n_saturated.sum())
-        n_black = len(self.values) - np.count_nonzero(self.values.any(axis=1))
-        warnings = [
-            capture_warnings.white_level(self.saturation.white_level),
-            capture_warnings.saturated(n_saturated / max(self.values.size, 1)),
-            capture_warnings.black_pixels(n_black / max(len(self.values), 1)),
-            capture_warnings.eight_bit() if self.any_8_bit else None,
-        ]
-        return [warning for warning in warnings if warning is not None]
-
-
 def collect_observations(
     images: Iterable[StoredPixels],
-    saturation: SaturationFinder,
+    n_pixels: int,
+    n_images: int,
+    *,
+    white_level: float | None = None,
     progress: Callable[[], object] | None = None,
-) -> Observations:
-    """Return the observations of the images, in their order. Only one image is in memory at a time.
+) -> tuple[NDArray[np.float32], Saturation, list[CaptureWarning]]:
+    """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
+
+    Only one image is in memory at a time.
 
     Args:
-        saturation: a new one for P pixels and F images.
+        white_level: the one that the user gave; None to find it.
         progress: called once after each image.
 
     Raises:
         InputError: the white level that the user gave is above an image's full scale.
     """
-    observations = np.empty(saturation.shape, np.float32)
-    any_8_bit = False
+    observations = np.empty((n_pixels, n_images), np.float32)
+    any_8_bit, found = False, []
     for position, image in enumerate(images):
         any_8_bit |= image.values.dtype == np.uint8
-        saturation.add(position, image.values, image.path, stated=image.stated_white_level)
+        found.append(image.find_saturated(white_level))
         observations[:, position] = image.observe()
         del image  # before the next one is decoded
         if progress is not None:
             progress()
-    return Observations(observations, saturation.finish(), any_8_bit)
+    saturation = Saturation(n_pixels, tuple(found), white_level)
+    warnings = codes.white_level(saturation.white_level)
+    saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)
+    if saturated > codes.SATURATED_SHARE:
+        text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."
+        warnings.append(CaptureWarning(codes.SATURATED, text))
+    black = (n_pixels - np.count_nonzero(observations.any(axis=1))) / max(n_pixels, 1)
+    if black > BLACK_SHARE:
+        text = f"{100 * black:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
+        text += " Leave them out with a mask or with --auto-mask."
+        warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
+    return observations, saturation, warnings + codes.eight_bit(any_8_bit)

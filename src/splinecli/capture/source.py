@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
 from splinecli.capture.capture_size import check_capture, common_size
-from splinecli.capture.capture_warnings import CaptureWarning
+from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
@@ -28,7 +27,6 @@ from splinecli.capture.linearise import AS_STORED, PixelReader, RadiometricCalib
 from splinecli.capture.observations import StoredPixels, collect_observations
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
-from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
@@ -125,25 +123,27 @@ class CaptureSource:
             )
             ground_truth = self.window.of(ground_truth)
         images = self.read_pixels(mask, indices, lambda pixels: pixels)
-        saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
-        found = collect_observations(images, saturation, progress)
-        warnings = [*self.warnings, *found.warnings()]
+        observations, saturation, warnings = collect_observations(
+            images, int(np.count_nonzero(mask)), len(indices), white_level=self.white_level, progress=progress
+        )
+        warnings = [*self.warnings, *warnings]
         if upside_down:
-            warnings.append(capture_warnings.ground_truth_upside_down())
+            text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
+            warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
         lamps, of_lamps = self.near_lamps(mask)
         warnings += of_lamps
         capture = Capture(
             name=self.files.name,
-            observations=found.values,
+            observations=observations,
             light_directions=self.light_directions[list(indices)],
             light_indices=indices,
             mask=mask,
             ground_truth=ground_truth,
             warnings=tuple(warnings),
-            white_level=found.saturation.white_level,
+            white_level=saturation.white_level,
             lamps=None if lamps is None else lamps.choose_lights(indices),
         )
-        stored = StoredCapture(capture, found.saturation, self.intensities_known)
+        stored = StoredCapture(capture, saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)
 
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
@@ -53,7 +53,7 @@ class StoredCapture:
             found = find(capture.observations, capture.mask, self.intensities_known)
         except InputError as error:
             raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
-        warning = capture_warnings.estimated_lights(found.errors_deg)
+        warning = estimated_lights(found.errors_deg)
         capture = replace(
             capture,
             light_directions=found.directions,
@@ -102,7 +102,12 @@ class StoredCapture:
         observations, warnings, restored = self.capture.observations, self.capture.warnings, None
         if intensities is not None:
             observations /= intensities.astype(np.float32)
-            warnings = (*warnings, capture_warnings.estimated_intensities(intensities))
+            text = (
+                "The light intensities were estimated from the images: they are unequal, from"
+                f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. Use --intensities FILE if you"
+                " have measured them, or --intensities equal to assume equal ones."
+            )
+            warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))
         saturated = self.saturation.flags
         if saturated is not None:
             restored = restore_saturated(observations, saturated, self._lights_of)

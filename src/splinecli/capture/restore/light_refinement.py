@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
 from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
 from splinecli.capture.robust_fit import fit_robustly, lit_rows
@@ -98,18 +98,22 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
-        return replace(capture, warnings=(*capture.warnings, capture_warnings.kept_lights(_why_kept(capture))))
+        kept = CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {_why_kept(capture)}.")
+        return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
     if not intensities_known:
         intensities = found.intensities if intensities is None else intensities * found.intensities
     moved_deg = angle_between_deg(found.directions, capture.light_directions)
-    warning = capture_warnings.refined_lights(moved_deg, found.fit_ratio)
+    text = (
+        f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
+        f" {moved_deg.max():.1f}. The images fit them better: {100 * found.fit_ratio:.0f} % of the misfit is left."
+    )
     return replace(
         capture,
         observations=np.asarray(capture.observations / found.intensities, np.float32),
         light_directions=found.directions,
         estimated_intensities=intensities,
-        warnings=(*capture.warnings, warning),
+        warnings=(*capture.warnings, CaptureWarning(REFINED_LIGHTS, text)),
     )
 
 

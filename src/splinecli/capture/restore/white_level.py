@@ -66,7 +66,7 @@ class WhiteLevel:
 _NOTHING = np.empty(0, np.int64)
 
 
-class _ImageValues(NamedTuple):
+class ImageValues(NamedTuple):
     """What decides whether observations of one image are saturated.
 
     Attributes:
@@ -79,16 +79,13 @@ class _ImageValues(NamedTuple):
         counts: how often each of these values occurs.
     """
 
-    full_scale: int | None = None
-    stated: int | None = None
-    saturated: NDArray[np.integer] = _NOTHING
+    full_scale: int | None
+    stated: int | None
+    saturated: NDArray[np.integer]
     maximum: int = 0
     at_maximum: NDArray[np.integer] = _NOTHING
     below: NDArray[np.int64] = _NOTHING
     counts: NDArray[np.int64] = _NOTHING
-
-
-_NOT_ADDED = _ImageValues()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +101,7 @@ class Saturation:
     """
 
     n_pixels: int
-    images: tuple[_ImageValues, ...]
+    images: tuple[ImageValues, ...]
     given: float | None = None
     rows: NDArray[np.integer] | None = None
     even: bool = False
@@ -165,7 +162,7 @@ class Saturation:
 
         PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
         """
-        levels = {image.stated for image in self.images if image is not _NOT_ADDED}
+        levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
         if stated is None or maximum <= stated:
             return stated
@@ -193,53 +190,31 @@ class Saturation:
         return number >= SPIKE * int(counts[-COMPARED_VALUES:].max(initial=0))
 
 
-class SaturationFinder:
-    """Find the saturated observations of a capture from its images, one at a time.
+def look_at(pixels: NDArray[Any], path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
+    """Return what decides which of an image's pixels (P, C), as stored, are saturated.
 
     Args:
-        n_pixels: P, the number of the mask's pixels.
-        n_images: F.
         given: the white level that the user gave; None to find it.
-        even: see Saturation.
+        stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
+
+    Raises:
+        InputError: the white level that the user gave is above the image's full scale.
     """
-
-    def __init__(self, n_pixels: int, n_images: int, *, given: float | None = None, even: bool = False) -> None:
-        self.shape = n_pixels, n_images
-        self.given, self.even = given, even
-        self._images = [_NOT_ADDED] * n_images
-
-    def add(self, position: int, pixels: NDArray[Any], path: Path, *, stated: int | None = None) -> None:
-        """Add the mask's pixels (P, C) of the image at this position, as stored.
-
-        Args:
-            stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
-
-        Raises:
-            InputError: the white level that the user gave is above the image's full scale.
-        """
-        full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
-        if self.given is not None and full_scale is not None and self.given > full_scale:
+    full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
+    if given is not None:
+        if full_scale is not None and given > full_scale:
             raise InputError(
-                f"the white level is {self.given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
+                f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
                 path=path,
                 hint="Lower the white level, or leave it out",
             )
-        found = _ImageValues(full_scale, stated)
-        if self.given is not None:
-            found = found._replace(saturated=_indices(in_any_channel(pixels >= self.given)))
-        elif pixels.dtype != np.uint16 or not pixels.size:
-            found = found._replace(saturated=_indices(find_saturated(pixels)))
-        elif maximum := int(pixels.max()):
-            at_maximum = _indices(in_any_channel(pixels == maximum))
-            saturated = at_maximum if maximum == full_scale else _NOTHING
-            below, counts = _largest_values(pixels, maximum)
-            found = _ImageValues(full_scale, stated, saturated, maximum, at_maximum, below, counts)
-        self._images[position] = found
-
-    def finish(self) -> Saturation:
-        """Return the white level and the saturated observations. Images that were not added have none."""
-        n_pixels, _ = self.shape
-        return Saturation(n_pixels, tuple(self._images), self.given, even=self.even)
+        return ImageValues(full_scale, stated, _indices(in_any_channel(pixels >= given)))
+    maximum = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else 0
+    if not maximum:
+        return ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
+    at_maximum = _indices(in_any_channel(pixels == maximum))
+    saturated = at_maximum if maximum == full_scale else _NOTHING
+    return ImageValues(full_scale, stated, saturated, maximum, at_maximum, *_largest_values(pixels, maximum))
 
 
 def _indices(flags: NDArray[np.bool_]) -> NDArray[np.integer]:
