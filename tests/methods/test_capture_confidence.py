@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.confidence.features import CaptureFeatures, capture_features
+from splinecli.confidence import CaptureFeatures, capture_features
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.light.lamp_light import LampLight
 from splinecli.maths.normals import unit
@@ -100,7 +100,7 @@ def test_the_head_takes_as_many_features_as_there_are() -> None:
 def test_an_untrained_head_changes_little() -> None:
     errors = torch.tensor([[-2.0, 1.0], [0.0, 0.5]])
     capture = torch.full((CAPTURE_FEATURES,), torch.nan)
-    turn = list(CaptureFeatures.__dataclass_fields__).index("bend_turn")
+    turn = CaptureFeatures._fields.index("bend_turn")
     capture[turn] = np.log(2.0)
     found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), capture)
     added = np.exp(-3.5) + np.radians(0.6 * 2.0)

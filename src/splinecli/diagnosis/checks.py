@@ -15,8 +15,7 @@ from splinecli.capture.restore.light_intensities import estimate_light_intensiti
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
 from splinecli.diagnosis.evidence import Evidence, StatedLights
-from splinecli.diagnosis.explanations import encoded_values, near_lamps
-from splinecli.diagnosis.ground_truth import check_ground_truth
+from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
 from splinecli.diagnosis.image_shifts import shift_warnings
 from splinecli.diagnosis.light_advice import light_warnings
 from splinecli.diagnosis.light_check import LightCheck

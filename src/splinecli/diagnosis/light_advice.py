@@ -38,23 +38,19 @@ def light_warnings(check: LightCheck, lights: StatedLights, *, strict: bool = Fa
 
 
 def _order_text(check: LightCheck, light_file: Path) -> str:
-    assert check.given_misfit is not None, "an order is judged by its misfit"
+    given = 100 * check.given_misfit
     if check.order == UNKNOWN_ORDER:
         return (
             f"The images fit {light_file.name} no better than lights in a random order"
-            f" (misfit {100 * check.given_misfit:.0f} % of a random order's). Its lines are in another order than the"
+            f" (misfit {given:.0f} % of a random order's). Its lines are in another order than the"
             " images, or it belongs to another capture."
         )
-    assert check.order_misfit is not None, "a better order has a misfit"
+    remedy = "Check that its lines are in the order of the images."
+    if check.order == ZENITH:
+        remedy = "Replace each elevation by 90 degrees minus it."
     return (
         f"The images fit the lights of {light_file.name} much better {check.order}"
-        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against"
-        f" {100 * check.given_misfit:.0f} %). "
-        + (
-            "Replace each elevation by 90 degrees minus it."
-            if check.order == ZENITH
-            else "Check that its lines are in the order of the images."
-        )
+        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %). {remedy}"
     )
 
 
@@ -63,7 +59,7 @@ def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_fil
     figures = [
         f"{name} {one:{form}} against {other:{form}}"
         for name, one, other, form in pairs
-        if one is not None and other is not None and f"{one:{form}}" != f"{other:{form}}"
+        if f"{one:{form}}" != f"{other:{form}}"
     ]
     twin = mirror_twin(check, best)
     words = best.name if best.frame is None else f"with {best.name}"
@@ -97,14 +93,13 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
 
     Frames come first, then orders, which are judged by their misfit alone.
     """
-    figures = ("misfit", "curl", "rim", "advantage")
-    frames = [
-        {"reading": candidate.name, **{name: _rounded(getattr(candidate, name)) for name in figures}}
+    readings = [
+        (candidate.name, (check.order_misfit, candidate.curl, candidate.rim, candidate.advantage))
         for candidate in check.candidates
     ]
-    orders = [{"reading": words, **dict.fromkeys(figures), "misfit": _rounded(misfit)} for words, misfit in check.tried]
-    return frames + orders
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else round(value, 3)
+    readings += [(words, (misfit, np.nan, np.nan, np.nan)) for words, misfit in check.tried]
+    rows = []
+    for words, values in readings:
+        rounded = [round(value, 3) if np.isfinite(value) else None for value in values]
+        rows.append(dict(zip(("reading", "misfit", "curl", "rim", "advantage"), (words, *rounded), strict=True)))
+    return rows

@@ -14,15 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.lights.light_fit import Factors, find_factors
-from splinecli.capture.lights.light_frames import BOTH_NEGATED, PLANE_FRAMES, LightFrame
-from splinecli.diagnosis.frame_evidence import RoughNormals, rough_normals
-from splinecli.diagnosis.light_order import (
-    MIN_LIGHTS,
-    UNKNOWN_ORDER,
-    check_order,
-    shift_steps,
-    shift_words,
-)
+from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
+from splinecli.diagnosis.frame_evidence import rough_normals
+from splinecli.diagnosis.light_order import MIN_LIGHTS, UNKNOWN_ORDER, check_order
 from splinecli.diagnosis.odd_image import OddImage, find_odd_image
 
 Array = NDArray[np.float64]
@@ -39,8 +33,6 @@ LOWEST_CURL = 0.1
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
 
-_AS_GIVEN = "as given"
-
 
 @dataclass(frozen=True)
 class Candidate:
@@ -50,10 +42,8 @@ class Candidate:
         name: in words, such as "y negated".
         frame: its frame, relative to the given one. None where it is an order that no frame stands for.
         matrix: (3, 3) M, where lights @ M' are those of this reading.
-        misfit: distance between the images and these lights, as a share of the median of random orders; None where
-            there are too few lights.
         curl: of the normals; 0 is a surface.
-        rim: mean cosine between normals and the outward direction at the outline; None without a closed outline.
+        rim: mean cosine between normals and the outward direction at the outline; NaN without a closed outline.
         steps: by how many lights it shifts the order.
         advantage: evidence for it against the given lights; from 1 it is better.
     """
@@ -61,9 +51,8 @@ class Candidate:
     name: str
     frame: LightFrame | None
     matrix: Array = field(compare=False)
-    misfit: float | None
     curl: float
-    rim: float | None
+    rim: float
     steps: int = 0
     advantage: float = 0.0
 
@@ -75,46 +64,41 @@ class LightCheck:
     Args:
         candidates: readings of the light file; the given one first, then from best to worst.
         order: the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits.
-        given_misfit, order_misfit: as in Candidate, of the given order and of the better one.
+        given_misfit, order_misfit: distances between the images and the lights in the given order and in the better
+            one, as shares of the median of random orders; NaN where there are too few lights.
         best: the reading that gives better normals; None if there is none. Its frame is relative to the given one.
         tried: readings of the order in words, each with its misfit.
         outline_counts: how much the normals at the mask's edge count, from 0 to 1.
-        odd_image: an image that contradicts the others, without which all this was found; None if there is none.
         mended: (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no
             order fits.
+        odd_image: an image that contradicts the others, without which all this was found; None if there is none.
     """
 
     candidates: tuple[Candidate, ...]
-    order: str | None = None
-    given_misfit: float | None = None
-    order_misfit: float | None = None
-    best: Candidate | None = None
-    tried: tuple[tuple[str, float], ...] = ()
-    outline_counts: float = 0.0
+    order: str | None
+    given_misfit: float
+    order_misfit: float
+    best: Candidate | None
+    tried: tuple[tuple[str, float], ...]
+    outline_counts: float
+    mended: Array | None
     odd_image: OddImage | None = None
-    mended: Array | None = None
 
     @property
     def given(self) -> Candidate:
         return self.candidates[0]
 
-    def order_fits_better_by(self, share: float) -> bool:
-        """Return whether another order leaves less than this share of the given one's misfit."""
-        if self.order in (None, UNKNOWN_ORDER) or self.order_misfit is None or self.given_misfit is None:
-            return False
-        return self.order_misfit <= share * self.given_misfit
-
     @property
     def unchecked(self) -> list[str]:
         """What the images do not tell about the lights, in words."""
         missing = []
-        if self.given_misfit is None:
+        if np.isnan(self.given_misfit):
             missing.append(f"their order (fewer than {MIN_LIGHTS} lights, too few lit pixels, or a flat object)")
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
             missing.append("their frame (too few pixels)")
-        elif 2 * RIM_WEIGHT * self.outline_counts * abs(self.given.rim or 0) < 1:
+        elif 2 * RIM_WEIGHT * self.outline_counts * abs(np.nan_to_num(self.given.rim)) < 1:
             missing.append("whether x and y are both negated (the mask's edge is no clear outline of the object)")
         return missing
 
@@ -140,14 +124,14 @@ def check_lights(
     factors = find_factors(observations) if factors is None else factors
     check = _check_frame_and_order(observations, mask, light_directions, chosen, names, factors)
     odd = None if factors is None else find_odd_image(factors, light_directions[chosen])
-    if factors is None or odd is None or check.order_fits_better_by(odd.left):
+    other_order = check.order not in (None, UNKNOWN_ORDER)
+    if factors is None or odd is None or (other_order and check.order_misfit <= odd.left * check.given_misfit):
         return check
     kept = np.delete(np.arange(len(chosen)), odd.place)
     others = observations[:, kept]
     factors = find_factors(others, intensities_known=factors.intensities_known)
-    check = _check_frame_and_order(
-        others, mask, light_directions, chosen[kept], [names[int(place)] for place in kept], factors
-    )
+    names = [names[int(place)] for place in kept]
+    check = _check_frame_and_order(others, mask, light_directions, chosen[kept], names, factors)
     return replace(check, odd_image=odd)
 
 
@@ -163,30 +147,26 @@ def _check_frame_and_order(
     found = check_order(observations, factors, light_directions, chosen, names)
     normals = rough_normals(observations / found.intensities, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
-    if not found.plausible:
-        weight = 0.0
-    weight = float(np.clip(weight, 0, 1))
-    frames = [
-        _candidate(frame.describe() or _AS_GIVEN, frame, frame.matrix, normals, found.misfit, weight)
-        for frame in PLANE_FRAMES
-        if frame.signs[0] > 0
-    ]
-    first, *others = (*frames, *map(_negated, frames))
-    for row, matrix in found.turns:
-        words, steps = shift_words(row, len(light_directions)), shift_steps(row, len(light_directions))
-        turned = _candidate(words, None, matrix, normals, found.misfit, weight)
-        others.append(replace(turned, steps=steps))
-    ranked = sorted((_judge(other, first, weight) for other in others), key=lambda other: -other.advantage)
-    # Where no order fits, the normals are no evidence.
-    best = None if found.order == UNKNOWN_ORDER else _best(ranked, in_order=found.order is not None)
+    weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
+
+    def candidate(name: str, frame: LightFrame | None, matrix: Array, steps: int = 0) -> Candidate:
+        turned = normals.transformed(matrix)
+        return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, steps)
+
+    given, *others = (candidate(frame.describe() or "as given", frame, frame.matrix) for frame in PLANE_FRAMES)
+    others += [candidate(turn.words, None, turn.matrix, turn.steps) for turn in found.turns]
+    judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
+    ranked = sorted(judged, key=lambda other: -other.advantage)
     order, mended = found.order, None
-    if order != UNKNOWN_ORDER and (order is not None or best is not None):
-        mended = found.lights if best is None else found.lights @ best.matrix.T
+    # Where no order fits, the normals are no evidence.
+    best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
+    if best is not None:
+        mended = found.lights @ best.matrix.T
+    elif order not in (None, UNKNOWN_ORDER):
+        mended = found.lights
     if order is not None and best is not None and best.frame is None:
         order, best = best.name, None  # one of several orders that fit, told by the normals
-    return LightCheck(
-        (first, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, mended=mended
-    )
+    return LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, mended)
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
@@ -200,25 +180,7 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
     return min(preferred or near, key=lambda candidate: candidate.steps, default=None)
 
 
-def _candidate(
-    name: str, frame: LightFrame | None, matrix: Array, normals: RoughNormals, misfit: float | None, weight: float
-) -> Candidate:
-    normals = normals.transformed(matrix)
-    return Candidate(name, frame, matrix, misfit, normals.curl(), normals.rim() if weight > 0 else None)
-
-
-def _negated(candidate: Candidate) -> Candidate:
-    """Return a candidate with x and y negated in addition: all slopes change sign, and so does the rim."""
-    assert candidate.frame is not None
-    frame = BOTH_NEGATED.after(candidate.frame)
-    rim = None if candidate.rim is None else -candidate.rim
-    return replace(candidate, name=frame.describe(), frame=frame, matrix=frame.matrix, rim=rim)
-
-
-def _judge(other: Candidate, given: Candidate, weight: float) -> Candidate:
-    """Return the candidate with its advantage over the given one."""
+def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
     curls = np.log(max(given.curl, LOWEST_CURL) / max(other.curl, LOWEST_CURL))
-    advantage = CURL_WEIGHT * (curls if np.isfinite(curls) else 0.0)
-    if other.rim is not None and given.rim is not None:
-        advantage += RIM_WEIGHT * weight * (other.rim - given.rim)
-    return replace(other, advantage=float(advantage))
+    rims = weight * (other.rim - given.rim)
+    return float(CURL_WEIGHT * np.nan_to_num(curls) + RIM_WEIGHT * np.nan_to_num(rims))

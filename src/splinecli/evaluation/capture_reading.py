@@ -13,7 +13,7 @@ from splinecli.capture import Capture, CaptureSource, open_capture
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
 from splinecli.capture.lights.draws import PIXELS_STREAM
 from splinecli.capture.sample import sample_observations
-from splinecli.diagnosis.ground_truth import check_ground_truth
+from splinecli.diagnosis.explanations import check_ground_truth
 from splinecli.errors import InputError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trial_capture import TrialSource
