@@ -115,7 +115,7 @@ def photographed(
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)
         circle = Circle(float(x), float(y), radius, points=outline)
-        marks = tuple(Highlight(*point, 9, 0.0) for point in highlights.tolist())
+        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())
         files = BallFiles(Path("ball"), (), None, None)
         balls.append(BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS))
     return places, balls

@@ -17,8 +17,15 @@ from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_image, read_mask, to_linear
-from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
-from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
+from splinecli.capture.layouts.capture_files import (
+    FILENAMES,
+    MASK,
+    NOT_PHOTOGRAPHS,
+    check_not_empty,
+    find_named,
+    list_images,
+    read_image_list,
+)
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -72,7 +79,7 @@ class BallCalibration:
     directions: NDArray[np.float64]
     normals: NDArray[np.float64]
     view: View
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
 
     @property
     def points(self) -> NDArray[np.float64]:
@@ -144,11 +151,11 @@ def calibrate_ball(
     view = find_view(files.facts[0], camera_matrix)
     centre = ball_centre(circle.outline, view.matrix)
     highlights, normals, directions = [], [], []
-    expected: ExpectedSize | None = None
+    shape = files.facts[0].size[0][:2]
+    expected = ExpectedSize(shape, files.images[0].name)
     for path in files.images:
         stored = decode_image(path, expected)
-        expected = expected or ExpectedSize(stored.shape, path.name)
-        if not circle.inside(stored.shape[:2]).any():
+        if not circle.inside(shape).any():
             raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
             highlight = find_highlight(
@@ -166,16 +173,8 @@ def calibrate_ball(
         directions.append(direction[0])
         if progress is not None:
             progress()
-    assert expected is not None  # a ball has images
     return BallCalibration(
-        files,
-        circle,
-        circle_from,
-        tuple(highlights),
-        np.array(directions),
-        np.array(normals),
-        view,
-        (expected.shape[0], expected.shape[1]),
+        files, circle, circle_from, tuple(highlights), np.array(directions), np.array(normals), view, shape
     )
 
 
@@ -222,10 +221,8 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
 
 def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
     """Return the mean (H, W) of the gray values of images."""
-    total: NDArray[np.float32] | None = None
-    for path in images:
-        expected = None if total is None else ExpectedSize(total.shape, images[0].name)
-        gray = read_image(path, expected).mean(axis=2)
-        total = gray if total is None else total + gray
-    assert total is not None
+    total: NDArray[np.float32] = read_image(images[0]).mean(axis=2)
+    expected = ExpectedSize(total.shape, images[0].name)
+    for path in images[1:]:
+        total = total + read_image(path, expected).mean(axis=2)
     return total / np.float32(len(images))

@@ -95,11 +95,9 @@ def _target_normals(
     files: BallFiles, shape: tuple[int, ...], target: Target
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
-    mask = (
-        np.ones(shape, np.bool_)
-        if files.mask is None
-        else read_mask(files.mask, ExpectedSize(shape, files.images[0].name, "a mask"))
-    )
+    mask = np.ones(shape, np.bool_)
+    if files.mask is not None:
+        mask = read_mask(files.mask, ExpectedSize(shape, files.images[0].name, "a mask"))
     if target == "card":
         return mask, np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     if files.mask is None:

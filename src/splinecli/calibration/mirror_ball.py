@@ -36,13 +36,11 @@ class Highlight:
 
     Args:
         x, y: the centroid, in pixels of the image.
-        n_pixels: the number of its pixels.
-        saturated: share of them that is saturated, 0 to 1.
+        saturated: share of its pixels that is saturated, 0 to 1.
     """
 
     x: float
     y: float
-    n_pixels: int
     saturated: float
 
 
@@ -83,9 +81,7 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
     weight = smooth[core].astype(np.float64) - 0.9 * HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
-    return Highlight(
-        float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), int(core.sum()), saturated
-    )
+    return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
 
 
 def ball_centre(outline: Floats, matrix: Floats) -> Floats:
@@ -96,10 +92,8 @@ def ball_centre(outline: Floats, matrix: Floats) -> Floats:
     """
     rays = np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)
     x, y = rays[:, 0], rays[:, 1]
-    equations, right_side = (
-        np.column_stack((x, y, np.ones(len(x)))),
-        (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1)),
-    )
+    equations = np.column_stack((x, y, np.ones(len(x))))
+    right_side = (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1))
     kept = np.ones(len(x), np.bool_)
     for _ in range(4):
         solution = np.linalg.lstsq(equations[kept], right_side[kept], rcond=None)[0]

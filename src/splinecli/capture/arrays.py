@@ -15,7 +15,7 @@ from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.observations import StoredPixels, collect_observations
+from splinecli.capture.linearise import StoredPixels, collect_observations
 from splinecli.capture.record import Capture
 from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError, UsageError

@@ -23,9 +23,9 @@ from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import positions_as_directions
 from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions, find_lamps
-from splinecli.capture.lights.light_angles import LightForm, RowForm
 from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.light_rows import LightForm, RowForm
 from splinecli.capture.lights.named_lights import NamedLights, read_lights
 from splinecli.capture.linearise import AUTOMATIC, RadiometricCalibration
 from splinecli.capture.paths import StrPath

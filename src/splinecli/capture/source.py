@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.capture_size import check_capture, common_size
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
 from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
-from splinecli.capture.formats.image_size import ExpectedSize
+from splinecli.capture.formats.image_size import ExpectedSize, check_capture, common_size
 from splinecli.capture.formats.images import read_mask
+from splinecli.capture.formats.native_stderr import stderr_is_apart
 from splinecli.capture.formats.normal_files import read_ground_truth
-from splinecli.capture.formats.read_ahead import read_ahead
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.linearise import AS_STORED, PixelReader, RadiometricCalibration
-from splinecli.capture.observations import StoredPixels, collect_observations
+from splinecli.capture.linearise import (
+    AS_STORED,
+    PixelReader,
+    RadiometricCalibration,
+    StoredPixels,
+    collect_observations,
+)
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.capture.stored import StoredCapture
@@ -32,6 +37,7 @@ from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 
 Item = TypeVar("Item")
+Image = TypeVar("Image")
 Progress = Callable[[], object]
 """Called once after each image."""
 
@@ -237,3 +243,22 @@ class CaptureSource:
             return use(StoredPixels(facts.path, stored, linear, intensity, facts.white_level))
 
         return read_ahead(read, indices)
+
+
+def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:
+    """Yield read(item) of each item, in order. While one result is used, a thread reads the next.
+
+    An error is raised when the turn of its item comes. Decoders catch what is printed to file descriptor 2. Where
+    Python's stderr is the same, one item is read after the other, so that no message is lost.
+    """
+    if len(items) < 2 or not stderr_is_apart():
+        yield from map(read, items)
+        return
+    with ThreadPoolExecutor(1, "read") as pool:
+        waiting = pool.submit(read, items[0])
+        for item in items[1:]:
+            found = waiting.result()
+            waiting = pool.submit(read, item)
+            yield found
+            del found  # so that no more than two are in memory
+        yield waiting.result()

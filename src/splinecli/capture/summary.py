@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
 from splinecli.capture.formats.images import to_linear
-from splinecli.capture.linearise import AS_STORED
-from splinecli.capture.observations import StoredPixels
+from splinecli.capture.linearise import AS_STORED, StoredPixels
 from splinecli.capture.restore.saturation import find_saturated
 from splinecli.capture.restore.white_level import Saturation, WhiteLevel
 from splinecli.capture.sample import Sample, closeup_window, grid_step

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.light_angles import zenith_as_elevation
 from splinecli.capture.lights.light_fit import (
     Factors,
     fit_residual,
@@ -25,6 +24,7 @@ from splinecli.capture.lights.light_fit import (
     shifted_orders,
     swapped_orders,
 )
+from splinecli.capture.lights.light_rows import zenith_as_elevation
 from splinecli.diagnosis.light_rings import mend_rings
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The simplest layout: a folder of images with a light file, in it or named by the user. DiLiGenT is one, too."""
+"""Folders of images with a light file, in it or named by the user: plain ones, DiLiGenT and PSBox."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from splinecli.capture.layouts.capture_files import (
     NOT_PHOTOGRAPHS,
     CaptureFiles,
     Overrides,
+    check_not_empty,
     find_lights,
     find_named,
     gather_files,
+    list_images,
+    read_image_list,
 )
-from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
+from splinecli.capture.paths import is_folder
 from splinecli.errors import InputError
 
 _WORD = re.compile(r"[a-z]+")
@@ -25,6 +28,10 @@ _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all
 
 _MOST_OTHERS = 0.25
 """Share of the images up to which names with these words are not those of the photographs."""
+
+
+PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"
+"""The names of the light file and of the folder of images, in the layout of PSBox (Y. Xiong)."""
 
 
 def find(folder: Path, overrides: Overrides) -> CaptureFiles:
@@ -58,3 +65,18 @@ def find(folder: Path, overrides: Overrides) -> CaptureFiles:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
         layout, ground_truth = "DiLiGenT", (*GROUND_TRUTH, "normal.txt")
     return gather_files(layout, folder, images, lights, overrides, ground_truth_names=ground_truth, others=others)
+
+
+def find_psbox(folder: Path, overrides: Overrides) -> CaptureFiles | None:
+    """Return the files of a capture of PSBox, or None for another layout: its images are in a folder of their own.
+
+    Raises:
+        InputError: that folder contains no images.
+    """
+    lights = overrides.lights or find_named(folder, PSBOX_LIGHTS)
+    objects = folder / PSBOX_IMAGES
+    if lights is None or not is_folder(objects):
+        return None
+    images = list_images(objects, leave_out_stems=NOT_PHOTOGRAPHS, leave_out=overrides.named())
+    check_not_empty(images, objects)
+    return gather_files("PSBox", folder, images, lights, overrides)

@@ -5,19 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.layouts import cyclesps, plain_folder, psbox
+from splinecli.capture.layouts import cyclesps, plain_folder
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     LIGHT_FILES,
     NO_OVERRIDES,
     NOT_PHOTOGRAPHS,
     CaptureFiles,
+    NoImagesError,
     Overrides,
     find_lights,
     find_named,
     folder_name,
+    list_folder,
+    list_images,
 )
-from splinecli.capture.layouts.image_lists import NoImagesError, list_folder, list_images
 from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
 
@@ -34,7 +36,8 @@ def find_capture_files(folder: StrPath, overrides: Overrides = NO_OVERRIDES) -> 
     overrides.named()
     try:
         # The plain folder comes last, because it takes any folder with images.
-        return psbox.find(folder, overrides) or cyclesps.find(folder, overrides) or plain_folder.find(folder, overrides)
+        finds = (plain_folder.find_psbox, cyclesps.find, plain_folder.find)
+        return next(files for find in finds if (files := find(folder, overrides)) is not None)
     except NoImagesError as error:
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
@@ -84,8 +87,8 @@ def _subfolders(folder: Path) -> list[Path]:
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
     if find_lights(folder) is not None:
-        objects = folder / psbox.OBJECTS
-        is_psbox = is_folder(objects) and find_named(folder, psbox.LIGHT_DIRECTIONS) is not None
+        objects = folder / plain_folder.PSBOX_IMAGES
+        is_psbox = is_folder(objects) and find_named(folder, plain_folder.PSBOX_LIGHTS) is not None
         if find_named(folder, [FILENAMES]) is not None or list_images(
             objects if is_psbox else folder, leave_out_stems=NOT_PHOTOGRAPHS
         ):

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_angles import RowForm
 from splinecli.capture.lights.light_files import directions_of, read_light_table, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.light_rows import image_name
+from splinecli.capture.lights.light_rows import RowForm, image_name
 from splinecli.errors import InputError
 from splinecli.system.files import parse_json
 
@@ -102,7 +101,8 @@ def read_lights(
     rows = read_light_table(path, n_images, form)
     if rows.names is None:
         return directions_of(rows.numbers, n_images, frame, form)
-    return NamedLights(path, rows.names, rows.numbers.lines, directions_of(rows.numbers, None, frame, form))
+    lines = tuple(row.line for row in rows.numbers.rows)
+    return NamedLights(path, rows.names, lines, directions_of(rows.numbers, None, frame, form))
 
 
 def _read_lp(path: Path, frame: LightFrame) -> NamedLights:

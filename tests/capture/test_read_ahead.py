@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from splinecli.capture.formats import read_ahead as module
-from splinecli.capture.formats.read_ahead import read_ahead
+from splinecli.capture import source as module
+from splinecli.capture.source import read_ahead
 
 
 @pytest.fixture(params=[True, False])
