@@ -40,10 +40,8 @@ class BallFiles:
     """The files of one ball.
 
     Args:
-        folder: the folder of the ball.
         images: one image for each light, in the order of the lights.
         reference: an image that shows the outline of the ball, or None.
-        mask: a mask of the ball, or None.
     """
 
     folder: Path
@@ -62,13 +60,10 @@ class BallCalibration:
     """The light directions from F images of one ball.
 
     Args:
-        files: the files of the ball.
-        circle: the outline of the ball.
         circle_from: the source of the outline: "--circle", "mask" or "picture".
         highlights: (F,), one for each image.
         directions: (F, 3) float64, unit vectors; x right, y up, z to the camera.
         normals: (F, 3), of the ball at the highlights, half-way between the view and the lights.
-        view: the camera.
         shape: (H, W) of the images.
     """
 
@@ -92,7 +87,6 @@ class CalibratedLights:
     """The light directions from one or several balls.
 
     Args:
-        balls: the calibration of each ball.
         directions: (F, 3) float64, unit vectors: the mean direction of the balls.
         disagreement_deg: (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a
             single ball.
@@ -107,7 +101,6 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
     """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
 
     Args:
-        folder: the folder of the images.
         mask: a mask that replaces the one in the folder.
 
     Raises:
@@ -135,11 +128,9 @@ def calibrate_ball(
     """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
 
     Args:
-        files: the files of the ball.
         circle: the outline. None takes it from the mask, from the reference image, or from the mean of all images, in
             this order.
         camera_matrix: a file; None takes the camera from EXIF, or as distant (see find_view).
-        progress: called after each image.
 
     Raises:
         InputError: an image cannot be read, has another size or shows no highlight; or the outline is not found or

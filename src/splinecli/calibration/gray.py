@@ -45,7 +45,6 @@ def measure_light_intensities(
             An image called `ambient` in the folder is subtracted.
         light_directions: (F, 3), unit vectors.
         target: a matte ball, or a matte card that faces the camera, with the normal (0, 0, 1).
-        radiometry: how stored values become linear light.
 
     Raises:
         InputError: the numbers of images and lights differ, an image cannot be read or has another size, or the target

@@ -45,7 +45,6 @@ class LampPositions:
         positions: (F, 3).
         uncertainty: (F,), the distance within which the true position is with CONFIDENCE.
         pixel_size: the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel.
-        view: the camera.
     """
 
     positions: Floats

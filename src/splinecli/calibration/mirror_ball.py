@@ -49,7 +49,6 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
 
     Args:
         image: (H, W), linear gray values.
-        circle: the outline of the ball.
         full_scale: the value at which pixels saturate. None for images that do not saturate.
 
     Raises:
@@ -105,12 +104,7 @@ def ball_centre(outline: Floats, matrix: Floats) -> Floats:
 
 
 def reflect(centre: Floats, highlights: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball.
-
-    Args:
-        centre: (3,), see ball_centre.
-        matrix: (3, 3), of the camera.
-    """
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball."""
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
     with np.errstate(invalid="ignore"):

@@ -35,7 +35,6 @@ def calibration_report(
     """Return the report of a calibration as values for JSON, with its warnings.
 
     Args:
-        lights: the calibrated directions.
         intensities: (F, 3), or None where they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
         picture: the name of the picture to which warnings refer.

@@ -16,7 +16,6 @@ class CaptureWarning:
 
     Args:
         code: a name that stays the same when the sentence changes; one of the constants below.
-        text: one or two sentences.
     """
 
     code: str

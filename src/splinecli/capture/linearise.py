@@ -189,7 +189,6 @@ def collect_observations(
 
     Args:
         white_level: the one that the user gave; None to find it.
-        progress: called once after each image.
 
     Raises:
         InputError: the white level that the user gave is above an image's full scale.

@@ -43,8 +43,6 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
 
     Args:
-        path: the path.
-        expected: what the file should be, for messages.
         pipe: whether the shell's process substitution `<(...)` may stand in its place, see is_substitution.
     """
     mode = find_mode(path)

@@ -65,10 +65,8 @@ def open_capture(
             folder is subtracted.
         white_level: stored value from which an observation counts as saturated, such as 4095 for 12 bits. By default it
             is found from the files and their values (see white_level.py).
-        light_frame: the frame of the light file.
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: where near lamps are, if no files in the folder say so.
-        window: the part of the images that is read.
         find_lights: finds the lights from the images, in place of light files.
 
     Raises:

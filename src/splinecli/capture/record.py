@@ -40,7 +40,6 @@ class Capture:
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
     Args:
-        name: the name of the outputs.
         observations: (P, F) float32, linear: every channel divided by its light's intensity, then the mean of
             the channels. Only the mask's pixels, in the mask's row-major order.
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).

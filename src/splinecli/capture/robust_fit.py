@@ -39,7 +39,6 @@ def fit_scaled_normals(observations: Array, weights: Array, light_directions: Ar
     Args:
         observations, weights: (P, F).
         light_directions: (F, 3) or (P, F, 3), of any length.
-        prior: pulls b towards 0.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)

@@ -47,15 +47,11 @@ class CaptureSource:
     """An opened capture: lights and facts of images loaded, pixels still on disk.
 
     Args:
-        files: the files of the capture.
-        facts: what the header of each image states.
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera. They mean nothing
             where find_lights is given.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         intensities_known: whether a file or the user gives the intensities.
         intensities_measured: whether a file gives the intensities.
-        warnings: what a user should read.
-        radiometry: how stored values become linear light.
         white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
         light_frame: the frame of the light file, in which the directions are no longer.
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
@@ -99,8 +95,6 @@ class CaptureSource:
         the mask are ignored.
 
         Args:
-            light_indices: zero-based.
-            progress: called once after each image.
             as_stored: use the stored values alone. By default, saturated observations are restored (see
                 restore_saturated) and light intensities that no file gives are estimated (see
                 estimate_light_intensities).

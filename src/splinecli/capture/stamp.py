@@ -26,9 +26,6 @@ def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence
     Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
 
-    Args:
-        lamps: stamps of the files of near lamps.
-
     Raises:
         InputError: a file cannot be read.
     """

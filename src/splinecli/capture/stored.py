@@ -32,7 +32,6 @@ class StoredCapture:
 
     Args:
         capture: the stored observations, linear, divided by the light intensities that the files give.
-        saturation: which observations are saturated.
         intensities_known: whether a file, an option or the image format gives the light intensities.
         found_intensities: (F,), those that were found together with the directions, or None.
     """
@@ -95,9 +94,6 @@ class StoredCapture:
         """Return the capture with its intensities divided out and its saturated observations restored.
 
         The observations are changed in place: this record must not be used afterwards.
-
-        Args:
-            intensities: what estimate_intensities returns.
         """
         observations, warnings, restored = self.capture.observations, self.capture.warnings, None
         if intensities is not None:

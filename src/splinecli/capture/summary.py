@@ -34,7 +34,6 @@ class ImageSummary:
     """One image of a capture; only the mask's pixels count.
 
     Args:
-        path: the file.
         shape: (H, W, C) as stored.
         dtype: as stored, such as "uint16".
         bright: the 99 % quantile of the values, as a share of the white level. For floating-point images, the
@@ -54,10 +53,6 @@ class CaptureSummary:
     """Summary of a capture.
 
     Args:
-        source: the capture.
-        images: a summary of each image.
-        n_pixels: number of the mask's pixels.
-        white_level: as in Capture.
         sample: some of the pixels of all images, on a grid; None where images have different sizes.
         closeup: every pixel of the middle, or None.
         lamp_warnings: about near lamps over this mask.

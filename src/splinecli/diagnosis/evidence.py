@@ -25,11 +25,8 @@ class StatedLights:
     """What files or arguments say about the lights of F images.
 
     Args:
-        names: of the images.
         directions: (N, 3), all lights of the file, in its order.
         indices: (F,), those of the images.
-        origin: the file.
-        frame: the frame in which it was read.
         intensities_measured: whether the intensities are given.
         intensities_known: whether they are given, or the user says that they are equal.
         linear: whether the values of the images are taken as linear.
@@ -94,7 +91,6 @@ class Evidence:
     """A capture as the checks see it; what several of them need is found once.
 
     Args:
-        lights: what is stated about the lights.
         sample, closeup: without dark background, not divided by estimated intensities.
         background: its share.
         truth: (H, W, 3), the ground truth of the whole images, or None.

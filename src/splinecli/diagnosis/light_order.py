@@ -132,7 +132,6 @@ def check_order(
         factors: of the observations; None where there are too few lit ones.
         light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
         chosen: (F,) the lights of the observations.
-        names: of the F images.
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))

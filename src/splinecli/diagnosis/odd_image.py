@@ -43,7 +43,6 @@ class OddImage:
     """An image that contradicts the others.
 
     Args:
-        place: of the image.
         left: what is left without it of the misfit, or of the residual of the factors, as a share of that of all.
         brightness: of the image, as a share of what its light would give; None where brightness is not its fault, or
             the intensity of the light is unknown.

@@ -122,13 +122,7 @@ def results_bytes(n_pixels: int, n_lights: int, *, albedo: bool = False, surface
 
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
-    """Return the bytes that `infer` takes for a capture: observations in float32, and images or results.
-
-    Args:
-        largest: the size of the largest image.
-        n_pixels: the number of the mask's pixels.
-        n_lights: the number of images that are read.
-    """
+    """Return the bytes that `infer` takes for a capture: observations in float32, and images or results."""
     images = min(_IMAGES, n_lights) * image_bytes(*largest)
     return n_pixels * 4 * n_lights + max(images, results_bytes(n_pixels, n_lights))
 

@@ -153,7 +153,6 @@ class CaptureFiles:
         layout: name of the arrangement of files, for people.
         name: name of the capture, in most layouts that of its folder.
         folder: the folder with the files beside the images.
-        images: one file for each light.
         light_directions: F x 3 text, or a file of named_lights.py, which sets the order of the images; None where no
             lights are needed.
         light_intensities: F x 3 text, or None where no file gives them.

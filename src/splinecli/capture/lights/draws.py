@@ -64,13 +64,7 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
 
 @dataclass(frozen=True)
 class DrawsFile:
-    """The draws of a file, all with the same number of lights.
-
-    Args:
-        path: the file.
-        draws: at least one, in the file's order.
-        lines: the one-based line of each draw.
-    """
+    """The draws of a file, all with the same number of lights."""
 
     path: Path
     draws: tuple[Draw, ...]

@@ -49,9 +49,7 @@ def read_light_directions(
     gives their order. Vectors may have any length above zero.
 
     Args:
-        path: the file.
         n_images: the number of lights that is expected, if it is known.
-        frame: the frame of the file.
         form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
@@ -125,8 +123,6 @@ def unit_directions(
 
     Args:
         vectors: of any length.
-        path: the file, for messages.
-        lines: the line of each vector in the file.
         places: words for the place of each vector on its line.
         of_lamps: whether the vectors are positions of lamps, for messages.
 
@@ -224,7 +220,6 @@ def _one_light_a_row(
 
     Args:
         names: the possible counts of numbers for a light, each with its meaning.
-        what: what the numbers are, for messages.
     """
     values = table.as_array()
     n_columns = values.shape[1]

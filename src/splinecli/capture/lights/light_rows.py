@@ -146,7 +146,6 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
     that names them, as "z y x" or "elevation azimuth", gives their order.
 
     Args:
-        expected: what the file should be, for messages.
         n_numbers: the number of numbers that follow a name.
 
     Raises:

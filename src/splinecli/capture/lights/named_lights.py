@@ -37,7 +37,6 @@ class NamedLights:
     """F lights, each with the name of its image.
 
     Args:
-        path: the file.
         names: names of the images, without folders.
         lines: the line of each light in the file; None for each where the file has no lines.
         directions: (F, 3) float64, unit; x right, y up, z to the camera.

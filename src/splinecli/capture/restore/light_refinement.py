@@ -84,7 +84,6 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
     """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
 
     Args:
-        capture: under distant lights.
         error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
         intensities_known: whether the light intensities were measured.
 

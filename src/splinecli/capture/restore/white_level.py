@@ -94,7 +94,6 @@ class Saturation:
 
     Args:
         n_pixels: P, the number of the mask's pixels.
-        images: what is known of each of the F images.
         given: the white level that the user gave; None to find it.
         rows: the pixels whose observations are wanted; None for all. The level is decided from all pixels.
         even: whether the images show an even target, of which one image may be clipped, and all of it.
