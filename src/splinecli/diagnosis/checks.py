@@ -16,7 +16,6 @@ from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
 from splinecli.diagnosis.evidence import Evidence, StatedLights
 from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
-from splinecli.diagnosis.image_shifts import shift_warnings
 from splinecli.diagnosis.light_advice import light_warnings
 from splinecli.diagnosis.light_check import LightCheck
 from splinecli.errors import InputError
@@ -38,12 +37,22 @@ UNEQUAL_MISFIT, UNEQUAL_RATIO = (0.1, 0.4), 0.3
 """Light intensities are unequal if equal ones leave a misfit in this range, as a share of the brightness, and those
 that fit best leave less than this share of it. Right captures of flat metal leave more than the range."""
 
+_MOST_NAMED = 4  # shifted images in a sentence
 
 Check = Callable[[Evidence], list[CaptureWarning]]
 
 
 def shifted_images(seen: Evidence) -> list[CaptureWarning]:
-    return shift_warnings(seen.shifts, seen.lights.names)
+    shifts, names = seen.shifts, seen.lights.names
+    if not shifts:
+        return []
+    named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
+    more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
+    text = (
+        f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
+        f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
+    )
+    return [CaptureWarning(codes.IMAGES_SHIFTED, text)]
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:

@@ -38,14 +38,14 @@ class StatedLights:
     names: Sequence[str]
     directions: NDArray[np.float64]
     indices: Sequence[int]
-    origin: Path
-    frame: LightFrame
     intensities_measured: bool
     intensities_known: bool
-    linear: bool
-    lamps: NearLamps | None
-    has_positions: bool
+    lamps: NearLamps | None = None
+    has_positions: bool = False
     found: bool = False
+    origin: Path = Path("light_directions")
+    frame: LightFrame = USUAL_FRAME
+    linear: bool = True
 
     @classmethod
     def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
@@ -55,14 +55,14 @@ class StatedLights:
             names=[source.files.images[index].name for index in indices],
             directions=source.light_directions,
             indices=indices,
-            origin=source.files.light_directions or Path("light_directions"),
-            frame=source.light_frame,
             intensities_measured=source.intensities_measured,
             intensities_known=source.intensities_known,
-            linear=source.radiometry.curve == 1,
             lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
             has_positions=source.lamps is not None,
             found=source.find_lights is not None,
+            origin=source.files.light_directions or Path("light_directions"),
+            frame=source.light_frame,
+            linear=source.radiometry.curve == 1,
         )
 
     @classmethod
@@ -75,11 +75,8 @@ class StatedLights:
             names=[f"images[{index}]" for index in range(capture.n_lights)],
             directions=capture.light_directions,
             indices=range(capture.n_lights),
-            origin=Path("light_directions"),
-            frame=USUAL_FRAME,
             intensities_measured=intensities_measured,
             intensities_known=intensities_measured,
-            linear=True,
             lamps=lamps,
             has_positions=lamps is not None,
             found=capture.light_errors_deg is not None,
@@ -139,9 +136,9 @@ class Evidence:
 
     @cached_property
     def light_check(self) -> LightCheck:
-        lights = self.lights
+        stated = self.lights
         return check_lights(
-            self.observations, self.sample.mask, lights.directions, lights.indices, lights.names, self.factors
+            self.observations, self.sample.mask, stated.directions, stated.indices, stated.names, self.factors
         )
 
     @cached_property

@@ -15,10 +15,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error
+from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import PILLOW_KINDS, PNG, facts_in, open_image, open_with_pillow
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
-from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.formats.raw import decode_raw
 from splinecli.capture.formats.tiff import decode_tiff
 from splinecli.errors import InputError
