@@ -27,8 +27,7 @@ Floats = NDArray[np.floating]
 Floats32 = NDArray[np.float32]
 Places = NDArray[np.integer]
 
-FEWEST_LIGHTS = 5
-"""With fewer, a fit leaves too little to judge a capture by."""
+FEWEST_LIGHTS = 5  # with fewer, a fit leaves too little to judge a capture by
 
 FEWEST_PIXELS = 50
 

@@ -22,15 +22,13 @@ LARGEST_UNCERTAINTY = 0.4
 """Largest uncertainty of a position, as a share of the lamp's distance. Beyond it the rays are nearly parallel, and the
 lamp may be at any distance."""
 
-PIXEL_ERROR = 0.3
-"""Standard deviation of highlights, and of the middle and the radius of outlines, in pixels."""
+PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
 
 HEIGHT_SPREAD = 0.5
 """Usual difference between the heights of the balls' centres and their plane, in radii. It decides where the size of
 the outlines does not: under a distant camera."""
 
-CONFIDENCE = 0.95
-"""Share of positions that are within their uncertainty."""
+CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 
 _DRAWS = 200
 

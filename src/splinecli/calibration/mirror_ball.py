@@ -21,12 +21,8 @@ from splinecli.surface.camera import ray_basis
 
 Floats = NDArray[np.float64]
 
-HIGHLIGHT_LEVEL = 0.7
-"""A highlight is the patch above this share of its brightest value, after a slight blur."""
-
-MIN_CONTRAST = 4.0
-"""Smallest ratio of the highlight to the median of the ball."""
-
+HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
+MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball
 _MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed ball, not a lamp
 
 

@@ -11,14 +11,9 @@ from splinecli.calibration.balls import CalibratedLights
 from splinecli.calibration.lamp_positions import LampPositions
 from splinecli.maths.normals import angle_between_deg
 
-UNSURE_VISIBLE = 0.6
-"""Smallest visible share of an outline without a warning."""
-
-UNSURE_SPREAD = 0.01
-"""Largest spread of an outline without a warning, as a share of the radius."""
-
-DISAGREEMENT_DEG = 5.0
-"""Largest angle between a ball and the mean of all balls without a warning."""
+UNSURE_VISIBLE = 0.6  # smallest visible share of an outline without a warning
+UNSURE_SPREAD = 0.01  # largest spread of an outline without a warning, as a share of the radius
+DISAGREEMENT_DEG = 5.0  # largest angle between a ball and the mean of all balls without a warning
 
 MISTAKEN_DEG = 3.0
 """Smallest mean difference at which compared directions are checked for the mistake of mirror_ball.py."""

@@ -18,8 +18,7 @@ from splinecli.surface.camera import ray_basis
 
 Floats = NDArray[np.float64]
 
-DISTANT = 1e6
-"""Focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel."""
+DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
 
 SHORTEST_LENS = 0.7
 """Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""

@@ -82,8 +82,7 @@ PROBABLY_WRONG = frozenset(
 )
 """Warnings that say that an input is probably wrong. With --strict they are errors."""
 
-SATURATED_SHARE = 0.01
-"""The share of saturated observations above which the capture, or an image, carries a warning."""
+SATURATED_SHARE = 0.01  # share of saturated observations above which the capture, or an image, carries a warning
 
 
 def white_level(level: WhiteLevel | None) -> list[CaptureWarning]:

@@ -22,9 +22,7 @@ from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
-BLACK_SHARE = 0.01
-"""The share of pixels without light above which the capture carries a warning."""
-
+BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
 _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 
 
@@ -69,11 +67,8 @@ class RadiometricCalibration:
         return self, warnings
 
 
-AUTOMATIC = RadiometricCalibration(automatic=True)
-"""Stored values are linear light, unless all images say otherwise."""
-
-AS_STORED = RadiometricCalibration()
-"""Stored values are linear light."""
+AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images say otherwise
+AS_STORED = RadiometricCalibration()  # stored values are linear light
 
 
 def take_pixels(image: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:

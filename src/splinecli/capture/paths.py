@@ -13,8 +13,7 @@ _OPEN_FILES = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 
-StrPath = str | os.PathLike[str]
-"""A path in any form that the standard library takes."""
+StrPath = str | os.PathLike[str]  # a path in any form that the standard library takes
 
 
 def find_mode(path: Path) -> int | None:

@@ -36,8 +36,7 @@ from splinecli.capture.stamp import stamp_files
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError, UsageError
 
-EQUAL = "equal"
-"""Given in place of a file of intensities: all lights have the same intensity."""
+EQUAL = "equal"  # given in place of a file of intensities: all lights have the same intensity
 
 
 def open_capture(

@@ -15,8 +15,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
 
-MIN_LIGHTS = 3
-"""A normal scaled by an albedo has three unknowns."""
+MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 
 COPLANAR_RATIO = 1e-3
 """Lights (F, 3) count as coplanar if their smallest singular value is below this share of the largest."""

@@ -7,12 +7,9 @@ from numpy.typing import NDArray
 
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
-SHADOW_SHARE = 0.05
-"""Observations below this share of a pixel's largest one count as shadow."""
-
+SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one count as shadow
 _PRIOR = 1e-6  # pulls towards a black pixel, so that a pixel without three lit observations has a solution
-_EQUAL_WEIGHT_BELOW = 0.02
-"""Residuals far below this share of a pixel's largest observation have nearly equal weights."""
+_EQUAL_WEIGHT_BELOW = 0.02  # residuals far below this share of a pixel's largest observation have nearly equal weights
 
 Array = NDArray[np.floating]
 

@@ -10,14 +10,9 @@ from numpy.typing import NDArray
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError
 
-MAX_PIXELS = 20_000
-"""Of larger captures, every second or third row and column is taken, and so on."""
-
-CLOSEUP_SIDE = 192
-"""The side of a closeup in pixels."""
-
-BLACK = 0.15
-"""A background is dark if its median brightness is below this share of the object's."""
+MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
+CLOSEUP_SIDE = 192  # side of a closeup in pixels
+BLACK = 0.15  # a background is dark if its median brightness is below this share of the object's
 
 _SMALLEST_SIDE = 8
 

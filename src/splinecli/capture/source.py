@@ -38,8 +38,7 @@ from splinecli.errors import InputError
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
-Progress = Callable[[], object]
-"""Called once after each image."""
+Progress = Callable[[], object]  # called once after each image
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,7 @@ from splinecli.system.files import file_sha256
 if TYPE_CHECKING:
     from splinecli.capture.layouts.capture_files import CaptureFiles
 
-LARGEST_HASHED = 1 << 26
-"""Bytes of the largest file that is stamped by its content."""
+LARGEST_HASHED = 1 << 26  # bytes of the largest file that is stamped by its content
 
 
 def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:

@@ -19,14 +19,9 @@ from splinecli.capture.sample import Sample, closeup_window, grid_step
 from splinecli.capture.source import CaptureSource
 from splinecli.capture.window import WHOLE
 
-DARK = 0.05
-"""An image is called dark if its 99 % quantile is below this share of the white level."""
-
-FEW_LIGHTS = 8
-"""A capture with fewer lights carries a warning."""
-
-NARROW_DEG = 30.0
-"""A capture whose lights are all nearer than this to the camera axis carries a warning."""
+DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
+FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
+NARROW_DEG = 30.0  # a capture whose lights are all nearer than this to the camera axis carries a warning
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,9 @@ from splinecli.diagnosis.light_check import LightCheck
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg
 
-SMALLEST_SPREAD = 0.1
-"""Lights that determine normals worse than this carry a warning; see light_spread."""
-
-MOST_BACKGROUND = 0.5
-"""Share of near black pixels above which a capture without a mask carries a warning."""
-
-LEAST_EXPECTED = 0.1
-"""Smallest expected share of normals within 5 degrees without a warning."""
+SMALLEST_SPREAD = 0.1  # lights that determine normals worse than this carry a warning; see light_spread
+MOST_BACKGROUND = 0.5  # share of near black pixels above which a capture without a mask carries a warning
+LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
 
 SAME_IMAGE = 1e-12
 """One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""

@@ -27,8 +27,7 @@ from splinecli.maths.normals import angle_between_deg, unit
 
 Array = NDArray[np.float64]
 
-DISPLAY_EXPONENT = 2.2
-"""A curve of this gamma is close to sRGB."""
+DISPLAY_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
 
 ENCODED_RATIO = 0.9
 """Images count as display-encoded if the fit to decoded values leaves less than this share of the mean difference. Of

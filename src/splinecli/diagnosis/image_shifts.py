@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.sample import Sample
 
-LARGEST = 8
-"""The largest shift that is looked for, in pixels of the sample."""
+LARGEST = 8  # largest shift that is looked for, in pixels of the sample
 
 LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
 """A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
@@ -25,12 +24,8 @@ images and more, a polished metal reached 0.44 and 0.17."""
 LEAST_SHIFT = 0.8
 """The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel."""
 
-LEAST_IMAGES = 10
-"""The fewest images: from fewer, polished metals are predicted so badly that right ones would be named."""
-
-LEAST_PIXELS = 1000
-"""The fewest pixels that must stay in the mask under every shift."""
-
+LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
+LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
 _MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
 _DETAIL, _CONTRAST = 1.5, 4.0  # standard deviations of blurs in pixels: finer detail, local contrast
 _LIMIT = 4.0  # of detail, in local contrasts: highlights count no more

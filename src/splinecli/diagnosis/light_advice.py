@@ -13,8 +13,7 @@ from splinecli.diagnosis.evidence import StatedLights
 from splinecli.diagnosis.light_check import Candidate, LightCheck
 from splinecli.diagnosis.light_order import UNKNOWN_ORDER, ZENITH
 
-TOLD_APART = 0.5
-"""Smallest difference of advantages that tells two frames apart."""
+TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
 
 
 def light_warnings(check: LightCheck, lights: StatedLights, *, strict: bool = False) -> list[CaptureWarning]:

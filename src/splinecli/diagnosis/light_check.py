@@ -24,8 +24,7 @@ Array = NDArray[np.float64]
 CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
 
-NEAR = 0.1
-"""Candidates whose advantages differ by less are near equals."""
+NEAR = 0.1  # candidates whose advantages differ by less are near equals
 
 LOWEST_CURL = 0.1
 """Curls below this are noise. On a cap of a sphere, other frames give little more."""

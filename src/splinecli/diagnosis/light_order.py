@@ -29,8 +29,7 @@ from splinecli.diagnosis.light_rings import mend_rings
 
 Array = NDArray[np.float64]
 
-MIN_LIGHTS = 6
-"""Fewer lights leave too few equations to judge their order."""
+MIN_LIGHTS = 6  # fewer lights leave too few equations to judge their order
 
 BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
 """Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
@@ -44,8 +43,7 @@ MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
 MIN_RING_MISFIT, BETTER_RINGS = 0.1, 0.75
 """The same for single rings of a dome, and the largest share of the misfit that is left when they are mended."""
 
-CHANCE = 0.02
-"""An order is wrong if more than this share of random orders fits as well."""
+CHANCE = 0.02  # an order is wrong if more than this share of random orders fits as well
 
 MIN_LIGHTS_FOR_CHANCE = 8
 """Fewer lights fit in too many random orders by chance. They are compared under known intensities, if there are any."""
@@ -62,8 +60,7 @@ UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
 """An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
 could explain: highlights and shadows."""
 
-UNKNOWN_ORDER = "unknown"
-"""The order of the lights does not fit, and no simple other one does."""
+UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
 
 ZENITH = "if their elevations count from the camera axis"
 """The reading of lights whose file has zenith angles in place of elevations, in words."""

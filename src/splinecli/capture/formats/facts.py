@@ -31,11 +31,8 @@ TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP"}
 """The first bytes of the files. Those of a PNG are the longest."""
 
-PILLOW_KINDS = ("BMP", "TGA")
-"""Kinds of files that Pillow reads, of 8 bits and without a transfer curve."""
-
-StoredSize = tuple[tuple[int, ...], int]
-"""The shape (H, W, C) of an image as stored, and the bytes of each number."""
+PILLOW_KINDS = ("BMP", "TGA")  # kinds of files that Pillow reads, of 8 bits and without a transfer curve
+StoredSize = tuple[tuple[int, ...], int]  # shape (H, W, C) of an image as stored, and the bytes of each number
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
 _KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
@@ -46,8 +43,7 @@ _MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF an
 _MOST_PARTS = 10_000
 """Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
 
-_RAW_WHITE = 65_535
-"""The white level of developed RAW files; see decode_raw."""
+_RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
 
 
 @dataclass(frozen=True)

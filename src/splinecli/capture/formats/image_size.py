@@ -91,11 +91,8 @@ _BYTES_OF_RESULTS = 52
 _BYTES_OF_ALBEDO = 52
 """Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
 
-BYTES_OF_SURFACE = 600
-"""Of each pixel of the mask: integration, or the mesh and its files, whichever takes more."""
-
-_IMAGES = 2
-"""Images in memory while they are read; see read_ahead."""
+BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
+_IMAGES = 2  # images in memory while they are read; see read_ahead
 
 
 def common_size(images: Sequence[ImageFacts]) -> StoredSize:

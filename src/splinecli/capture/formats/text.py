@@ -23,14 +23,12 @@ _LINE_END = re.compile(r"\r\n|\r|\n")
 _BYTES_OF_LINE = 20  # at least, on average, in a file of the greatest length: each line takes time and memory
 _FROM_PIPES: dict[Path, bytes] = {}
 
-WordRow = tuple[int, str, list[str]]
-"""The one-based line of a row in its file, this line without comments, and its words."""
+WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
 
 MOST_TEXT = 1_000_000
 """Bytes of the longest text file that is read, unless the images say how long it may be: 14,000 lights."""
 
-DECIMAL_POINT = "A comma separates columns; write decimals with a point"
-"""Hint for a line with decimal commas."""
+DECIMAL_POINT = "A comma separates columns; write decimals with a point"  # hint for a line with decimal commas
 
 
 class Row(NamedTuple):

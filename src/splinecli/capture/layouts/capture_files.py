@@ -16,10 +16,8 @@ from splinecli.errors import InputError
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
-PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)
-"""Suffixes of pictures, such as masks."""
-IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)
-"""Suffixes of images of an object."""
+PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
+IMAGE_SUFFIXES = (*_DEVELOPED, *RAW_SUFFIXES, *_JPEG)  # suffixes of images of an object
 
 _DIGITS = re.compile(r"([0-9]+)")
 

@@ -26,8 +26,7 @@ _WORD = re.compile(r"[a-z]+")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 """Words in the names of pictures that other programs leave beside the photographs."""
 
-_MOST_OTHERS = 0.25
-"""Share of the images up to which names with these words are not those of the photographs."""
+_MOST_OTHERS = 0.25  # share of the images up to which names with these words are not those of the photographs
 
 
 PSBOX_LIGHTS, PSBOX_IMAGES = ("light_directions.txt",), "Objects"

@@ -13,8 +13,7 @@ from splinecli.capture.formats.text import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
 
-Draw = tuple[int, ...]
-"""Zero-based indices of lights in the whole capture."""
+Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
 DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
 """First numbers of the seeds, so that draws, light noise and the choice of pixels are independent."""

@@ -9,11 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FirstLight = Literal["left", "right", "above", "below"]
-"""Side of the image from which a light comes."""
-
-ESTIMATE = "estimate"
-"""Given in place of a light file: the lights are found from the images."""
+FirstLight = Literal["left", "right", "above", "below"]  # side of the image from which a light comes
+ESTIMATE = "estimate"  # given in place of a light file: the lights are found from the images
 
 
 @dataclass(frozen=True, eq=False)

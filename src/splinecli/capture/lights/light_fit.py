@@ -17,8 +17,7 @@ from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_sca
 
 Array = NDArray[np.float64]
 
-LIT_SHARE = 0.1
-"""Observations below this share of a pixel's largest one count as shadow."""
+LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
 
 DARK_SHARES = (0.1, 0.02)
 """Pixels below this share of the brightest hundredth are left out: background. The second counts where too few are left
@@ -26,14 +25,9 @@ by the first, because highlights outshine the object."""
 
 MIN_PIXELS_PER_LIGHT = 10
 
-MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000
-"""Limits of the sample that the factors are found from."""
-
-RANDOM_ORDERS = 250
-"""The number of random orders of the lights that a given order is compared with."""
-
-INTENSITY_PRIOR = 0.01
-"""Weight of equal intensities against those that fit best, where nobody measured them."""
+MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
+RANDOM_ORDERS = 250  # number of random orders of the lights that a given order is compared with
+INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, where nobody measured them
 
 INTENSITY_LIMITS = (0.1, 10.0)
 

@@ -20,8 +20,7 @@ AXIS_WORDS = {
 }
 """What --light-frame takes: the axis of the file and the sign with which it enters."""
 
-EXCHANGED = "exchanged"
-"""The word for files whose first column is y and whose second is x."""
+EXCHANGED = "exchanged"  # word for files whose first column is y and whose second is x
 
 FRAME_WORDS = (*AXIS_WORDS, EXCHANGED)
 
@@ -67,8 +66,7 @@ class LightFrame:
         return LightFrame((x, y, z), exchanged)
 
 
-USUAL_FRAME = LightFrame()
-"""x right, y up, z to the camera, as in docs/files-and-frames.md."""
+USUAL_FRAME = LightFrame()  # x right, y up, z to the camera, as in docs/files-and-frames.md
 
 BOTH_NEGATED = LightFrame((-1, -1, 1))
 

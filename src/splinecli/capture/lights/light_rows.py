@@ -17,8 +17,7 @@ from splinecli.errors import InputError
 LightForm = Literal["xyz", "azel", "slant-tilt"]
 """The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""
 
-RowForm = LightForm | Literal["positions"]
-"""The numbers of a row in a file of lights or of near lamps."""
+RowForm = LightForm | Literal["positions"]  # numbers of a row in a file of lights or of near lamps
 
 COLUMNS: dict[RowForm, dict[int, str]] = {
     "xyz": {3: "x y z"},

@@ -24,13 +24,11 @@ from splinecli.maths.normals import angle_between_deg, unit
 
 Array = NDArray[np.float64]
 
-LIGHT_ERROR_DEG = 5.0
-"""Usual error of a rough direction."""
+LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
 
 LARGEST_LIGHT_ERROR_DEG = 30.0
 
-MIN_LIGHTS = 6
-"""With fewer lights, an error of a light looks like one of the normals."""
+MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like one of the normals
 
 BETTER_FIT = 0.7
 """Refined lights are taken if the median residual falls below this share of that under the given lights. On rendered
@@ -44,8 +42,7 @@ ROUGH_MISFIT = 0.04
 """Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to be
 suggested. Few matte or shiny captures with exact lights have more."""
 
-INTENSITY_ERROR = 0.15
-"""Standard deviation of intensities that nobody measured, in the prior."""
+INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
 
 _MAX_PIXELS = 2000
 _MIN_PIXELS = 100

@@ -22,23 +22,18 @@ from splinecli.errors import InputError, UsageError
 
 Origin = Literal["given", "file", "images", "full scale"]
 
-FEWEST_IMAGES = 3
-"""An image counts as clipped at the common maximum only if at least this many images reach it..."""
-
-FEWEST_IMAGES_AT_BITS = 2
-"""... or this many, if the maximum is the largest number of 8 to 15 bits."""
+FEWEST_IMAGES = 3  # an image counts as clipped at the common maximum only if so many images reach it
+FEWEST_IMAGES_AT_BITS = 2  # or this many, if the maximum is the largest number of 8 to 15 bits
 
 FEWEST_PIXELS, SMALLEST_SHARE = 3, 1e-4
 """An image reaches the maximum at no fewer pixels, and at no smaller share of the pixels."""
 
-COMPARED_VALUES = 16
-"""The number of different values below the maximum whose observations are counted."""
+COMPARED_VALUES = 16  # number of different values below the maximum whose observations are counted
 
 LOWEST_COMPARED = 0.5
 """They must not be smaller than this share of the maximum: clipping cuts through a continuous range of values."""
 
-SPIKE = 5
-"""The maximum occurs at least this many times as often as any of the compared values."""
+SPIKE = 5  # the maximum occurs at least this many times as often as any of the compared values
 
 _BLOCK, _NEAR = 1 << 20, 1 << 10
 _FULL_SCALE_16_BIT = 65_535
