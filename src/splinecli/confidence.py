@@ -119,18 +119,12 @@ class CaptureFeatures(NamedTuple):
 
 @dataclass(frozen=True)
 class PixelScale:
-    """What relates pixels to their capture.
+    """What relates pixels to their capture."""
 
-    Args:
-        bright: brightness of a bright pixel.
-        middle: row and column of the middle of the object. width: of the object, in pixels.
-        turning: (3, 3, 2), the turn of a normal by near lamps, over the normal and the place.
-    """
-
-    bright: float
-    middle: tuple[float, float]
-    width: float
-    turning: Doubles
+    bright: float  # brightness of a bright pixel
+    middle: tuple[float, float]  # row and column of the middle of the object
+    width: float  # of the object, in pixels
+    turning: Doubles  # (3, 3, 2), the turn of a normal by near lamps, over the normal and the place
 
     def features(self, brightness: Floats, normals: Floats, rows: Places, columns: Places) -> Doubles:
         """Return for pixels (n, 2): log of their relative brightness, and of their turn by near lamps in degrees."""

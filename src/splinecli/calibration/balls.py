@@ -37,16 +37,11 @@ _NOT_LIGHTS = NOT_PHOTOGRAPHS | set(REFERENCES)
 
 @dataclass(frozen=True, eq=False)
 class BallFiles:
-    """The files of one ball.
-
-    Args:
-        images: one image for each light, in the order of the lights.
-        reference: an image that shows the outline of the ball, or None.
-    """
+    """The files of one ball."""
 
     folder: Path
-    images: tuple[Path, ...]
-    reference: Path | None
+    images: tuple[Path, ...]  # one image for each light, in the order of the lights
+    reference: Path | None  # an image that shows the outline of the ball, or None
     mask: Path | None
 
     @cached_property
@@ -57,24 +52,16 @@ class BallFiles:
 
 @dataclass(frozen=True, eq=False)
 class BallCalibration:
-    """The light directions from F images of one ball.
-
-    Args:
-        circle_from: the source of the outline: "--circle", "mask" or "picture".
-        highlights: (F,), one for each image.
-        directions: (F, 3) float64, unit vectors; x right, y up, z to the camera.
-        normals: (F, 3), of the ball at the highlights, half-way between the view and the lights.
-        shape: (H, W) of the images.
-    """
+    """The light directions from F images of one ball."""
 
     files: BallFiles
     circle: Circle
-    circle_from: str
-    highlights: tuple[Highlight, ...]
-    directions: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    circle_from: str  # the source of the outline: "--circle", "mask" or "picture"
+    highlights: tuple[Highlight, ...]  # (F,), one for each image
+    directions: NDArray[np.float64]  # (F, 3) float64, unit vectors; x right, y up, z to the camera
+    normals: NDArray[np.float64]  # (F, 3), of the ball at the highlights, half-way between the view and the lights
     view: View
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # (H, W) of the images
 
     @property
     def points(self) -> NDArray[np.float64]:
@@ -84,16 +71,11 @@ class BallCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLights:
-    """The light directions from one or several balls.
-
-    Args:
-        directions: (F, 3) float64, unit vectors: the mean direction of the balls.
-        disagreement_deg: (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a
-            single ball.
-    """
+    """The light directions from one or several balls."""
 
     balls: tuple[BallCalibration, ...]
-    directions: NDArray[np.float64]
+    directions: NDArray[np.float64]  # (F, 3) float64, unit vectors: the mean direction of the balls
+    # (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a single ball
     disagreement_deg: NDArray[np.float64]
 
 

@@ -37,17 +37,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
-    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane.
+    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane."""
 
-    Args:
-        positions: (F, 3).
-        uncertainty: (F,), the distance within which the true position is with CONFIDENCE.
-        pixel_size: the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel.
-    """
-
-    positions: Floats
-    uncertainty: Floats
-    pixel_size: float
+    positions: Floats  # (F, 3)
+    uncertainty: Floats  # (F,), the distance within which the true position is with CONFIDENCE
+    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel
     view: View
 
     @property

@@ -28,16 +28,12 @@ _MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed
 
 @dataclass(frozen=True)
 class Highlight:
-    """The image of a lamp in a mirror ball.
+    """The image of a lamp in a mirror ball."""
 
-    Args:
-        x, y: the centroid, in pixels of the image.
-        saturated: share of its pixels that is saturated, 0 to 1.
-    """
-
+    # x, y: the centroid, in pixels of the image
     x: float
     y: float
-    saturated: float
+    saturated: float  # share of its pixels that is saturated, 0 to 1
 
 
 def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | None = None) -> Highlight:

@@ -33,17 +33,11 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The camera of a calibration.
+    """The camera of a calibration."""
 
-    Args:
-        matrix: (3, 3) in pixels.
-        source: "--camera-matrix", "EXIF" or "assumed distant".
-        shortest: the focal length of the shortest usual lens, in pixels.
-    """
-
-    matrix: Floats
-    source: str
-    shortest: float
+    matrix: Floats  # (3, 3) in pixels
+    source: str  # "--camera-matrix", "EXIF" or "assumed distant"
+    shortest: float  # the focal length of the shortest usual lens, in pixels
 
     @property
     def known(self) -> bool:

@@ -132,21 +132,13 @@ class PixelReader:
 
 @dataclass(frozen=True, eq=False)
 class StoredPixels:
-    """The mask's pixels of one image.
+    """The mask's pixels of one image."""
 
-    Args:
-        path: the image; messages name it.
-        values: (P, C), as stored.
-        linear: (P, C) float32, linear light.
-        intensity: (3,), RGB, of the light.
-        stated_white_level: the white level that the file states; None where it states none.
-    """
-
-    path: Path
-    values: NDArray[Any]
-    linear: NDArray[np.float32]
-    intensity: NDArray[np.float64]
-    stated_white_level: int | None = None
+    path: Path  # the image; messages name it
+    values: NDArray[Any]  # (P, C), as stored
+    linear: NDArray[np.float32]  # (P, C) float32, linear light
+    intensity: NDArray[np.float64]  # (3,), RGB, of the light
+    stated_white_level: int | None = None  # the white level that the file states; None where it states none
 
     def observe(self) -> NDArray[np.float32]:
         """Return observations (P,): each channel is divided by its intensity, then the mean is taken.

@@ -19,17 +19,12 @@ _SMALLEST_SIDE = 8
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Observations on a grid of pixels.
+    """Observations on a grid of pixels."""
 
-    Args:
-        observations: (p, F), linear, divided by the light intensities; pixels of the mask in row-major order.
-        mask: (h, w) bool with p true pixels.
-        step: rows and columns of the images from one pixel of the grid to the next.
-    """
-
+    # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
     observations: NDArray[np.floating]
-    mask: NDArray[np.bool_]
-    step: int
+    mask: NDArray[np.bool_]  # (h, w) bool with p true pixels
+    step: int  # rows and columns of the images from one pixel of the grid to the next
 
 
 def grid_step(mask: NDArray[np.bool_]) -> int:

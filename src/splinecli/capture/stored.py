@@ -28,17 +28,12 @@ class StoredCapture:
 
     `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
     lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
-    level of a choice is decided from its images alone.
+    level of a choice is decided from its images alone."""
 
-    Args:
-        capture: the stored observations, linear, divided by the light intensities that the files give.
-        intensities_known: whether a file, an option or the image format gives the light intensities.
-        found_intensities: (F,), those that were found together with the directions, or None.
-    """
-
-    capture: Capture
+    capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
     saturation: Saturation
-    intensities_known: bool
+    intensities_known: bool  # whether a file, an option or the image format gives the light intensities
+    # (F,), those that were found together with the directions, or None
     found_intensities: NDArray[np.float64] | None = None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:

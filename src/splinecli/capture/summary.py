@@ -26,40 +26,27 @@ NARROW_DEG = 30.0  # a capture whose lights are all nearer than this to the came
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """One image of a capture; only the mask's pixels count.
-
-    Args:
-        shape: (H, W, C) as stored.
-        dtype: as stored, such as "uint16".
-        bright: the 99 % quantile of the values, as a share of the white level. For floating-point images, the
-            quantile itself.
-        saturated: share of the pixels with a channel at the white level or above.
-    """
+    """One image of a capture; only the mask's pixels count."""
 
     path: Path
-    shape: tuple[int, ...]
-    dtype: str
+    shape: tuple[int, ...]  # (H, W, C) as stored
+    dtype: str  # as stored, such as "uint16"
+    # the 99 % quantile of the values, as a share of the white level. For floating-point images, the quantile itself
     bright: float
-    saturated: float
+    saturated: float  # share of the pixels with a channel at the white level or above
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureSummary:
-    """Summary of a capture.
-
-    Args:
-        sample: some of the pixels of all images, on a grid; None where images have different sizes.
-        closeup: every pixel of the middle, or None.
-        lamp_warnings: about near lamps over this mask.
-    """
+    """Summary of a capture."""
 
     source: CaptureSource
     images: tuple[ImageSummary, ...]
     n_pixels: int
     white_level: WhiteLevel | None
-    sample: Sample | None = None
-    closeup: Sample | None = None
-    lamp_warnings: tuple[CaptureWarning, ...] = ()
+    sample: Sample | None = None  # some of the pixels of all images, on a grid; None where images have different sizes
+    closeup: Sample | None = None  # every pixel of the middle, or None
+    lamp_warnings: tuple[CaptureWarning, ...] = ()  # about near lamps over this mask
 
     @property
     def axis_angles_deg(self) -> NDArray[np.float64]:

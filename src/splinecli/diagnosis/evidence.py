@@ -22,30 +22,20 @@ from splinecli.maths.solve_3x3 import solve_each
 
 @dataclass(frozen=True, eq=False)
 class StatedLights:
-    """What files or arguments say about the lights of F images.
-
-    Args:
-        directions: (N, 3), all lights of the file, in its order.
-        indices: (F,), those of the images.
-        intensities_measured: whether the intensities are given.
-        intensities_known: whether they are given, or the user says that they are equal.
-        linear: whether the values of the images are taken as linear.
-        lamps: all near lamps, over the grid of the sample that is checked; None if the lights count as distant.
-        has_positions: whether positions of lamps are known.
-        found: whether the lights were found from these images, so that the images cannot contradict them.
-    """
+    """What files or arguments say about the lights of F images."""
 
     names: Sequence[str]
-    directions: NDArray[np.float64]
-    indices: Sequence[int]
-    intensities_measured: bool
-    intensities_known: bool
+    directions: NDArray[np.float64]  # (N, 3), all lights of the file, in its order
+    indices: Sequence[int]  # (F,), those of the images
+    intensities_measured: bool  # whether the intensities are given
+    intensities_known: bool  # whether they are given, or the user says that they are equal
+    # all near lamps, over the grid of the sample that is checked; None if the lights count as distant
     lamps: NearLamps | None = None
-    has_positions: bool = False
-    found: bool = False
+    has_positions: bool = False  # whether positions of lamps are known
+    found: bool = False  # whether the lights were found from these images, so that the images cannot contradict them
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
-    linear: bool = True
+    linear: bool = True  # whether the values of the images are taken as linear
 
     @classmethod
     def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
@@ -85,21 +75,15 @@ class StatedLights:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A capture as the checks see it; what several of them need is found once.
-
-    Args:
-        sample, closeup: without dark background, not divided by estimated intensities.
-        background: its share.
-        truth: (H, W, 3), the ground truth of the whole images, or None.
-        strict: also warn of what the images do not tell.
-    """
+    """A capture as the checks see it; what several of them need is found once."""
 
     lights: StatedLights
+    # sample, closeup: without dark background, not divided by estimated intensities
     sample: Sample
     closeup: Sample
-    background: float = 0.0
-    truth: NDArray[np.floating] | None = None
-    strict: bool = False
+    background: float = 0.0  # its share
+    truth: NDArray[np.floating] | None = None  # (H, W, 3), the ground truth of the whole images, or None
+    strict: bool = False  # also warn of what the images do not tell
 
     @cached_property
     def directions(self) -> NDArray[np.float64]:

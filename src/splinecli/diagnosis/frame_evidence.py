@@ -26,17 +26,12 @@ _FITS = 5
 
 @dataclass(frozen=True, eq=False)
 class RoughNormals:
-    """Normals on a grid of pixels.
+    """Normals on a grid of pixels."""
 
-    Args:
-        normals: (h, w, 3), unit in the mask, zero outside.
-        mask: (h, w).
-        outward: (h, w, 2), unit vectors in the image, x right and y up, that point out of the mask, at the pixels of
-            the rim; zero elsewhere.
-    """
-
-    normals: Array
-    mask: NDArray[np.bool_]
+    normals: Array  # (h, w, 3), unit in the mask, zero outside
+    mask: NDArray[np.bool_]  # (h, w)
+    # (h, w, 2), unit vectors in the image, x right and y up, that point out of the mask, at the pixels of the rim; zero
+    # elsewhere
     outward: Array
 
     @property

@@ -35,52 +35,35 @@ RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 
 @dataclass(frozen=True)
 class Candidate:
-    """One reading of the light file.
+    """One reading of the light file."""
 
-    Args:
-        name: in words, such as "y negated".
-        frame: its frame, relative to the given one. None where it is an order that no frame stands for.
-        matrix: (3, 3) M, where lights @ M' are those of this reading.
-        curl: of the normals; 0 is a surface.
-        rim: mean cosine between normals and the outward direction at the outline; NaN without a closed outline.
-        steps: by how many lights it shifts the order.
-        advantage: evidence for it against the given lights; from 1 it is better.
-    """
-
-    name: str
-    frame: LightFrame | None
-    matrix: Array = field(compare=False)
-    curl: float
-    rim: float
-    steps: int = 0
-    advantage: float = 0.0
+    name: str  # in words, such as "y negated"
+    frame: LightFrame | None  # its frame, relative to the given one. None where it is an order that no frame stands for
+    matrix: Array = field(compare=False)  # (3, 3) M, where lights @ M' are those of this reading
+    curl: float  # of the normals; 0 is a surface
+    rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
+    steps: int = 0  # by how many lights it shifts the order
+    advantage: float = 0.0  # evidence for it against the given lights; from 1 it is better
 
 
 @dataclass(frozen=True)
 class LightCheck:
-    """What the images say about the light directions.
+    """What the images say about the light directions."""
 
-    Args:
-        candidates: readings of the light file; the given one first, then from best to worst.
-        order: the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits.
-        given_misfit, order_misfit: distances between the images and the lights in the given order and in the better
-            one, as shares of the median of random orders; NaN where there are too few lights.
-        best: the reading that gives better normals; None if there is none. Its frame is relative to the given one.
-        tried: readings of the order in words, each with its misfit.
-        outline_counts: how much the normals at the mask's edge count, from 0 to 1.
-        mended: (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no
-            order fits.
-        odd_image: an image that contradicts the others, without which all this was found; None if there is none.
-    """
-
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
+    # the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
     order: str | None
+    # given_misfit, order_misfit: distances between the images and the lights in the given order and in the better one,
+    # as shares of the median of random orders; NaN where there are too few lights
     given_misfit: float
     order_misfit: float
+    # the reading that gives better normals; None if there is none. Its frame is relative to the given one
     best: Candidate | None
-    tried: tuple[tuple[str, float], ...]
-    outline_counts: float
+    tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its misfit
+    outline_counts: float  # how much the normals at the mask's edge count, from 0 to 1
+    # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no order fits
     mended: Array | None
+    # an image that contradicts the others, without which all this was found; None if there is none
     odd_image: OddImage | None = None
 
     @property

@@ -84,28 +84,21 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LightOrder:
-    """The order of lights that fits best.
+    """The order of lights that fits best."""
 
-    Args:
-        order: in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found.
-        lights: (F, 3), in this order.
-        intensities: (F,), those that fit these lights best; ones where only known ones tell the order. They make the
-            normals of metals better.
-        given_misfit, misfit: of the given order and of this one, as shares of random orders'; NaN where there are too
-            few lights.
-        plausible: whether the lights fit well enough for the normals to tell an outline.
-        tried: readings in words, each with its misfit as a share of random orders'.
-        turns: shifts that fit as well. They turn a regular ring of lights.
-    """
-
+    # in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found
     order: str | None
-    lights: Array
+    lights: Array  # (F, 3), in this order
+    # (F,), those that fit these lights best; ones where only known ones tell the order. They make the normals of metals
+    # better
     intensities: Array
+    # given_misfit, misfit: of the given order and of this one, as shares of random orders'; NaN where there are too few
+    # lights
     given_misfit: float = np.nan
     misfit: float = np.nan
-    plausible: bool = True
-    tried: tuple[tuple[str, float], ...] = ()
-    turns: tuple[Turn, ...] = ()
+    plausible: bool = True  # whether the lights fit well enough for the normals to tell an outline
+    tried: tuple[tuple[str, float], ...] = ()  # readings in words, each with its misfit as a share of random orders'
+    turns: tuple[Turn, ...] = ()  # shifts that fit as well. They turn a regular ring of lights
 
 
 class _Reading(NamedTuple):

@@ -37,16 +37,12 @@ OTHER_BRIGHTNESS = 0.3
 
 @dataclass(frozen=True)
 class OddImage:
-    """An image that contradicts the others.
-
-    Args:
-        left: what is left without it of the misfit, or of the residual of the factors, as a share of that of all.
-        brightness: of the image, as a share of what its light would give; None where brightness is not its fault, or
-            the intensity of the light is unknown.
-    """
+    """An image that contradicts the others."""
 
     place: int
-    left: float
+    left: float  # what is left without it of the misfit, or of the residual of the factors, as a share of that of all
+    # of the image, as a share of what its light would give; None where brightness is not its fault, or the intensity of
+    # the light is unknown
     brightness: float | None = None
 
 

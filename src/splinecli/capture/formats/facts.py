@@ -48,17 +48,11 @@ _RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
 
 @dataclass(frozen=True)
 class StatedCurve:
-    """What a file says of its transfer curve.
+    """What a file says of its transfer curve."""
 
-    Args:
-        curve: see TransferCurve; linear where the file says nothing.
-        by: what says so, for people; empty for nothing.
-        unread: whether there is a colour profile whose curve cannot be read.
-    """
-
-    curve: TransferCurve = 1.0
-    by: str = ""
-    unread: bool = False
+    curve: TransferCurve = 1.0  # see TransferCurve; linear where the file says nothing
+    by: str = ""  # what says so, for people; empty for nothing
+    unread: bool = False  # whether there is a colour profile whose curve cannot be read
 
 
 _FILM, _ENCODED = StatedCurve(BT709, "PNG of a film"), StatedCurve(SRGB, "PNG that says so")
@@ -68,25 +62,18 @@ _CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: 
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What the header of an image file states.
-
-    Args:
-        kind: "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them.
-        stated_size: None for a RAW file, and for a damaged one.
-        curve: that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
-        white_level: the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is
-            in the unit of the decoded values: full scale for a RAW file, whatever its tags say.
-        exif: orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads.
-        damage: why the file cannot be read. It is raised when the size is wanted.
-    """
+    """What the header of an image file states."""
 
     path: Path
-    kind: str = ""
-    stated_size: StoredSize | None = None
-    curve: StatedCurve = StatedCurve()
+    kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
+    stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
+    curve: StatedCurve = StatedCurve()  # that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
+    # the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is in the unit of
+    # the decoded values: full scale for a RAW file, whatever its tags say
     white_level: int | None = None
+    # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads
     exif: Mapping[int, Any] | None = field(default_factory=dict)
-    damage: InputError | None = None
+    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is wanted
 
     @cached_property
     def size(self) -> StoredSize:

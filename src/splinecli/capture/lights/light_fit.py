@@ -38,18 +38,14 @@ _FITS = 5
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """The best factors of rank 3 of some observations.
+    """The best factors of rank 3 of some observations."""
 
-    Args:
-        matrix: (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between
-            two such matrices is one between images, as a share of the mean brightness.
-        image_residuals: (F,), the root mean square of what the factors do not explain of each image, in the same unit.
-        intensities_known: whether the observations were divided by measured light intensities.
-    """
-
+    # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
+    # matrices is one between images, as a share of the mean brightness
     matrix: Array
+    # (F,), the root mean square of what the factors do not explain of each image, in the same unit
     image_residuals: Array
-    intensities_known: bool = True
+    intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
     def residual(self) -> float:

@@ -27,15 +27,11 @@ FRAME_WORDS = (*AXIS_WORDS, EXCHANGED)
 
 @dataclass(frozen=True)
 class LightFrame:
-    """The frame of a light file.
+    """The frame of a light file."""
 
-    Args:
-        signs: of x, y and z, 1 for right, up and to the camera, -1 for left, down and away.
-        exchanged: whether the file has y before x. The signs are those of x and y, wherever they stand.
-    """
-
+    # of x, y and z, 1 for right, up and to the camera, -1 for left, down and away
     signs: tuple[int, int, int] = (1, 1, 1)
-    exchanged: bool = False
+    exchanged: bool = False  # whether the file has y before x. The signs are those of x and y, wherever they stand
 
     @property
     def matrix(self) -> NDArray[np.float64]:

@@ -127,14 +127,10 @@ _AXES, _ANGLES = ("x", "y", "z"), ("az", "el")
 
 @dataclass(frozen=True)
 class LightRows:
-    """The rows of a light file.
+    """The rows of a light file."""
 
-    Args:
-        numbers: without a header and without names.
-        names: the name of each row's image, without folders; None where the rows begin with numbers.
-    """
-
-    numbers: NumberRows
+    numbers: NumberRows  # without a header and without names
+    # the name of each row's image, without folders; None where the rows begin with numbers
     names: tuple[str, ...] | None = None
 
 

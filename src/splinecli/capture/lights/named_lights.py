@@ -34,20 +34,13 @@ _FOLDERS = re.compile(r"[/\\]")
 
 @dataclass(frozen=True, eq=False)
 class NamedLights:
-    """F lights, each with the name of its image.
-
-    Args:
-        names: names of the images, without folders.
-        lines: the line of each light in the file; None for each where the file has no lines.
-        directions: (F, 3) float64, unit; x right, y up, z to the camera.
-        intensities: (F, 3) float64, RGB, or None where the file has none.
-    """
+    """F lights, each with the name of its image."""
 
     path: Path
-    names: tuple[str, ...]
-    lines: tuple[int | None, ...]
-    directions: NDArray[np.float64]
-    intensities: NDArray[np.float64] | None = None
+    names: tuple[str, ...]  # names of the images, without folders
+    lines: tuple[int | None, ...]  # the line of each light in the file; None for each where the file has no lines
+    directions: NDArray[np.float64]  # (F, 3) float64, unit; x right, y up, z to the camera
+    intensities: NDArray[np.float64] | None = None  # (F, 3) float64, RGB, or None where the file has none
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".

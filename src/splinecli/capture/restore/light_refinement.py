@@ -57,17 +57,12 @@ _CONVERGED = 1e-4
 
 
 class LightFit(NamedTuple):
-    """Lights that fit the images best near given ones.
+    """Lights that fit the images best near given ones."""
 
-    Attributes:
-        directions: (F, 3), unit.
-        intensities: (F,), relative to those of the observations.
-        before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
-            observation.
-    """
-
-    directions: Array
-    intensities: Array
+    directions: Array  # (F, 3), unit
+    intensities: Array  # (F,), relative to those of the observations
+    # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
+    # observation
     before: float
     after: float
 

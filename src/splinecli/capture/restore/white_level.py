@@ -62,43 +62,28 @@ _NOTHING = np.empty(0, np.int64)
 
 
 class ImageValues(NamedTuple):
-    """What decides whether observations of one image are saturated.
+    """What decides whether observations of one image are saturated."""
 
-    Attributes:
-        full_scale: the largest value that the file can store; None for floating-point images.
-        stated: the white level that the file states; None where it states none.
-        saturated: the pixels at the given white level or above, or at full scale where none is given.
-        maximum: the largest value of a 16-bit image; 0 for other images.
-        at_maximum: the pixels with this value.
-        below: the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED.
-        counts: how often each of these values occurs.
-    """
-
-    full_scale: int | None
-    stated: int | None
-    saturated: NDArray[np.integer]
-    maximum: int = 0
-    at_maximum: NDArray[np.integer] = _NOTHING
+    full_scale: int | None  # the largest value that the file can store; None for floating-point images
+    stated: int | None  # the white level that the file states; None where it states none
+    saturated: NDArray[np.integer]  # the pixels at the given white level or above, or at full scale where none is given
+    maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
+    at_maximum: NDArray[np.integer] = _NOTHING  # the pixels with this value
+    # the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED
     below: NDArray[np.int64] = _NOTHING
-    counts: NDArray[np.int64] = _NOTHING
+    counts: NDArray[np.int64] = _NOTHING  # how often each of these values occurs
 
 
 @dataclass(frozen=True, eq=False)
 class Saturation:
-    """The white level of some images and their saturated observations, decided from these images alone.
+    """The white level of some images and their saturated observations, decided from these images alone."""
 
-    Args:
-        n_pixels: P, the number of the mask's pixels.
-        given: the white level that the user gave; None to find it.
-        rows: the pixels whose observations are wanted; None for all. The level is decided from all pixels.
-        even: whether the images show an even target, of which one image may be clipped, and all of it.
-    """
-
-    n_pixels: int
+    n_pixels: int  # P, the number of the mask's pixels
     images: tuple[ImageValues, ...]
-    given: float | None = None
+    given: float | None = None  # the white level that the user gave; None to find it
+    # the pixels whose observations are wanted; None for all. The level is decided from all pixels
     rows: NDArray[np.integer] | None = None
-    even: bool = False
+    even: bool = False  # whether the images show an even target, of which one image may be clipped, and all of it
 
     @property
     def white_level(self) -> WhiteLevel | None:
