@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
 from splinecli.calibration.view import View, find_view, unit_rays
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import read_image, read_mask, to_linear
+from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
 from splinecli.capture.layouts.capture_files import (
     FILENAMES,
     MASK,

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import to_linear
+from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError

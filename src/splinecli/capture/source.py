@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
 from splinecli.capture.formats.damage import stderr_is_apart
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize, check_capture, common_size
-from splinecli.capture.formats.images import read_mask
+from splinecli.capture.formats.images import decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.lights.found_lights import LightFinder

@@ -22,10 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
-from splinecli.capture.formats.decoding import decode_image, decode_with_alpha
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, check_vectors
-from splinecli.capture.formats.images import cut_out, read_mask
+from splinecli.capture.formats.images import cut_out, decode_image, decode_with_alpha, read_mask
 from splinecli.capture.formats.matlab import read_mat
 from splinecli.capture.formats.text import MOST_TEXT, check_length, read_number_rows
 from splinecli.capture.paths import StrPath, check_file
