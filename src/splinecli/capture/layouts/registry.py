@@ -28,7 +28,6 @@ from splinecli.capture.layouts.capture_files import (
 from splinecli.capture.paths import StrPath, is_folder
 from splinecli.errors import InputError
 
-
 _WORD = re.compile(r"[a-z]+")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 """Words in the names of pictures that other programs leave beside the photographs."""
