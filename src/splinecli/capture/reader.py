@@ -9,13 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.capture_warnings import (
-    AMBIENT_SUBTRACTED,
-    EXIF_ORIENTATION,
-    IMAGES_LEFT_OUT,
-    LIGHTS_MATCHED,
-    CaptureWarning,
-)
+from splinecli.capture import capture_warnings as codes
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.exif import UPRIGHT, check_exposures, common_orientation
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overrides, find_named
@@ -112,12 +107,12 @@ def open_capture(
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
         text = f"{files.ambient.name} was subtracted from all images as ambient light."
-        warnings.append(CaptureWarning(AMBIENT_SUBTRACTED, text))
+        warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
     if files.others:
         more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
         text = f"{files.others[0].name}{more}: left out, because the name says that it is no photograph under one of"
         text += " the lights. To use it, list all images in filenames.txt."
-        warnings.append(CaptureWarning(IMAGES_LEFT_OUT, text))
+        warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     radiometry, of_curve = radiometry.with_stated_curve(facts)
     warnings += of_curve
     # Earlier versions read such images as linear, or those with a colour profile as sRGB.
@@ -128,7 +123,7 @@ def open_capture(
             f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
             " results are in the frame of the stored pixels."
         )
-        warnings.append(CaptureWarning(EXIF_ORIENTATION, text))
+        warnings.append(CaptureWarning(codes.EXIF_ORIENTATION, text))
     return CaptureSource(
         files,
         facts,
@@ -189,10 +184,10 @@ def _read_lights(
     warnings = []
     if len(images) < len(files.images):
         text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out."
-        warnings.append(CaptureWarning(IMAGES_LEFT_OUT, text))
+        warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     if how != "name":
         text = f"The lights of {path.name} were matched to the images by {how}."
-        warnings.append(CaptureWarning(LIGHTS_MATCHED, text))
+        warnings.append(CaptureWarning(codes.LIGHTS_MATCHED, text))
     return replace(files, images=images), lights.directions, lights.intensities, warnings
 
 

@@ -11,13 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.capture_warnings import (
-    ENCODED_VALUES,
-    GROUND_TRUTH_FRAME,
-    GROUND_TRUTH_Z,
-    LAMPS_NEAR,
-    CaptureWarning,
-)
+from splinecli.capture import capture_warnings as codes
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.light_frames import PLANE_FRAMES, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.robust_fit import fit_robustly, fit_scaled_normals, lit_rows, shade
@@ -71,7 +66,7 @@ def encoded_values(sample: Sample, light_directions: Array) -> list[CaptureWarni
         f" linear (what the lights cannot explain falls to {100 * after / before:.0f} %). Add --transfer srgb or"
         " --transfer gamma:2.2."
     )
-    return [CaptureWarning(ENCODED_VALUES, text)]
+    return [CaptureWarning(codes.ENCODED_VALUES, text)]
 
 
 def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
@@ -84,7 +79,7 @@ def near_lamps(sample: Sample, light_directions: Array) -> list[CaptureWarning]:
         f" they leave {100 * near[1]:.0f} % of the misfit. Measure the distance and the width of the object, or try"
         f" --light-distance {near[0]:.1f} --object-width 1."
     )
-    return [CaptureWarning(LAMPS_NEAR, text)]
+    return [CaptureWarning(codes.LAMPS_NEAR, text)]
 
 
 def check_ground_truth(
@@ -107,12 +102,13 @@ def check_ground_truth(
     best = int(np.argmin(angles))
     if angles[0] <= MIN_ANGLE_DEG or angles[best] > MOST_LEFT * angles[0]:
         return []
-    frame, lights = _FRAMES[best], ", or the light directions are in another frame than it"
-    code = GROUND_TRUTH_Z if frame.signs[2] < 0 else GROUND_TRUTH_FRAME
+    frame = _FRAMES[best]
+    code, lights = codes.GROUND_TRUTH_FRAME, ", or the light directions are in another frame than it"
+    if frame.signs[2] < 0:
+        code, lights = codes.GROUND_TRUTH_Z, ""
     text = (
         f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but {angles[best]:.0f} degrees"
-        f" with {frame.describe()}: it is probably in this frame{'' if code == GROUND_TRUTH_Z else lights}, so the"
-        " errors mean nothing."
+        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean nothing."
     )
     return [CaptureWarning(code, text)]
 

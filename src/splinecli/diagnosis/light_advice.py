@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture.capture_warnings import LIGHT_FRAME, LIGHT_ORDER, LIGHTS_UNCHECKED, CaptureWarning
+from splinecli.capture import capture_warnings as codes
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, LightFrame
 from splinecli.diagnosis.evidence import StatedLights
 from splinecli.diagnosis.light_check import Candidate, LightCheck
@@ -25,14 +26,14 @@ def light_warnings(check: LightCheck, lights: StatedLights, *, strict: bool = Fa
     frame, light_file = lights.frame, lights.origin
     warnings = []
     if check.order is not None:
-        code = LIGHT_FRAME if check.order == ZENITH else LIGHT_ORDER
+        code = codes.LIGHT_FRAME if check.order == ZENITH else codes.LIGHT_ORDER
         warnings.append(CaptureWarning(code, _order_text(check, light_file)))
     if check.best is not None:
-        code = LIGHT_FRAME if check.best.frame is not None else LIGHT_ORDER
+        code = codes.LIGHT_FRAME if check.best.frame is not None else codes.LIGHT_ORDER
         warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file)))
     if strict and check.unchecked:
         text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
-        warnings.append(CaptureWarning(LIGHTS_UNCHECKED, text))
+        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
     return warnings
 
 

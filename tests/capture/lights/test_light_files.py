@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splinecli.capture import read_light_directions, read_light_intensities
-from splinecli.capture.lights.light_files import read_light_directions
 from splinecli.capture.lights.named_lights import NamedLights, read_lights
 from splinecli.errors import InputError
 
