@@ -70,17 +70,7 @@ def read_light_table(path: Path, n_images: int | None, form: RowForm) -> LightRo
 
 def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
-    table, vectors, transposed = _vectors(table, n_images, form)
-    if form in ("azel", "slant-tilt"):
-        check_angles(table, form)
-        vectors = directions_from_angles(vectors, form)
-    return unit_directions(
-        vectors @ frame.matrix.T + 0.0,  # no -0
-        table.path,
-        [table.rows[2 if transposed else light].line for light in range(len(vectors))],
-        [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))],
-        of_lamps=form == "positions",
-    )
+    return _lights_of(table, n_images, frame, form)[1]
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
@@ -91,7 +81,7 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
             rows that name their images.
     """
     rows = read_light_table(Path(path), n_images, "positions")
-    directions_of(rows.numbers, n_images, frame, "positions")
+    positions, _ = _lights_of(rows.numbers, n_images, frame, "positions")
     if rows.names is not None:
         raise InputError(
             f"found the name {rows.names[0]!r}, expected x y z",
@@ -99,16 +89,25 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
             line=rows.numbers.rows[0].line,
             hint="Positions have a line for each image, in the order of the images",
         )
-    return np.asarray(_vectors(rows.numbers, n_images, "positions")[1] @ frame.matrix.T)
+    return positions
 
 
-def _vectors(table: NumberRows, n_images: int | None, form: RowForm) -> tuple[NumberRows, NDArray[np.float64], bool]:
-    """Return the table without counts, its vectors or angles, and whether the file has one light in each column."""
+def _lights_of(
+    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length."""
     table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
     if form == "xyz":
         refuse_angles(table)
     what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
-    return table, *_one_light_a_row(table, COLUMNS[form], what, n_images)
+    vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
+    if form in ("azel", "slant-tilt"):
+        check_angles(table, form)
+        vectors = directions_from_angles(vectors, form)
+    vectors = vectors @ frame.matrix.T + 0.0  # no -0
+    lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
+    places = [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))]
+    return vectors, unit_directions(vectors, table.path, lines, places, of_lamps=form == "positions")
 
 
 def unit_directions(

@@ -22,8 +22,6 @@ AXIS_WORDS = {
 
 EXCHANGED = "exchanged"  # word for files whose first column is y and whose second is x
 
-FRAME_WORDS = (*AXIS_WORDS, EXCHANGED)
-
 
 @dataclass(frozen=True)
 class LightFrame:
@@ -87,9 +85,8 @@ def parse_light_frame(text: str | None) -> LightFrame:
             exchanged = True
             continue
         if word not in AXIS_WORDS:
-            raise UsageError(
-                f"--light-frame is {text!r}; expected words of {', '.join(FRAME_WORDS)}, separated by commas"
-            )
+            words = ", ".join((*AXIS_WORDS, EXCHANGED))
+            raise UsageError(f"--light-frame is {text!r}; expected words of {words}, separated by commas")
         axis, sign = AXIS_WORDS[word]
         if axis in signs:
             raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} comes twice", hint="Leave one out")

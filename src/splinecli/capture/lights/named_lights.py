@@ -7,7 +7,6 @@ the folder are matched to them by base name, then by name without suffix, then b
 from __future__ import annotations
 
 import json
-import re
 import reprlib
 import sys
 from collections.abc import Callable, Sequence
@@ -29,7 +28,6 @@ Array = NDArray[np.float64]
 
 SUFFIXES = (".lp", ".json")
 _MOST_DIGITS = 9  # of the number of lights
-_FOLDERS = re.compile(r"[/\\]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +152,7 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
                 path=path,
                 hint="Calibrate for distant lights, one direction a light",
             )
-        names.append(_FOLDERS.split(str(light.get("viewId", number)))[-1])
+        names.append(image_name(str(light.get("viewId", number)), []))
         vectors.append(_three_numbers(light, "direction", number, path))
         if "intensity" in light:
             intensities.append(_three_numbers(light, "intensity", number, path))
