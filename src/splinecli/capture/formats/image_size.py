@@ -15,6 +15,15 @@ from splinecli.capture.formats.facts import ImageFacts, StoredSize
 from splinecli.errors import InputError
 from splinecli.system.memory import LARGEST_IMAGE, available_memory
 
+_BYTES_OF_RESULTS = 52
+"""Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
+
+_BYTES_OF_ALBEDO = 52
+"""Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
+
+BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
+_IMAGES = 2  # images in memory while they are read; see read_ahead
+
 
 @dataclass(frozen=True)
 class ExpectedSize:
@@ -83,16 +92,6 @@ def _size(shape: tuple[int, ...]) -> str:
 
 def _gigabytes(n_bytes: float) -> str:
     return f"{n_bytes / 1e9:.1f} GB"
-
-
-_BYTES_OF_RESULTS = 52
-"""Of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are needed for a while."""
-
-_BYTES_OF_ALBEDO = 52
-"""Of each pixel of the mask: the colours of two images, sums and the map; one for each light comes on top."""
-
-BYTES_OF_SURFACE = 600  # of each pixel of the mask: integration, or the mesh and its files, whichever takes more
-_IMAGES = 2  # images in memory while they are read; see read_ahead
 
 
 def common_size(images: Sequence[ImageFacts]) -> StoredSize:

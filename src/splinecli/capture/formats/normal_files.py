@@ -1,4 +1,4 @@
-"""Normal maps and ground truth from .mat, .npy, text and picture files.
+"""Normal maps and ground truth from .mat, .npy, text and picture files; depth maps, such as those of scanners.
 
 Frame: x right, y up, z to the camera. A file is one of
 
@@ -8,7 +8,8 @@ Frame: x right, y up, z to the camera. A file is one of
 - a picture: n = 2 v / full scale - 1, black or mid-gray where there is no normal; a floating-point TIFF contains n
   itself.
 
-Vectors are scaled to unit length. Zero and non-finite vectors are no normals.
+Vectors are scaled to unit length. Zero and non-finite vectors are no normals. Depth maps are floating-point .npy, TIFF
+and OpenEXR files.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from splinecli.errors import InputError
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
 from splinecli.system.extras import import_extra
 
+_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")  # of a depth
 _GROUND_TRUTH_SUFFIXES = (".mat", ".npy", ".txt", ".png", ".tif", ".tiff")
 
 _CLEARLY_BETTER = 0.02  # share of the mask's pixels
@@ -206,9 +208,6 @@ def _check_lengths(stored: NDArray[Any], mask: NDArray[np.bool_], path: Path) ->
             path=path,
             hint="If the background is not black, give a mask",
         )
-
-
-_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA")
 
 
 def read_depth(path: Path, expected: ExpectedSize) -> NDArray[np.float64]:
