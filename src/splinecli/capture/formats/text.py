@@ -152,9 +152,9 @@ def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int =
     """
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
-    commas = uses_decimal_commas([text for _, text in content if text], n_numbers)
-    rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
-    return [row for row in rows if row[2]]
+    content = [(line, text) for line, text in content if text.strip(" ,;")]
+    commas = uses_decimal_commas([text for _, text in content], n_numbers)
+    return [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
 
 
 def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
