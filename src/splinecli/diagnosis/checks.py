@@ -16,8 +16,7 @@ from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
 from splinecli.diagnosis.evidence import Evidence, StatedLights
 from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
-from splinecli.diagnosis.light_advice import light_warnings
-from splinecli.diagnosis.light_check import LightCheck
+from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg
 
@@ -62,6 +61,10 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         " the object. Photograph it again, or leave it out."
     )
     return [CaptureWarning(codes.IMAGE_ODD, text)]
+
+
+def doubted_lights(seen: Evidence) -> list[CaptureWarning]:
+    return light_warnings(seen.light_check, seen.lights.origin, seen.lights.frame, strict=seen.strict)
 
 
 def missing_mask(seen: Evidence) -> list[CaptureWarning]:
@@ -145,7 +148,7 @@ EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (shifted_images, frozenset()),
     (odd_image, frozenset()),
-    (lambda seen: light_warnings(seen.light_check, seen.lights, strict=seen.strict), frozenset()),
+    (doubted_lights, frozenset()),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (same_images, frozenset()),
