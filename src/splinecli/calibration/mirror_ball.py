@@ -30,8 +30,7 @@ _MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed
 class Highlight:
     """The image of a lamp in a mirror ball."""
 
-    # x, y: the centroid, in pixels of the image
-    x: float
+    x: float  # of the centroid, in pixels of the image
     y: float
     saturated: float  # share of its pixels that is saturated, 0 to 1
 

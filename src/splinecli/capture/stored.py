@@ -28,7 +28,8 @@ class StoredCapture:
 
     `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
     lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
-    level of a choice is decided from its images alone."""
+    level of a choice is decided from its images alone.
+    """
 
     capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
     saturation: Saturation
@@ -79,11 +80,7 @@ class StoredCapture:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
         if self.intensities_known or self.found_intensities is not None:
             return self.found_intensities
-        return estimate_light_intensities(
-            self.capture.observations,
-            self.saturation.flags,
-            self.capture.light_directions if self.capture.lamps is None else self._lights_of,
-        )
+        return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)
 
     def restore(self, intensities: NDArray[np.float64] | None) -> Capture:
         """Return the capture with its intensities divided out and its saturated observations restored.
