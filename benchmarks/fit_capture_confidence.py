@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.confidence.features import capture_features
+from splinecli.confidence import capture_features
 from splinecli.light.indirect_light import PixelPlaces
 from splinecli.light.lamp_light import LampLight, Rows
 from splinecli.methods.estimator import CONFIDENT_DEG
@@ -76,7 +75,7 @@ def read_examples(folder: Path) -> Iterator[Example]:
             pixels = features[1].features(observations[rows].mean(axis=1), normals[rows], *places)
             yield Example(
                 f"{found['kind']}{', pixelwise' if name else ''}", int(found["scene"]), torch.from_numpy(errors[rows]),
-                torch.from_numpy(pixels).float(), torch.tensor(astuple(features[0])).float(),
+                torch.from_numpy(pixels).float(), torch.tensor(features[0]).float(),
                 torch.from_numpy(found[f"{name}error_deg"][rows]),
             )  # fmt: skip
 

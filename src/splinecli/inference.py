@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.confidence.correction import add_light_error, correct_errors
+from splinecli.confidence import add_light_error, correct_errors
 from splinecli.errors import SplinecliError
 from splinecli.light.indirect_light import IndirectLight, find_indirect_light
 from splinecli.light.lamp_light import LampLight, Rows, parts_of_rows

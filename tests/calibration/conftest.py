@@ -7,17 +7,21 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import spiral_lights
+from splinecli.maths.normals import unit
 
 Render = Callable[..., NDArray[np.float32]]
 
 
 @pytest.fixture
 def render_ball() -> Render:
-    """A mirror ball (H, W) before a gray wall, 3 x 3 samples a pixel: a lamp of 2 degrees, a dim room around it."""
+    """A mirror ball (H, W) before a gray wall, 3 x 3 samples a pixel: a lamp of 2 degrees, a dim room around it.
+
+    The lamp is in a direction, or at a position in pixels from the middle of the image.
+    """
 
     def render(
         light: NDArray[np.float64], x: float = 103.3, y: float = 88.7, radius: float = 61.4,
-        shape: tuple[int, int] = (180, 210), lamp: float = 30.0,
+        shape: tuple[int, int] = (180, 210), lamp: float = 30.0, *, near: bool = False,
     ) -> NDArray[np.float32]:  # fmt: skip
         height, width = shape
         offsets = (np.arange(3) - 1) / 3
@@ -29,7 +33,11 @@ def render_ball() -> Render:
         # The ray from the camera, (0, 0, -1), mirrored.
         mirrored = np.stack((2 * nz * nx, 2 * nz * ny, 2 * nz**2 - 1), axis=-1)
         room = 0.02 + 0.01 * mirrored[..., 1]
-        values = np.where(mirrored @ light > np.cos(np.radians(2)), lamp, room)
+        towards = light
+        if near:
+            centre = np.array((x - (width - 1) / 2, (height - 1) / 2 - y, 0))
+            towards = unit(light - centre - radius * np.stack((nx, ny, nz), axis=-1))
+        values = np.where((mirrored * towards).sum(axis=-1) > np.cos(np.radians(2)), lamp, room)
         values = np.where(inside, values, 0.15)
         picture = values.reshape(height, 3, width, 3).mean(axis=(1, 3))
         return np.asarray(picture, np.float32)

@@ -1,5 +1,6 @@
 """Positions of lamps from mirror balls: the oracle is the law of reflection under a lamp of known position."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,26 +17,9 @@ from splinecli.calibration.report import calibration_report, summary_lines
 from splinecli.calibration.view import DISTANT, SHORTEST_LENS, View
 from splinecli.maths.normals import unit
 
+Render = Callable[..., NDArray[np.float32]]
 SHAPE = 160, 400
 BALLS = Circle(70, 90, 60), Circle(320, 75, 60)
-
-
-def photograph(circle: Circle, lamp: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A mirror ball under a lamp of 2 degrees at a position in pixels from the middle of the image, 3 x 3 samples."""
-    height, width = SHAPE
-    offsets = (np.arange(3) - 1) / 3
-    rows, cols = ((np.arange(size)[:, None] + offsets).ravel() for size in SHAPE)
-    nx, ny = np.meshgrid((cols - circle.x) / circle.radius, (circle.y - rows) / circle.radius)
-    inside = nx**2 + ny**2 < 1
-    nz = np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))
-    normals = np.stack((nx, ny, nz), axis=-1)
-    centre = np.array((circle.x - (width - 1) / 2, (height - 1) / 2 - circle.y, 0))
-    mirrored = 2 * nz[..., None] * normals - (0, 0, 1)
-    towards = unit(lamp - centre - circle.radius * normals)
-    lit = (mirrored * towards).sum(axis=-1) > np.cos(np.radians(2))
-    values = np.where(inside, np.where(lit, 30.0, 0.02), 0.15)
-    picture = values.reshape(height, 3, width, 3).mean(axis=(1, 3))
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 
 
 def lamps(distance: float) -> NDArray[np.float64]:
@@ -43,7 +27,9 @@ def lamps(distance: float) -> NDArray[np.float64]:
     return distance * spiral_lights(6, 50, 15)
 
 
-def calibrate(folder: Path, positions: NDArray[np.float64], *, known: bool = True) -> list[BallCalibration]:
+def calibrate(
+    folder: Path, render_ball: Render, positions: NDArray[np.float64], *, known: bool = True
+) -> list[BallCalibration]:
     """The balls, with the matrix of a camera that is far away or without one."""
     matrix = folder / "matrix.txt"
     np.savetxt(matrix, ((1e6, 0, 199.5), (0, 1e6, 79.5), (0, 0, 1)))
@@ -51,7 +37,8 @@ def calibrate(folder: Path, positions: NDArray[np.float64], *, known: bool = Tru
     for name, circle in zip("ab", BALLS, strict=True):
         (folder / name).mkdir(parents=True)
         for number, lamp in enumerate(positions):
-            cv2.imwrite(str(folder / name / f"{number}.png"), photograph(circle, lamp))
+            picture = render_ball(lamp, circle.x, circle.y, circle.radius, SHAPE, near=True)
+            cv2.imwrite(str(folder / name / f"{number}.png"), np.rint(picture.clip(0, 1) * 255).astype(np.uint8))
         balls.append(
             calibrate_ball(find_ball_files(folder / name), circle=circle, camera_matrix=matrix if known else None)
         )
@@ -115,7 +102,7 @@ def photographed(
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)
         circle = Circle(float(x), float(y), radius, points=outline)
-        marks = tuple(Highlight(*point, 9, 0.0) for point in highlights.tolist())
+        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())
         files = BallFiles(Path("ball"), (), None, None)
         balls.append(BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS))
     return places, balls
@@ -144,9 +131,9 @@ def test_the_uncertainty_covers_the_error(source: str) -> None:
         assert np.mean(errors) < 0.03
 
 
-def test_two_balls_give_positions(tmp_path: Path) -> None:
+def test_two_balls_give_positions(tmp_path: Path, render_ball: Render) -> None:
     """Two balls 250 pixels apart, and lamps 1,200 pixels away: about five times as far."""
-    balls = calibrate(tmp_path, lamps(1200.0))
+    balls = calibrate(tmp_path, render_ball, lamps(1200.0))
     found = triangulate_lamps(balls, ball_diameter=40.0)
     assert found is not None and found.known
     assert found.pixel_size == pytest.approx(40 / 120)
@@ -162,9 +149,9 @@ def test_two_balls_give_positions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_lamps_without_positions(tmp_path: Path, known: bool) -> None:
+def test_lamps_without_positions(tmp_path: Path, render_ball: Render, known: bool) -> None:
     """Distant lamps, and near ones that an unknown camera photographs."""
-    balls = calibrate(tmp_path, lamps(1e6 if known else 1500.0), known=known)
+    balls = calibrate(tmp_path, render_ball, lamps(1e6 if known else 1500.0), known=known)
     found = triangulate_lamps(balls)
     assert found is not None and not found.known
     report = calibration_report(combine_balls(balls), None, None, picture="calibration.png", lamps=found)

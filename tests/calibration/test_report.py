@@ -23,7 +23,7 @@ def turned(directions: NDArray[np.float64], degrees: float) -> NDArray[np.float6
 
 def ball(directions: NDArray[np.float64], circle: Circle | None = None) -> BallCalibration:
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
-    highlights = tuple(Highlight(1.23456, 2.0, 9, 0.25) for _ in directions)
+    highlights = tuple(Highlight(1.23456, 2.0, 0.25) for _ in directions)
     return BallCalibration(
         files,
         circle or Circle(50, 40, 30),

@@ -10,8 +10,8 @@ import tifffile
 from PIL import Image
 
 from scenes import BUMP_LAMPS, write_bump
-from splinecli.capture.capture_size import results_bytes
 from splinecli.capture.formats import image_size
+from splinecli.capture.formats.image_size import results_bytes
 from splinecli.maths.normals import encode_picture
 
 SHAPE = (40, 50)

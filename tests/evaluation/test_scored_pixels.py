@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splinecli.capture import Capture
-from splinecli.capture.restore.white_level import SaturationFinder
+from splinecli.capture.restore.white_level import Saturation
 from splinecli.capture.stored import StoredCapture
 from splinecli.evaluation.trial_capture import scored_rows
 
@@ -27,11 +27,7 @@ def test_pixels_without_ground_truth_go(capture: Capture) -> None:
     wanted[:, 3:5] = False
     rows = scored_rows(capture)
     np.testing.assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
-    kept = (
-        StoredCapture(capture, SaturationFinder(capture.n_pixels, 3).finish(), intensities_known=True)
-        .choose_pixels(rows)
-        .capture
-    )
+    kept = StoredCapture(capture, Saturation(capture.n_pixels, ()), intensities_known=True).choose_pixels(rows).capture
     np.testing.assert_array_equal(kept.mask, wanted)
     np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
     assert kept.light_indices == (4, 7, 9)

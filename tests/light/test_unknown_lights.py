@@ -9,7 +9,7 @@ from scenes import cap_directions, shade, sphere, sphere_cap
 from splinecli import estimate_normals
 from splinecli.capture.capture_warnings import ESTIMATED_LIGHTS
 from splinecli.capture.restore.light_refinement import fit_near
-from splinecli.confidence.correction import add_light_error
+from splinecli.confidence import add_light_error
 from splinecli.errors import InputError, UsageError
 from splinecli.light.outline import outline_share, turn_at_outline
 from splinecli.light.unknown_lights import find_lights

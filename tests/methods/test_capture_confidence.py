@@ -1,6 +1,6 @@
 """The confidence falls where a capture as a whole contradicts its lights or its values."""
 
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture
-from splinecli.confidence.features import CaptureFeatures, capture_features
+from splinecli.confidence import CaptureFeatures, capture_features
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.light.lamp_light import LampLight
 from splinecli.maths.normals import unit
@@ -90,17 +90,17 @@ def test_the_order_of_lights_and_the_exposure_do_not_count() -> None:
     order = np.random.default_rng(3).permutation(capture.n_lights)
     other = capture.choose_lights(order.tolist())
     other = replace(other, observations=other.observations * np.float32(37))
-    np.testing.assert_allclose(astuple(features(other)), astuple(features(capture)), atol=1e-4)
+    np.testing.assert_allclose(features(other), features(capture), atol=1e-4)
 
 
 def test_the_head_takes_as_many_features_as_there_are() -> None:
-    assert len(astuple(features(relief(draw_lights())))) == CAPTURE_FEATURES
+    assert len(features(relief(draw_lights()))) == CAPTURE_FEATURES
 
 
 def test_an_untrained_head_changes_little() -> None:
     errors = torch.tensor([[-2.0, 1.0], [0.0, 0.5]])
     capture = torch.full((CAPTURE_FEATURES,), torch.nan)
-    turn = list(CaptureFeatures.__dataclass_fields__).index("bend_turn")
+    turn = CaptureFeatures._fields.index("bend_turn")
     capture[turn] = np.log(2.0)
     found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), capture)
     added = np.exp(-3.5) + np.radians(0.6 * 2.0)

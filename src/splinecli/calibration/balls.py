@@ -13,12 +13,18 @@ from numpy.typing import NDArray
 from splinecli.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.calibration.mirror_ball import Highlight, ball_centre, check_in_front, find_highlight, reflect
 from splinecli.calibration.view import View, find_view, unit_rays
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts, read_facts
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import read_image, read_mask, to_linear
-from splinecli.capture.layouts.capture_files import FILENAMES, MASK, NOT_PHOTOGRAPHS, find_named
-from splinecli.capture.layouts.image_lists import check_not_empty, list_images, read_image_list
+from splinecli.capture.formats.images import decode_image, read_image, read_mask, to_linear
+from splinecli.capture.layouts.capture_files import (
+    FILENAMES,
+    MASK,
+    NOT_PHOTOGRAPHS,
+    check_not_empty,
+    find_named,
+    list_images,
+    read_image_list,
+)
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -30,18 +36,11 @@ _NOT_LIGHTS = NOT_PHOTOGRAPHS | set(REFERENCES)
 
 @dataclass(frozen=True, eq=False)
 class BallFiles:
-    """The files of one ball.
-
-    Args:
-        folder: the folder of the ball.
-        images: one image for each light, in the order of the lights.
-        reference: an image that shows the outline of the ball, or None.
-        mask: a mask of the ball, or None.
-    """
+    """The files of one ball."""
 
     folder: Path
-    images: tuple[Path, ...]
-    reference: Path | None
+    images: tuple[Path, ...]  # one image for each light, in the order of the lights
+    reference: Path | None  # an image that shows the outline of the ball, or None
     mask: Path | None
 
     @cached_property
@@ -52,27 +51,16 @@ class BallFiles:
 
 @dataclass(frozen=True, eq=False)
 class BallCalibration:
-    """The light directions from F images of one ball.
-
-    Args:
-        files: the files of the ball.
-        circle: the outline of the ball.
-        circle_from: the source of the outline: "--circle", "mask" or "picture".
-        highlights: (F,), one for each image.
-        directions: (F, 3) float64, unit vectors; x right, y up, z to the camera.
-        normals: (F, 3), of the ball at the highlights, half-way between the view and the lights.
-        view: the camera.
-        shape: (H, W) of the images.
-    """
+    """The light directions from F images of one ball."""
 
     files: BallFiles
     circle: Circle
-    circle_from: str
-    highlights: tuple[Highlight, ...]
-    directions: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    circle_from: str  # the source of the outline: "--circle", "mask" or "picture"
+    highlights: tuple[Highlight, ...]  # (F,), one for each image
+    directions: NDArray[np.float64]  # (F, 3) float64, unit vectors; x right, y up, z to the camera
+    normals: NDArray[np.float64]  # (F, 3), of the ball at the highlights, half-way between the view and the lights
     view: View
-    shape: tuple[int, int]
+    shape: tuple[int, ...]  # (H, W) of the images
 
     @property
     def points(self) -> NDArray[np.float64]:
@@ -82,17 +70,11 @@ class BallCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLights:
-    """The light directions from one or several balls.
-
-    Args:
-        balls: the calibration of each ball.
-        directions: (F, 3) float64, unit vectors: the mean direction of the balls.
-        disagreement_deg: (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a
-            single ball.
-    """
+    """The light directions from one or several balls."""
 
     balls: tuple[BallCalibration, ...]
-    directions: NDArray[np.float64]
+    directions: NDArray[np.float64]  # (F, 3) float64, unit vectors: the mean direction of the balls
+    # (F,) float64: the largest angle between the direction of a ball and the mean. Zero for a single ball
     disagreement_deg: NDArray[np.float64]
 
 
@@ -100,7 +82,6 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
     """Return the files of the ball in a folder, with images in natural order or in that of filenames.txt.
 
     Args:
-        folder: the folder of the images.
         mask: a mask that replaces the one in the folder.
 
     Raises:
@@ -128,11 +109,9 @@ def calibrate_ball(
     """Find the outline, the highlights and the light directions of one ball. Only one image is in memory at a time.
 
     Args:
-        files: the files of the ball.
         circle: the outline. None takes it from the mask, from the reference image, or from the mean of all images, in
             this order.
         camera_matrix: a file; None takes the camera from EXIF, or as distant (see find_view).
-        progress: called after each image.
 
     Raises:
         InputError: an image cannot be read, has another size or shows no highlight; or the outline is not found or
@@ -144,11 +123,11 @@ def calibrate_ball(
     view = find_view(files.facts[0], camera_matrix)
     centre = ball_centre(circle.outline, view.matrix)
     highlights, normals, directions = [], [], []
-    expected: ExpectedSize | None = None
+    shape = files.facts[0].size[0][:2]
+    expected = ExpectedSize(shape, files.images[0].name)
     for path in files.images:
         stored = decode_image(path, expected)
-        expected = expected or ExpectedSize(stored.shape, path.name)
-        if not circle.inside(stored.shape[:2]).any():
+        if not circle.inside(shape).any():
             raise InputError("the circle lies outside the image", path=path, hint="--circle is X,Y,R in pixels")
         try:
             highlight = find_highlight(
@@ -166,16 +145,8 @@ def calibrate_ball(
         directions.append(direction[0])
         if progress is not None:
             progress()
-    assert expected is not None  # a ball has images
     return BallCalibration(
-        files,
-        circle,
-        circle_from,
-        tuple(highlights),
-        np.array(directions),
-        np.array(normals),
-        view,
-        (expected.shape[0], expected.shape[1]),
+        files, circle, circle_from, tuple(highlights), np.array(directions), np.array(normals), view, shape
     )
 
 
@@ -222,10 +193,8 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
 
 def _mean_gray(images: Sequence[Path]) -> NDArray[np.float32]:
     """Return the mean (H, W) of the gray values of images."""
-    total: NDArray[np.float32] | None = None
-    for path in images:
-        expected = None if total is None else ExpectedSize(total.shape, images[0].name)
-        gray = read_image(path, expected).mean(axis=2)
-        total = gray if total is None else total + gray
-    assert total is not None
+    total: NDArray[np.float32] = read_image(images[0]).mean(axis=2)
+    expected = ExpectedSize(total.shape, images[0].name)
+    for path in images[1:]:
+        total = total + read_image(path, expected).mean(axis=2)
     return total / np.float32(len(images))

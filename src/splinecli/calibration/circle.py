@@ -29,20 +29,17 @@ _N_SAMPLES = 300  # random triples of points
 
 @dataclass(frozen=True)
 class Circle:
-    """The outline of a ball.
+    """The outline of a ball."""
 
-    Args:
-        x, y, radius: centre and radius, in pixels.
-        spread: rms distance of the outline's points from the circle, in pixels. 0 for a circle that the user gives.
-        visible: share of the outline that the image or mask shows, 0 to 1. 1 for a circle that the user gives.
-        points: (N, 2), the points of the outline; None for a circle that the user gives.
-    """
-
+    # x, y, radius: centre and radius, in pixels
     x: float
     y: float
     radius: float
+    # rms distance of the outline's points from the circle, in pixels. 0 for a circle that the user gives
     spread: float = 0.0
+    # share of the outline that the image or mask shows, 0 to 1. 1 for a circle that the user gives
     visible: float = 1.0
+    # (N, 2), the points of the outline; None for a circle that the user gives
     points: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
 
     @property

@@ -15,7 +15,7 @@ from splinecli.capture.formats.image_size import ExpectedSize
 from splinecli.capture.formats.images import read_mask
 from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
-from splinecli.capture.restore.white_level import SaturationFinder
+from splinecli.capture.restore.white_level import Saturation
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 
@@ -45,7 +45,6 @@ def measure_light_intensities(
             An image called `ambient` in the folder is subtracted.
         light_directions: (F, 3), unit vectors.
         target: a matte ball, or a matte card that faces the camera, with the normal (0, 0, 1).
-        radiometry: how stored values become linear light.
 
     Raises:
         InputError: the numbers of images and lights differ, an image cannot be read or has another size, or the target
@@ -65,13 +64,12 @@ def measure_light_intensities(
         np.ones((n_lights, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
     )
-    finder = SaturationFinder(len(normals), n_lights, even=True)
     rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.int64)
-    values = []
-    for position, image in enumerate(capture.read_pixels(mask, range(n_lights), lambda pixels: pixels)):
-        finder.add(position, image.values, image.path, stated=image.stated_white_level)
+    values, found = [], []
+    for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels):
+        found.append(image.find_saturated(None))
         values.append(image.linear[rows].astype(np.float64))
-    saturated = finder.finish().choose_pixels(rows).flags
+    saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
     cosines = normals[rows] @ light_directions.T
     intensities = np.empty((n_lights, 3))
     for position, path in enumerate(files.images):
@@ -96,11 +94,9 @@ def _target_normals(
     files: BallFiles, shape: tuple[int, ...], target: Target
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
-    mask = (
-        np.ones(shape, np.bool_)
-        if files.mask is None
-        else read_mask(files.mask, ExpectedSize(shape, files.images[0].name, "a mask"))
-    )
+    mask = np.ones(shape, np.bool_)
+    if files.mask is not None:
+        mask = read_mask(files.mask, ExpectedSize(shape, files.images[0].name, "a mask"))
     if target == "card":
         return mask, np.broadcast_to(np.array((0.0, 0.0, 1.0)), (int(mask.sum()), 3))
     if files.mask is None:

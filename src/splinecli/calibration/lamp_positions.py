@@ -22,15 +22,13 @@ LARGEST_UNCERTAINTY = 0.4
 """Largest uncertainty of a position, as a share of the lamp's distance. Beyond it the rays are nearly parallel, and the
 lamp may be at any distance."""
 
-PIXEL_ERROR = 0.3
-"""Standard deviation of highlights, and of the middle and the radius of outlines, in pixels."""
+PIXEL_ERROR = 0.3  # standard deviation of highlights, and of the middle and the radius of outlines, in pixels
 
 HEIGHT_SPREAD = 0.5
 """Usual difference between the heights of the balls' centres and their plane, in radii. It decides where the size of
 the outlines does not: under a distant camera."""
 
-CONFIDENCE = 0.95
-"""Share of positions that are within their uncertainty."""
+CONFIDENCE = 0.95  # share of positions that are within their uncertainty
 
 _DRAWS = 200
 
@@ -39,18 +37,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
-    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane.
+    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the balls' plane."""
 
-    Args:
-        positions: (F, 3).
-        uncertainty: (F,), the distance within which the true position is with CONFIDENCE.
-        pixel_size: the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel.
-        view: the camera.
-    """
-
-    positions: Floats
-    uncertainty: Floats
-    pixel_size: float
+    positions: Floats  # (F, 3)
+    uncertainty: Floats  # (F,), the distance within which the true position is with CONFIDENCE
+    pixel_size: float  # the width of a pixel on the plane, in the unit of the positions; 1 if that is a pixel
     view: View
 
     @property

@@ -21,29 +21,18 @@ from splinecli.surface.camera import ray_basis
 
 Floats = NDArray[np.float64]
 
-HIGHLIGHT_LEVEL = 0.7
-"""A highlight is the patch above this share of its brightest value, after a slight blur."""
-
-MIN_CONTRAST = 4.0
-"""Smallest ratio of the highlight to the median of the ball."""
-
+HIGHLIGHT_LEVEL = 0.7  # a highlight is the patch above this share of its brightest value, after a slight blur
+MIN_CONTRAST = 4.0  # smallest ratio of the highlight to the median of the ball
 _MAX_WIDTH = 0.3  # of the diameter; a wider patch is a window or an overexposed ball, not a lamp
 
 
 @dataclass(frozen=True)
 class Highlight:
-    """The image of a lamp in a mirror ball.
+    """The image of a lamp in a mirror ball."""
 
-    Args:
-        x, y: the centroid, in pixels of the image.
-        n_pixels: the number of its pixels.
-        saturated: share of them that is saturated, 0 to 1.
-    """
-
-    x: float
+    x: float  # of the centroid, in pixels of the image
     y: float
-    n_pixels: int
-    saturated: float
+    saturated: float  # share of its pixels that is saturated, 0 to 1
 
 
 def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | None = None) -> Highlight:
@@ -51,7 +40,6 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
 
     Args:
         image: (H, W), linear gray values.
-        circle: the outline of the ball.
         full_scale: the value at which pixels saturate. None for images that do not saturate.
 
     Raises:
@@ -83,9 +71,7 @@ def find_highlight(image: NDArray[Any], circle: Circle, *, full_scale: float | N
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its shape.
     weight = smooth[core].astype(np.float64) - 0.9 * HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
-    return Highlight(
-        float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), int(core.sum()), saturated
-    )
+    return Highlight(float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated)
 
 
 def ball_centre(outline: Floats, matrix: Floats) -> Floats:
@@ -96,10 +82,8 @@ def ball_centre(outline: Floats, matrix: Floats) -> Floats:
     """
     rays = np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)
     x, y = rays[:, 0], rays[:, 1]
-    equations, right_side = (
-        np.column_stack((x, y, np.ones(len(x)))),
-        (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1)),
-    )
+    equations = np.column_stack((x, y, np.ones(len(x))))
+    right_side = (x * x + y * y) / (1 + np.hypot(np.hypot(x, y), 1))
     kept = np.ones(len(x), np.bool_)
     for _ in range(4):
         solution = np.linalg.lstsq(equations[kept], right_side[kept], rcond=None)[0]
@@ -111,12 +95,7 @@ def ball_centre(outline: Floats, matrix: Floats) -> Floats:
 
 
 def reflect(centre: Floats, highlights: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball.
-
-    Args:
-        centre: (3,), see ball_centre.
-        matrix: (3, 3), of the camera.
-    """
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN beside the ball."""
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
     with np.errstate(invalid="ignore"):

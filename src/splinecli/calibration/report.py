@@ -7,18 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.calibration.balls import BallCalibration, CalibratedLights
+from splinecli.calibration.balls import CalibratedLights
 from splinecli.calibration.lamp_positions import LampPositions
 from splinecli.maths.normals import angle_between_deg
 
-UNSURE_VISIBLE = 0.6
-"""Smallest visible share of an outline without a warning."""
-
-UNSURE_SPREAD = 0.01
-"""Largest spread of an outline without a warning, as a share of the radius."""
-
-DISAGREEMENT_DEG = 5.0
-"""Largest angle between a ball and the mean of all balls without a warning."""
+UNSURE_VISIBLE = 0.6  # smallest visible share of an outline without a warning
+UNSURE_SPREAD = 0.01  # largest spread of an outline without a warning, as a share of the radius
+DISAGREEMENT_DEG = 5.0  # largest angle between a ball and the mean of all balls without a warning
 
 MISTAKEN_DEG = 3.0
 """Smallest mean difference at which compared directions are checked for the mistake of mirror_ball.py."""
@@ -35,17 +30,30 @@ def calibration_report(
     """Return the report of a calibration as values for JSON, with its warnings.
 
     Args:
-        lights: the calibrated directions.
         intensities: (F, 3), or None where they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
         picture: the name of the picture to which warnings refer.
         lamps: the positions from several balls, or None.
     """
     single, view = len(lights.balls) == 1, lights.balls[0].view
+    off_deg = None if known_directions is None else angle_between_deg(known_directions, lights.directions)
     return {
         "n_lights": len(lights.directions),
         "camera": {"from": view.source, "matrix": _rows(view.matrix) if view.known else None},
-        "balls": [_ball(ball) for ball in lights.balls],
+        "balls": [
+            {
+                "folder": str(ball.files.folder),
+                "circle": {
+                    **{name: _round(getattr(ball.circle, name)) for name in ("x", "y", "radius")},
+                    "from": ball.circle_from,
+                    "seen": _round(ball.circle.visible),
+                    "spread": _round(ball.circle.spread),
+                },
+                "highlights": [[_round(highlight.x), _round(highlight.y)] for highlight in ball.highlights],
+                "saturated": [_round(highlight.saturated) for highlight in ball.highlights],
+            }
+            for ball in lights.balls
+        ],
         "light_directions": _rows(lights.directions),
         "light_intensities": None if intensities is None else _rows(intensities),
         "lamp_positions": None
@@ -57,10 +65,12 @@ def calibration_report(
             "uncertainty": [_round(value) if np.isfinite(value) else None for value in lamps.uncertainty],
             "pixel_size": _round(lamps.pixel_size, 6),
         },
-        "disagreement_deg": None if single else _mean_and_largest(lights.disagreement_deg, "mean", "largest"),
+        "disagreement_deg": None
+        if single
+        else {"mean": _round(lights.disagreement_deg.mean()), "largest": _round(lights.disagreement_deg.max())},
         "compared": None
-        if known_directions is None
-        else _mean_and_largest(angle_between_deg(known_directions, lights.directions), "mean_deg", "largest_deg"),
+        if off_deg is None
+        else {"mean_deg": _round(off_deg.mean()), "largest_deg": _round(off_deg.max())},
         "warnings": _warnings(lights, known_directions, picture, lamps),
     }
 
@@ -80,8 +90,17 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         lines.append(
             f"the balls differ from their mean by {angles['mean']:.1f} degrees, at most {angles['largest']:.1f}"
         )
-    if report["lamp_positions"]:
-        lines.append(_lamp_line(report["lamp_positions"]))
+    lamps = report["lamp_positions"]
+    if lamps and not lamps["known"]:
+        lines.append("the lamps' distances are unknown: they count as distant")
+    elif lamps:
+        distances = np.linalg.norm(lamps["positions"], axis=1)
+        shares = 100 * np.array(lamps["uncertainty"]) / distances
+        lines.append(
+            f"the lamps are {distances.min():.4g} to {distances.max():.4g} away"
+            f" ({'pixels' if lamps['pixel_size'] == 1 else 'in the unit of --ball-diameter'}),"
+            f" uncertain by {shares.mean():.0f} % on average, at most {shares.max():.0f} %"
+        )
     if report["compared"]:
         angles = report["compared"]
         lines.append(
@@ -89,36 +108,6 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             f" at most {angles['largest_deg']:.1f}"
         )
     return lines
-
-
-def _lamp_line(lamps: dict[str, Any]) -> str:
-    """Return the line on triangulated lamps, from the report."""
-    if not lamps["known"]:
-        return "the lamps' distances are unknown: they count as distant"
-    distances = np.linalg.norm(lamps["positions"], axis=1)
-    shares = 100 * np.array(lamps["uncertainty"]) / distances
-    return (
-        f"the lamps are {distances.min():.4g} to {distances.max():.4g} away"
-        f" ({'pixels' if lamps['pixel_size'] == 1 else 'in the unit of --ball-diameter'}),"
-        f" uncertain by {shares.mean():.0f} % on average, at most {shares.max():.0f} %"
-    )
-
-
-def _ball(ball: BallCalibration) -> dict[str, Any]:
-    circle = ball.circle
-    return {
-        "folder": str(ball.files.folder),
-        "circle": {
-            "x": _round(circle.x),
-            "y": _round(circle.y),
-            "radius": _round(circle.radius),
-            "from": ball.circle_from,
-            "seen": _round(circle.visible),
-            "spread": _round(circle.spread),
-        },
-        "highlights": [[_round(highlight.x), _round(highlight.y)] for highlight in ball.highlights],
-        "saturated": [_round(highlight.saturated) for highlight in ball.highlights],
-    }
 
 
 def _warnings(
@@ -155,10 +144,6 @@ def _warnings(
                 " each lies half-way between the view and the light. Use the file written here."
             )
     return warnings
-
-
-def _mean_and_largest(angles: NDArray[np.float64], mean: str, largest: str) -> dict[str, float]:
-    return {mean: _round(angles.mean()), largest: _round(angles.max())}
 
 
 def _rows(values: NDArray[np.float64]) -> list[list[float]]:

@@ -18,8 +18,7 @@ from splinecli.surface.camera import ray_basis
 
 Floats = NDArray[np.float64]
 
-DISTANT = 1e6
-"""Focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel."""
+DISTANT = 1e6  # focal length, in pixels, of a camera that counts as distant: all its rays are nearly parallel
 
 SHORTEST_LENS = 0.7
 """Shortest usual focal length, in longer sides of the image: that of a telephone, 25 mm for 36 mm of film."""
@@ -34,17 +33,11 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The camera of a calibration.
+    """The camera of a calibration."""
 
-    Args:
-        matrix: (3, 3) in pixels.
-        source: "--camera-matrix", "EXIF" or "assumed distant".
-        shortest: the focal length of the shortest usual lens, in pixels.
-    """
-
-    matrix: Floats
-    source: str
-    shortest: float
+    matrix: Floats  # (3, 3) in pixels
+    source: str  # "--camera-matrix", "EXIF" or "assumed distant"
+    shortest: float  # the focal length of the shortest usual lens, in pixels
 
     @property
     def known(self) -> bool:

@@ -4,23 +4,20 @@ from splinecli.capture.arrays import capture_from_arrays
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.images import read_image, read_mask
 from splinecli.capture.formats.normal_files import read_normal_map
-from splinecli.capture.layouts.capture_files import CaptureFiles, Overrides
+from splinecli.capture.layouts.capture_files import Overrides
 from splinecli.capture.layouts.registry import capture_name, find_capture_files, find_captures
 from splinecli.capture.lights.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.capture.reader import open_capture, read_capture
 from splinecli.capture.record import Capture
-from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.capture.source import CaptureSource
 
 __all__ = [
     "Capture",
-    "CaptureFiles",
     "CaptureSource",
     "CaptureWarning",
     "Overrides",
     "RadiometricCalibration",
-    "WhiteLevel",
     "capture_from_arrays",
     "capture_name",
     "find_capture_files",

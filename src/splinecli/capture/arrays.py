@@ -14,10 +14,8 @@ from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import check_distances
 from splinecli.capture.lights.light_files import unit_directions
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.linearise import linear_light
-from splinecli.capture.observations import StoredPixels, collect_observations
+from splinecli.capture.linearise import StoredPixels, collect_observations, linear_light
 from splinecli.capture.record import Capture
-from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
 from splinecli.errors import InputError, UsageError
 
@@ -75,23 +73,24 @@ def capture_from_arrays(
             path = Path(f"images[{index}]")
             yield StoredPixels(path, values, linear_light(values, path), intensities[index])
 
-    found = collect_observations(pixels(), SaturationFinder(int(inside.sum()), n_lights, given=white_level))
+    observations, saturation, warnings = collect_observations(
+        pixels(), int(inside.sum()), n_lights, white_level=white_level
+    )
     capture = Capture(
         name="capture",
-        observations=found.values,
+        observations=observations,
         light_directions=directions,
         light_indices=tuple(range(n_lights)),
         mask=inside,
-        warnings=tuple(found.warnings()),
-        white_level=found.saturation.white_level,
+        warnings=tuple(warnings),
+        white_level=saturation.white_level,
     )
     known = light_intensities is not None
     if pixel_size is not None:
         positions = np.asarray(light_directions, np.float64)
         lamps = NearLamps.of(positions, pixel_size, shape, equal=not known)
-        warnings = (*capture.warnings, *check_distances(lamps, inside, None))
-        capture = replace(capture, lamps=lamps, warnings=warnings)
-    stored = StoredCapture(capture, found.saturation, intensities_known=known)
+        capture = replace(capture, lamps=lamps, warnings=(*warnings, *check_distances(lamps, inside, None)))
+    stored = StoredCapture(capture, saturation, intensities_known=known)
     if light_directions is None and find_lights is not None:
         stored = stored.find_lights(find_lights)
     return stored.capture if as_stored else stored.restore(stored.estimate_intensities())

@@ -1,9 +1,9 @@
-"""Pixels of images: decode, take the window and the mask, invert the transfer curve, subtract ambient light, divide by
-the falloff."""
+"""Observations from images: decode, take the window and the mask, invert the transfer curve, subtract ambient light,
+divide by the falloff and by the light's intensity. Files and arrays have the last step in common."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import ImageFacts
 from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import to_linear
+from splinecli.capture.formats.images import decode_image, to_linear
+from splinecli.capture.restore.white_level import ImageValues, Saturation, look_at
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 
+BLACK_SHARE = 0.01  # share of pixels without light above which the capture carries a warning
 _DARKEST_FLAT = 0.02  # share of a flat field's mean; darker places do not show the falloff
 
 
@@ -46,21 +47,27 @@ class RadiometricCalibration:
             return self, []
         curves = {image.curve.curve for image in images}
         by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
-        unread = [image.path for image in images if image.curve.unread]
-        warnings = [capture_warnings.profile_unread(unread[0].name)] if unread and self.automatic else []
+        unread = [image.path.name for image in images if image.curve.unread]
+        warnings = []
+        if unread and self.automatic:
+            text = f"The colour profile of {unread[0]} has no curve that can be read, so it does not count."
+            warnings.append(CaptureWarning(codes.PROFILE_UNREAD, f"{text} Add --transfer linear, srgb or gamma:G."))
         if self.automatic and len(curves) == 1:
             (curve,) = curves
             if curve not in (1, BT709):  # a film has no other curve
-                warnings.append(capture_warnings.display_decoded(by, curve))
+                how = "the profile says" if isinstance(curve, tuple) else f"gamma:{curve:g}" if curve else "sRGB"
+                text = f"The images say that they are display-encoded ({by}) and are read as {how}."
+                text += " Add --transfer linear if their values are linear."
+                warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
             return replace(self, curve=curve), warnings
-        return self, [*warnings, capture_warnings.display_encoded(by)] if by else warnings
+        if by:
+            text = f"The images look display-encoded ({by}) but are read as linear."
+            warnings.append(CaptureWarning(codes.DISPLAY_ENCODED, f"{text} Add --transfer srgb if they are sRGB."))
+        return self, warnings
 
 
-AUTOMATIC = RadiometricCalibration(automatic=True)
-"""Stored values are linear light, unless all images say otherwise."""
-
-AS_STORED = RadiometricCalibration()
-"""Stored values are linear light."""
+AUTOMATIC = RadiometricCalibration(automatic=True)  # stored values are linear light, unless all images say otherwise
+AS_STORED = RadiometricCalibration()  # stored values are linear light
 
 
 _MIDDLE_OF_8_BITS = np.float32(0.25 / 255)
@@ -134,3 +141,76 @@ class PixelReader:
         stored = take_pixels(self._window.of(image), self.mask)
         linear = linear_light(stored, path, self.radiometry.curve)
         return stored, linear if self._ambient is None else np.maximum(linear - self._ambient, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPixels:
+    """The mask's pixels of one image."""
+
+    path: Path  # the image; messages name it
+    values: NDArray[Any]  # (P, C), as stored
+    linear: NDArray[np.float32]  # (P, C) float32, linear light
+    intensity: NDArray[np.float64]  # (3,), RGB, of the light
+    stated_white_level: int | None = None  # the white level that the file states; None where it states none
+
+    def observe(self) -> NDArray[np.float32]:
+        """Return observations (P,): each channel is divided by its intensity, then the mean is taken.
+
+        A gray image is equal in all channels.
+        """
+        weights = 1 / (3 * self.intensity)
+        if self.linear.shape[1] == 1:
+            weights = weights.sum(keepdims=True)
+        return self.linear @ weights.astype(np.float32)
+
+    def find_saturated(self, white_level: float | None) -> ImageValues:
+        """Return what decides which pixels are saturated; see look_at. Raises InputError."""
+        return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
+
+    def colours(self) -> NDArray[np.float32]:
+        """Return linear RGB (P, 3), each channel divided by its intensity."""
+        # In float32 and in place: 24 megapixels take noticeably longer in any other way.
+        colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
+        colours /= self.intensity.astype(np.float32)
+        return colours
+
+
+def collect_observations(
+    images: Iterable[StoredPixels],
+    n_pixels: int,
+    n_images: int,
+    *,
+    white_level: float | None = None,
+    progress: Callable[[], object] | None = None,
+) -> tuple[NDArray[np.float32], Saturation, list[CaptureWarning]]:
+    """Return observations (P, F) of the images, in their order, which are saturated, and warnings.
+
+    Only one image is in memory at a time.
+
+    Args:
+        white_level: the one that the user gave; None to find it.
+
+    Raises:
+        InputError: the white level that the user gave is above an image's full scale.
+    """
+    observations = np.empty((n_pixels, n_images), np.float32)
+    any_8_bit, found = False, []
+    for position, image in enumerate(images):
+        any_8_bit |= image.values.dtype == np.uint8
+        found.append(image.find_saturated(white_level))
+        observations[:, position] = image.observe()
+        del image  # before the next one is decoded
+        if progress is not None:
+            progress()
+    saturation = Saturation(n_pixels, tuple(found), white_level)
+    warnings = codes.white_level(saturation.white_level)
+    saturated = int(saturation.n_saturated.sum()) / max(observations.size, 1)
+    if saturated > codes.SATURATED_SHARE:
+        text = f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives better normals."
+        warnings.append(CaptureWarning(codes.SATURATED, text))
+    black = (n_pixels - np.count_nonzero(observations.any(axis=1))) / max(n_pixels, 1)
+    if black > BLACK_SHARE:
+        text = f"{100 * black:.1f} % of the pixels are black under every light; they get the normal (0, 0, 1)."
+        text += " Leave them out with a mask or with --auto-mask."
+        warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
+    return observations, saturation, warnings + codes.eight_bit(any_8_bit)

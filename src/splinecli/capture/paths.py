@@ -5,22 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
 
 from splinecli.errors import InputError
 
 _OPEN_FILES = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
-_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (lambda _: True, "a device"),
-)
+_KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 
-StrPath = str | os.PathLike[str]
-"""A path in any form that the standard library takes."""
+StrPath = str | os.PathLike[str]  # a path in any form that the standard library takes
 
 
 def find_mode(path: Path) -> int | None:
@@ -43,16 +36,13 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     """Raise InputError unless there is a file. Anything else, such as a device, might never end or never begin.
 
     Args:
-        path: the path.
-        expected: what the file should be, for messages.
         pipe: whether the shell's process substitution `<(...)` may stand in its place, see is_substitution.
     """
     mode = find_mode(path)
     if mode is None:
         raise InputError("the file does not exist", path=path)
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
-        kind = next(words for matches, words in _KINDS if matches(mode))
-        raise InputError(f"found {kind}, expected {expected}", path=path)
+        raise InputError(f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path=path)
 
 
 def is_found_file(path: Path) -> bool:
@@ -69,12 +59,15 @@ def is_found_file(path: Path) -> bool:
 
 def is_substitution(path: Path) -> bool:
     """Return whether the path is a pipe that the shell has opened for this process: `<(...)`, or standard input."""
-    return str(path).startswith(_OPEN_FILES) and stat.S_ISFIFO(_mode_or_zero(path))
+    try:
+        return str(path).startswith(_OPEN_FILES) and stat.S_ISFIFO(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def is_folder(path: Path) -> bool:
     """Return whether there is a folder; False also if the system refuses to answer."""
-    return stat.S_ISDIR(_mode_or_zero(path))
+    return os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises for a name that is too long
 
 
 def resolve(path: Path) -> Path:
@@ -85,13 +78,6 @@ def resolve(path: Path) -> Path:
         raise _unreadable(path, os.strerror(errno.ELOOP)) from None
     except OSError as error:
         raise _unreadable(path, error.strerror) from None
-
-
-def _mode_or_zero(path: Path) -> int:
-    try:
-        return path.stat().st_mode
-    except (OSError, ValueError):  # ValueError: a zero byte in the name
-        return 0
 
 
 def _unreadable(path: Path, reason: str | None) -> InputError:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.formats.exif import UPRIGHT, check_exposures, common_orientation
 from splinecli.capture.formats.facts import read_facts
@@ -17,10 +17,10 @@ from splinecli.capture.layouts.capture_files import AMBIENT, CaptureFiles, Overr
 from splinecli.capture.layouts.registry import find_capture_files
 from splinecli.capture.lights.found_lights import LightFinder, placeholders
 from splinecli.capture.lights.lamp_checks import positions_as_directions
-from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampFiles, LampOptions, find_lamps
-from splinecli.capture.lights.light_angles import LightForm, RowForm
+from splinecli.capture.lights.lamp_files import NO_LAMP_OPTIONS, LampOptions, find_lamps
 from splinecli.capture.lights.light_files import read_light_intensities
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.light_rows import LightForm, RowForm
 from splinecli.capture.lights.named_lights import NamedLights, read_lights
 from splinecli.capture.linearise import AUTOMATIC, RadiometricCalibration
 from splinecli.capture.paths import StrPath
@@ -31,8 +31,7 @@ from splinecli.capture.stamp import stamp_files
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError, UsageError
 
-EQUAL = "equal"
-"""Given in place of a file of intensities: all lights have the same intensity."""
+EQUAL = "equal"  # given in place of a file of intensities: all lights have the same intensity
 
 
 def open_capture(
@@ -60,10 +59,8 @@ def open_capture(
             folder is subtracted.
         white_level: stored value from which an observation counts as saturated, such as 4095 for 12 bits. By default it
             is found from the files and their values (see white_level.py).
-        light_frame: the frame of the light file.
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: where near lamps are, if no files in the folder say so.
-        window: the part of the images that is read.
         find_lights: finds the lights from the images, in place of light files.
 
     Raises:
@@ -93,26 +90,54 @@ def open_capture(
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
     files = replace(files, ambient=radiometry.ambient or found)
     stamp = stamp_files(files, radiometry.flat_field, () if near is None else near.stamp)
-    source = replace(_read_lights(files, radiometry, light_frame, form, near, equal=equal), find_lights=find_lights)
-    files, radiometry, warnings = source.files, source.radiometry, [*source.warnings]
+    in_folder = files.images
+    files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+    if len(radiometry.flat_field) == len(in_folder) > 1:  # they are in the order of the folder's images
+        flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
+        radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
+    if equal:
+        found_intensities = None
+    elif files.light_intensities is not None:
+        found_intensities = _read_intensities(files.light_intensities, files.images, in_folder)
+    if files.light_directions is not None and form == "xyz" and near is None:
+        warnings += positions_as_directions(files.light_directions)
+    facts = tuple(map(read_facts, files.images))
+    if found_intensities is None:
+        check_exposures(facts)
     if radiometry.ambient is None and files.ambient is not None:
         radiometry = replace(radiometry, ambient=files.ambient)
-        warnings.append(capture_warnings.ambient_subtracted(files.ambient.name))
+        text = f"{files.ambient.name} was subtracted from all images as ambient light."
+        warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
     if files.others:
-        warnings.append(capture_warnings.other_pictures([path.name for path in files.others]))
-    radiometry, of_curve = radiometry.with_stated_curve(source.facts)
+        more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
+        text = f"{files.others[0].name}{more}: left out, because the name says that it is no photograph under one of"
+        text += " the lights. To use it, list all images in filenames.txt."
+        warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
+    radiometry, of_curve = radiometry.with_stated_curve(facts)
     warnings += of_curve
     # Earlier versions read such images as linear, or those with a colour profile as sRGB.
     decoded = (radiometry.curve or "sRGB",) if radiometry.automatic and radiometry.curve != 1 else ()
-    orientation = common_orientation(source.facts)
+    orientation = common_orientation(facts)
     if orientation != UPRIGHT:
-        warnings.append(capture_warnings.exif_orientation(orientation))
-    return replace(
-        source,
-        radiometry=radiometry,
-        warnings=tuple(warnings),
-        white_level=white_level,
-        window=window.on(source.facts[0]),
+        text = (
+            f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light directions and"
+            " results are in the frame of the stored pixels."
+        )
+        warnings.append(CaptureWarning(codes.EXIF_ORIENTATION, text))
+    return CaptureSource(
+        files,
+        facts,
+        directions,
+        np.ones((len(facts), 3)) if found_intensities is None else found_intensities,
+        tuple(warnings),
+        radiometry,
+        white_level,
+        intensities_known=equal or found_intensities is not None,
+        intensities_measured=found_intensities is not None,
+        light_frame=light_frame,
+        lamps=near,
+        window=window.on(facts[0]),
+        find_lights=find_lights,
         # Left out where they are not given, so that earlier stamps stay valid.
         stamp=(*stamp, *decoded, *(() if white_level is None else (white_level,))),
     )
@@ -143,61 +168,27 @@ def read_capture(
 
 
 def _read_lights(
-    files: CaptureFiles,
-    radiometry: RadiometricCalibration,
-    frame: LightFrame,
-    form: RowForm,
-    lamps: LampFiles | None,
-    *,
-    equal: bool,
-) -> CaptureSource:
-    """Return the capture with its lights; a light file that names images sets their order.
+    files: CaptureFiles, frame: LightFrame, form: RowForm
+) -> tuple[CaptureFiles, NDArray[np.float64], NDArray[np.float64] | None, list[CaptureWarning]]:
+    """Return the files, the light directions (F, 3), the intensities (F, 3) that come with them, and warnings.
 
-    Args:
-        equal: whether all lights have the same intensity, whatever the files say.
+    A light file that names images sets their order.
     """
-    path, in_folder = files.light_directions, files.images
-    warnings: list[CaptureWarning] = []
-    intensities = None
-    named = placeholders(len(in_folder)) if path is None else read_lights(path, len(in_folder), frame, form)
-    if isinstance(named, NamedLights):
-        assert path is not None
-        images, how = named.match(files.images)
-        flats = radiometry.flat_field
-        if len(flats) == len(files.images) > 1:  # they are in the order of the folder's images
-            flat_of = dict(zip(files.images, flats, strict=True))
-            radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in images))
-        if len(images) < len(files.images):
-            warnings.append(capture_warnings.images_left_out(path.name, len(images), len(files.images)))
-        files, directions, intensities = replace(files, images=images), named.directions, named.intensities
-        if how != "name":
-            warnings.append(capture_warnings.lights_matched(path.name, how))
-    else:
-        directions = named
-    if equal:
-        intensities = None
-    elif files.light_intensities is not None:
-        intensities = _read_intensities(files.light_intensities, files.images, in_folder)
-    if path is not None and form == "xyz" and lamps is None:
-        warnings += positions_as_directions(path)
-    facts = tuple(map(read_facts, files.images))
-    known = equal or intensities is not None
-    measured = intensities is not None
-    if intensities is None:
-        check_exposures(facts)
-        intensities = np.ones((len(files.images), 3))
-    return CaptureSource(
-        files,
-        facts,
-        directions,
-        intensities,
-        tuple(warnings),
-        radiometry,
-        intensities_known=known,
-        intensities_measured=measured,
-        light_frame=frame,
-        lamps=lamps,
-    )
+    path = files.light_directions
+    if path is None:
+        return files, placeholders(len(files.images)), None, []
+    lights = read_lights(path, len(files.images), frame, form)
+    if not isinstance(lights, NamedLights):
+        return files, lights, None, []
+    images, how = lights.match(files.images)
+    warnings = []
+    if len(images) < len(files.images):
+        text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out."
+        warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
+    if how != "name":
+        text = f"The lights of {path.name} were matched to the images by {how}."
+        warnings.append(CaptureWarning(codes.LIGHTS_MATCHED, text))
+    return replace(files, images=images), lights.directions, lights.intensities, warnings
 
 
 def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> NDArray[np.float64]:

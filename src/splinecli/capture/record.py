@@ -15,8 +15,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.errors import InputError, UsageError
 
-MIN_LIGHTS = 3
-"""A normal scaled by an albedo has three unknowns."""
+MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
 
 COPLANAR_RATIO = 1e-3
 """Lights (F, 3) count as coplanar if their smallest singular value is below this share of the largest."""
@@ -40,7 +39,6 @@ class Capture:
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
     Args:
-        name: the name of the outputs.
         observations: (P, F) float32, linear: every channel divided by its light's intensity, then the mean of
             the channels. Only the mask's pixels, in the mask's row-major order.
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).

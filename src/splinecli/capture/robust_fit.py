@@ -7,12 +7,9 @@ from numpy.typing import NDArray
 
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 
-SHADOW_SHARE = 0.05
-"""Observations below this share of a pixel's largest one count as shadow."""
-
+SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one count as shadow
 _PRIOR = 1e-6  # pulls towards a black pixel, so that a pixel without three lit observations has a solution
-_EQUAL_WEIGHT_BELOW = 0.02
-"""Residuals far below this share of a pixel's largest observation have nearly equal weights."""
+_EQUAL_WEIGHT_BELOW = 0.02  # residuals far below this share of a pixel's largest observation have nearly equal weights
 
 Array = NDArray[np.floating]
 
@@ -39,7 +36,6 @@ def fit_scaled_normals(observations: Array, weights: Array, light_directions: Ar
     Args:
         observations, weights: (P, F).
         light_directions: (F, 3) or (P, F, 3), of any length.
-        prior: pulls b towards 0.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)

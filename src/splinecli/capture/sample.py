@@ -10,31 +10,21 @@ from numpy.typing import NDArray
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError
 
-MAX_PIXELS = 20_000
-"""Of larger captures, every second or third row and column is taken, and so on."""
-
-CLOSEUP_SIDE = 192
-"""The side of a closeup in pixels."""
-
-BLACK = 0.15
-"""A background is dark if its median brightness is below this share of the object's."""
+MAX_PIXELS = 20_000  # of larger captures, every second or third row and column is taken, and so on
+CLOSEUP_SIDE = 192  # side of a closeup in pixels
+BLACK = 0.15  # a background is dark if its median brightness is below this share of the object's
 
 _SMALLEST_SIDE = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Observations on a grid of pixels.
+    """Observations on a grid of pixels."""
 
-    Args:
-        observations: (p, F), linear, divided by the light intensities; pixels of the mask in row-major order.
-        mask: (h, w) bool with p true pixels.
-        step: rows and columns of the images from one pixel of the grid to the next.
-    """
-
+    # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
     observations: NDArray[np.floating]
-    mask: NDArray[np.bool_]
-    step: int
+    mask: NDArray[np.bool_]  # (h, w) bool with p true pixels
+    step: int  # rows and columns of the images from one pixel of the grid to the next
 
 
 def grid_step(mask: NDArray[np.bool_]) -> int:

@@ -3,39 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
-from splinecli.capture.capture_size import check_capture, common_size
-from splinecli.capture.capture_warnings import CaptureWarning
-from splinecli.capture.formats.decoding import decode_image
+from splinecli.capture.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN, CaptureWarning
+from splinecli.capture.formats.damage import stderr_is_apart
 from splinecli.capture.formats.facts import ImageFacts
-from splinecli.capture.formats.image_size import ExpectedSize
-from splinecli.capture.formats.images import read_mask
+from splinecli.capture.formats.image_size import ExpectedSize, check_capture, common_size
+from splinecli.capture.formats.images import decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth
-from splinecli.capture.formats.read_ahead import read_ahead
 from splinecli.capture.layouts.capture_files import CaptureFiles
 from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.lights.lamp_checks import check_distances, distant_lights
 from splinecli.capture.lights.lamp_files import LampFiles
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.near_lamps import NearLamps
-from splinecli.capture.linearise import AS_STORED, PixelReader, RadiometricCalibration
-from splinecli.capture.observations import StoredPixels, collect_observations
+from splinecli.capture.linearise import (
+    AS_STORED,
+    PixelReader,
+    RadiometricCalibration,
+    StoredPixels,
+    collect_observations,
+)
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.restore.auto_mask import find_object
-from splinecli.capture.restore.white_level import SaturationFinder
 from splinecli.capture.stored import StoredCapture
 from splinecli.capture.window import WHOLE, Window
 from splinecli.errors import InputError
 
 Item = TypeVar("Item")
-Progress = Callable[[], object]
-"""Called once after each image."""
+Image = TypeVar("Image")
+Progress = Callable[[], object]  # called once after each image
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +45,11 @@ class CaptureSource:
     """An opened capture: lights and facts of images loaded, pixels still on disk.
 
     Args:
-        files: the files of the capture.
-        facts: what the header of each image states.
         light_directions: (F, 3) float64, unit; x right, y up, z to the camera. They mean nothing
             where find_lights is given.
         light_intensities: (F, 3) float64, RGB; ones where no file gives them.
         intensities_known: whether a file or the user gives the intensities.
         intensities_measured: whether a file gives the intensities.
-        warnings: what a user should read.
-        radiometry: how stored values become linear light.
         white_level: stored value from which an observation counts as saturated, given by the user; None to find it.
         light_frame: the frame of the light file, in which the directions are no longer.
         automatic_mask: (H, W) bool, a mask made from the images, used in place of a file; see find_mask.
@@ -95,8 +93,6 @@ class CaptureSource:
         the mask are ignored.
 
         Args:
-            light_indices: zero-based.
-            progress: called once after each image.
             as_stored: use the stored values alone. By default, saturated observations are restored (see
                 restore_saturated) and light intensities that no file gives are estimated (see
                 estimate_light_intensities).
@@ -125,25 +121,27 @@ class CaptureSource:
             )
             ground_truth = self.window.of(ground_truth)
         images = self.read_pixels(mask, indices, lambda pixels: pixels)
-        saturation = SaturationFinder(int(np.count_nonzero(mask)), len(indices), given=self.white_level)
-        found = collect_observations(images, saturation, progress)
-        warnings = [*self.warnings, *found.warnings()]
+        observations, saturation, warnings = collect_observations(
+            images, int(np.count_nonzero(mask)), len(indices), white_level=self.white_level, progress=progress
+        )
+        warnings = [*self.warnings, *warnings]
         if upside_down:
-            warnings.append(capture_warnings.ground_truth_upside_down())
+            text = "The rows of the ground truth are in the wrong order; the map was turned upside down."
+            warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
         lamps, of_lamps = self.near_lamps(mask)
         warnings += of_lamps
         capture = Capture(
             name=self.files.name,
-            observations=found.values,
+            observations=observations,
             light_directions=self.light_directions[list(indices)],
             light_indices=indices,
             mask=mask,
             ground_truth=ground_truth,
             warnings=tuple(warnings),
-            white_level=found.saturation.white_level,
+            white_level=saturation.white_level,
             lamps=None if lamps is None else lamps.choose_lights(indices),
         )
-        stored = StoredCapture(capture, found.saturation, self.intensities_known)
+        stored = StoredCapture(capture, saturation, self.intensities_known)
         return stored if self.find_lights is None else stored.find_lights(self.find_lights)
 
     def find_mask(self, progress: Progress | None = None) -> CaptureSource:
@@ -237,3 +235,22 @@ class CaptureSource:
             return use(StoredPixels(facts.path, stored, linear, intensity, facts.white_level))
 
         return read_ahead(read, indices)
+
+
+def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:
+    """Yield read(item) of each item, in order. While one result is used, a thread reads the next.
+
+    An error is raised when the turn of its item comes. Decoders catch what is printed to file descriptor 2. Where
+    Python's stderr is the same, one item is read after the other, so that no message is lost.
+    """
+    if len(items) < 2 or not stderr_is_apart():
+        yield from map(read, items)
+        return
+    with ThreadPoolExecutor(1, "read") as pool:
+        waiting = pool.submit(read, items[0])
+        for item in items[1:]:
+            found = waiting.result()
+            waiting = pool.submit(read, item)
+            yield found
+            del found  # so that no more than two are in memory
+        yield waiting.result()

@@ -16,8 +16,7 @@ from splinecli.system.files import file_sha256
 if TYPE_CHECKING:
     from splinecli.capture.layouts.capture_files import CaptureFiles
 
-LARGEST_HASHED = 1 << 26
-"""Bytes of the largest file that is stamped by its content."""
+LARGEST_HASHED = 1 << 26  # bytes of the largest file that is stamped by its content
 
 
 def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]) -> tuple[Any, ...]:
@@ -25,9 +24,6 @@ def stamp_files(files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence
 
     Images and flat fields are stamped by path, size and time of change, because reading them takes long. All other
     files (lights, intensities, mask, ground truth, ambient image) are stamped by their content.
-
-    Args:
-        lamps: stamps of the files of near lamps.
 
     Raises:
         InputError: a file cannot be read.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import ESTIMATED_INTENSITIES, CaptureWarning, estimated_lights
 from splinecli.capture.lights.found_lights import LightFinder
 from splinecli.capture.record import Capture
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
@@ -29,17 +29,12 @@ class StoredCapture:
     `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights once, chooses the
     lights of each draw, and restores each choice by itself, so that both commands see the same observations. The white
     level of a choice is decided from its images alone.
-
-    Args:
-        capture: the stored observations, linear, divided by the light intensities that the files give.
-        saturation: which observations are saturated.
-        intensities_known: whether a file, an option or the image format gives the light intensities.
-        found_intensities: (F,), those that were found together with the directions, or None.
     """
 
-    capture: Capture
+    capture: Capture  # the stored observations, linear, divided by the light intensities that the files give
     saturation: Saturation
-    intensities_known: bool
+    intensities_known: bool  # whether a file, an option or the image format gives the light intensities
+    # (F,), those that were found together with the directions, or None
     found_intensities: NDArray[np.float64] | None = None
 
     def find_lights(self, find: LightFinder) -> StoredCapture:
@@ -53,7 +48,7 @@ class StoredCapture:
             found = find(capture.observations, capture.mask, self.intensities_known)
         except InputError as error:
             raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
-        warning = capture_warnings.estimated_lights(found.errors_deg)
+        warning = estimated_lights(found.errors_deg)
         capture = replace(
             capture,
             light_directions=found.directions,
@@ -85,24 +80,22 @@ class StoredCapture:
         """Return light intensities (F,) estimated from all pixels; None where they are known or count as equal."""
         if self.intensities_known or self.found_intensities is not None:
             return self.found_intensities
-        return estimate_light_intensities(
-            self.capture.observations,
-            self.saturation.flags,
-            self.capture.light_directions if self.capture.lamps is None else self._lights_of,
-        )
+        return estimate_light_intensities(self.capture.observations, self.saturation.flags, self._lights_of)
 
     def restore(self, intensities: NDArray[np.float64] | None) -> Capture:
         """Return the capture with its intensities divided out and its saturated observations restored.
 
         The observations are changed in place: this record must not be used afterwards.
-
-        Args:
-            intensities: what estimate_intensities returns.
         """
         observations, warnings, restored = self.capture.observations, self.capture.warnings, None
         if intensities is not None:
             observations /= intensities.astype(np.float32)
-            warnings = (*warnings, capture_warnings.estimated_intensities(intensities))
+            text = (
+                "The light intensities were estimated from the images: they are unequal, from"
+                f" {intensities.min():.2f} to {intensities.max():.2f} times their mean. Use --intensities FILE if you"
+                " have measured them, or --intensities equal to assume equal ones."
+            )
+            warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))
         saturated = self.saturation.flags
         if saturated is not None:
             restored = restore_saturated(observations, saturated, self._lights_of)

@@ -2,75 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture import capture_warnings as codes
 from splinecli.capture.capture_warnings import SATURATED_SHARE, CaptureWarning
 from splinecli.capture.formats.images import to_linear
-from splinecli.capture.linearise import AS_STORED
-from splinecli.capture.observations import StoredPixels
+from splinecli.capture.linearise import AS_STORED, StoredPixels
 from splinecli.capture.restore.saturation import find_saturated
-from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.restore.white_level import Saturation, WhiteLevel
 from splinecli.capture.sample import Sample, closeup_window, grid_step
 from splinecli.capture.source import CaptureSource
 from splinecli.capture.window import WHOLE
 
-DARK = 0.05
-"""An image is called dark if its 99 % quantile is below this share of the white level."""
-
-FEW_LIGHTS = 8
-"""A capture with fewer lights carries a warning."""
-
-NARROW_DEG = 30.0
-"""A capture whose lights are all nearer than this to the camera axis carries a warning."""
+DARK = 0.05  # an image is called dark if its 99 % quantile is below this share of the white level
+FEW_LIGHTS = 8  # a capture with fewer lights carries a warning
+NARROW_DEG = 30.0  # a capture whose lights are all nearer than this to the camera axis carries a warning
 
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """One image of a capture; only the mask's pixels count.
-
-    Args:
-        path: the file.
-        shape: (H, W, C) as stored.
-        dtype: as stored, such as "uint16".
-        bright: the 99 % quantile of the values, as a share of the white level. For floating-point images, the
-            quantile itself.
-        saturated: share of the pixels with a channel at the white level or above.
-    """
+    """One image of a capture; only the mask's pixels count."""
 
     path: Path
-    shape: tuple[int, ...]
-    dtype: str
+    shape: tuple[int, ...]  # (H, W, C) as stored
+    dtype: str  # as stored, such as "uint16"
+    # the 99 % quantile of the values, as a share of the white level. For floating-point images, the quantile itself
     bright: float
-    saturated: float
+    saturated: float  # share of the pixels with a channel at the white level or above
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureSummary:
-    """Summary of a capture.
-
-    Args:
-        source: the capture.
-        images: a summary of each image.
-        n_pixels: number of the mask's pixels.
-        white_level: as in Capture.
-        sample: some of the pixels of all images, on a grid; None where images have different sizes.
-        closeup: every pixel of the middle, or None.
-        lamp_warnings: about near lamps over this mask.
-    """
+    """Summary of a capture."""
 
     source: CaptureSource
     images: tuple[ImageSummary, ...]
     n_pixels: int
     white_level: WhiteLevel | None
-    sample: Sample | None = None
-    closeup: Sample | None = None
-    lamp_warnings: tuple[CaptureWarning, ...] = ()
+    sample: Sample | None = None  # some of the pixels of all images, on a grid; None where images have different sizes
+    closeup: Sample | None = None  # every pixel of the middle, or None
+    lamp_warnings: tuple[CaptureWarning, ...] = ()  # about near lamps over this mask
 
     @property
     def axis_angles_deg(self) -> NDArray[np.float64]:
@@ -81,22 +57,35 @@ class CaptureSummary:
     def warnings(self) -> list[CaptureWarning]:
         """Return warnings of faults that reduce accuracy."""
         saturated = [image for image in self.images if image.saturated > SATURATED_SHARE]
-        worst = max(saturated, key=lambda image: image.saturated, default=None)
         dark = [image for image in self.images if image.dtype.startswith("uint") and image.bright < DARK]
         n_sizes = len({image.shape[:2] for image in self.images})
-        found = [
-            capture_warnings.white_level(self.white_level),
-            capture_warnings.different_sizes(n_sizes) if n_sizes > 1 else None,
-            capture_warnings.eight_bit() if any(image.dtype == "uint8" for image in self.images) else None,
-            None
-            if worst is None
-            else capture_warnings.saturated_images(len(saturated), worst.path.name, worst.saturated),
-            capture_warnings.dark_images(len(dark), dark[0].path.name, DARK) if dark else None,
-            capture_warnings.few_lights(len(self.images), FEW_LIGHTS) if len(self.images) < FEW_LIGHTS else None,
-            capture_warnings.high_lights(NARROW_DEG) if self.axis_angles_deg.max() < NARROW_DEG else None,
-        ]
-        given = (warning for warning in found if warning is not None)
-        return [*self.source.warnings, *self.lamp_warnings, *given]
+        found = [*self.source.warnings, *self.lamp_warnings, *codes.white_level(self.white_level)]
+        if n_sizes > 1:
+            text = f"The images have {n_sizes} different sizes; all images need the same size."
+            found.append(CaptureWarning(codes.DIFFERENT_SIZES, text))
+        found += codes.eight_bit(any(image.dtype == "uint8" for image in self.images))
+        if saturated:
+            worst = max(saturated, key=lambda image: image.saturated)
+            text = (
+                f"Images saturated in more than {100 * SATURATED_SHARE:.0f} % of the pixels: {len(saturated)}, most of"
+                f" all {worst.path.name} ({100 * worst.saturated:.1f} %); a shorter exposure gives better normals."
+            )
+            found.append(CaptureWarning(codes.SATURATED, text))
+        if dark:
+            text = (
+                f"Images that use less than {100 * DARK:.0f} % of the range: {len(dark)}, such as {dark[0].path.name};"
+                " a longer exposure gives less noise."
+            )
+            found.append(CaptureWarning(codes.DARK_IMAGES, text))
+        if len(self.images) < FEW_LIGHTS:
+            text = f"There are {len(self.images)} lights; use {FEW_LIGHTS} or more, well spread."
+            found.append(CaptureWarning(codes.FEW_LIGHTS, text))
+        if self.axis_angles_deg.max() < NARROW_DEG:
+            text = (
+                f"All lights are within {NARROW_DEG:.0f} degrees of the camera axis; lower lights give better normals."
+            )
+            found.append(CaptureWarning(codes.HIGH_LIGHTS, text))
+        return found
 
 
 def summarise_capture(source: CaptureSource, progress: Callable[[], object] | None = None) -> CaptureSummary:
@@ -106,69 +95,66 @@ def summarise_capture(source: CaptureSource, progress: Callable[[], object] | No
         InputError: an image cannot be read, the mask, the ambient image or a flat field does not fit, or a lamp would
             be inside the object.
     """
-    shape = source.facts[0].size[0][:2]
+    sizes = [facts.size[0][:2] for facts in source.facts]
+    shape = sizes[0]
     mask = source.read_mask(shape)
-    n_images = len(source.facts)
-    finder = SaturationFinder(int(np.count_nonzero(mask)), n_images, given=source.white_level)
+    n_pixels = int(np.count_nonzero(mask))
     step = grid_step(mask)
     on_grid, inside = np.zeros_like(mask), np.zeros_like(mask)
     on_grid[::step, ::step] = mask[::step, ::step]
     seen_closely = closeup_window(mask)
     inside[seen_closely] = mask[seen_closely]
     taken = on_grid | inside
-    observations = np.zeros((int(np.count_nonzero(taken)), n_images), np.float32)
-    images: dict[int, ImageSummary] = {}
-    for index, pixels in _pixels_of_all(source, mask, shape):
-        height, width = source.facts[index].size[0][:2]
-        if (height, width) == shape:
-            finder.add(index, pixels.values, pixels.path, stated=pixels.stated_white_level)
-            observations[:, index] = replace(pixels, linear=pixels.linear[taken[mask]]).observe()
-        images[index] = ImageSummary(
-            pixels.path,
-            (height, width, pixels.values.shape[1]),
-            str(pixels.values.dtype),
-            float(np.quantile(to_linear(pixels.values, pixels.path), 0.99)),
-            # This share is used if the image has another size, because the finder cannot take it.
-            float(find_saturated(pixels.values).mean()),
-        )
+    fitting = [index for index, size in enumerate(sizes) if size == shape]
+    observations = np.zeros((int(np.count_nonzero(taken)), len(fitting)), np.float32)
+    found, images = [], {}
+    for position, pixels in enumerate(source.read_pixels(mask, fitting, lambda pixels: pixels)):
+        found.append(pixels.find_saturated(source.white_level))
+        observations[:, position] = replace(pixels, linear=pixels.linear[taken[mask]]).observe()
+        images[fitting[position]] = _summarise(pixels, shape)
         if progress is not None:
             progress()
-    level, summaries = _by_white_level(finder, [images[index] for index in range(n_images)], shape)
-    sample = closeup = None
-    if all(image.shape[:2] == shape for image in summaries):
-        sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
-        closeup = Sample(observations[inside[taken]], mask[seen_closely], 1)
-    _, of_lamps = source.near_lamps(mask)
-    return CaptureSummary(source, summaries, int(np.count_nonzero(mask)), level, sample, closeup, tuple(of_lamps))
-
-
-def _pixels_of_all(
-    source: CaptureSource, mask: NDArray[np.bool_], shape: tuple[int, ...]
-) -> Iterator[tuple[int, StoredPixels]]:
-    """Yield the mask's pixels of the images of this shape, and then all pixels of the others, with their indices."""
-    sizes = [facts.size[0][:2] for facts in source.facts]
-    fitting = [index for index, size in enumerate(sizes) if size == shape]
-    yield from zip(fitting, source.read_pixels(mask, fitting, lambda pixels: pixels), strict=True)
     as_stored = replace(source, radiometry=AS_STORED, window=WHOLE)
     for index, size in enumerate(sizes):
         if size != shape:
             (pixels,) = as_stored.read_pixels(np.ones(size, np.bool_), [index], lambda pixels: pixels)
-            yield index, pixels
+            images[index] = _summarise(pixels, size)
+            if progress is not None:
+                progress()
+    saturation = Saturation(n_pixels, tuple(found), source.white_level)
+    for index, n_saturated in zip(fitting, saturation.n_saturated.tolist(), strict=True):
+        images[index] = replace(images[index], saturated=n_saturated / max(n_pixels, 1))
+    level = saturation.white_level
+    sample = closeup = None
+    if len(fitting) == len(sizes):
+        sample = Sample(observations[on_grid[taken]], mask[::step, ::step], step)
+        closeup = Sample(observations[inside[taken]], mask[seen_closely], 1)
+    return CaptureSummary(
+        source,
+        tuple(_relative_to(level, images[index]) for index in range(len(sizes))),
+        n_pixels,
+        level,
+        sample,
+        closeup,
+        tuple(source.near_lamps(mask)[1]),
+    )
 
 
-def _by_white_level(
-    finder: SaturationFinder, images: list[ImageSummary], shape: tuple[int, ...]
-) -> tuple[WhiteLevel | None, tuple[ImageSummary, ...]]:
-    """Return the white level, and the images with brightness and saturation relative to it."""
-    saturation = finder.finish()
-    level, shares = saturation.white_level, saturation.n_saturated / max(saturation.n_pixels, 1)
-    summaries = []
-    for image, share in zip(images, shares, strict=True):
-        bright = image.bright
-        full_scale = np.iinfo(image.dtype).max if image.dtype.startswith("uint") else 0
-        # The white level of 16-bit images does not apply to 8-bit images among them.
-        if level is not None and full_scale >= level.value:
-            bright *= full_scale / level.value
-        fits = image.shape[:2] == shape
-        summaries.append(replace(image, bright=bright, saturated=float(share) if fits else image.saturated))
-    return level, tuple(summaries)
+def _summarise(pixels: StoredPixels, size: tuple[int, ...]) -> ImageSummary:
+    """Return the summary of an image with this height and width, relative to its full scale."""
+    return ImageSummary(
+        pixels.path,
+        (*size, pixels.values.shape[1]),
+        str(pixels.values.dtype),
+        float(np.quantile(to_linear(pixels.values, pixels.path), 0.99)),
+        float(find_saturated(pixels.values).mean()),
+    )
+
+
+def _relative_to(level: WhiteLevel | None, image: ImageSummary) -> ImageSummary:
+    """Return the image with its brightness relative to the white level."""
+    full_scale = np.iinfo(image.dtype).max if image.dtype.startswith("uint") else 0
+    # The white level of 16-bit images does not apply to 8-bit images among them.
+    if level is None or full_scale < level.value:
+        return image
+    return replace(image, bright=image.bright * (full_scale / level.value))

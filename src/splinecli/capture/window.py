@@ -19,17 +19,11 @@ _SCALE, _CROP = re.compile(r"1(?:/(\d{1,3}))?"), re.compile(r"\d{1,9}(?:,\d{1,9}
 
 @dataclass(frozen=True)
 class Window:
-    """Which pixels of the images are read. Pixels are left out, not averaged, so their values are those of the files.
+    """Which pixels of the images are read. Pixels are left out, not averaged, so values are those of the files."""
 
-    Args:
-        box: left, top, width and height in pixels; None for whole images.
-        step: one of so many rows and columns is read.
-        shape: (H, W) of the whole images, where they are not read as a whole.
-    """
-
-    box: tuple[int, int, int, int] | None = None
-    step: int = 1
-    shape: tuple[int, ...] | None = None
+    box: tuple[int, int, int, int] | None = None  # left, top, width and height in pixels; None for whole images
+    step: int = 1  # one of so many rows and columns is read
+    shape: tuple[int, ...] | None = None  # (H, W) of the whole images, where they are not read as a whole
 
     @property
     def is_whole(self) -> bool:

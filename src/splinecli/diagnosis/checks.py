@@ -15,22 +15,14 @@ from splinecli.capture.restore.light_intensities import estimate_light_intensiti
 from splinecli.capture.restore.light_refinement import would_refine
 from splinecli.capture.sample import Sample, leave_out_background, sample_observations, take_closeup
 from splinecli.diagnosis.evidence import Evidence, StatedLights
-from splinecli.diagnosis.explanations import encoded_values, near_lamps
-from splinecli.diagnosis.ground_truth import check_ground_truth
-from splinecli.diagnosis.image_shifts import shift_warnings
-from splinecli.diagnosis.light_advice import light_warnings
-from splinecli.diagnosis.light_check import LightCheck
+from splinecli.diagnosis.explanations import check_ground_truth, encoded_values, near_lamps
+from splinecli.diagnosis.light_check import LightCheck, light_warnings
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg
 
-SMALLEST_SPREAD = 0.1
-"""Lights that determine normals worse than this carry a warning; see light_spread."""
-
-MOST_BACKGROUND = 0.5
-"""Share of near black pixels above which a capture without a mask carries a warning."""
-
-LEAST_EXPECTED = 0.1
-"""Smallest expected share of normals within 5 degrees without a warning."""
+SMALLEST_SPREAD = 0.1  # lights that determine normals worse than this carry a warning; see light_spread
+MOST_BACKGROUND = 0.5  # share of near black pixels above which a capture without a mask carries a warning
+LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
 
 SAME_IMAGE = 1e-12
 """One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6 and more."""
@@ -39,12 +31,22 @@ UNEQUAL_MISFIT, UNEQUAL_RATIO = (0.1, 0.4), 0.3
 """Light intensities are unequal if equal ones leave a misfit in this range, as a share of the brightness, and those
 that fit best leave less than this share of it. Right captures of flat metal leave more than the range."""
 
+_MOST_NAMED = 4  # shifted images in a sentence
 
 Check = Callable[[Evidence], list[CaptureWarning]]
 
 
 def shifted_images(seen: Evidence) -> list[CaptureWarning]:
-    return shift_warnings(seen.shifts, seen.lights.names)
+    shifts, names = seen.shifts, seen.lights.names
+    if not shifts:
+        return []
+    named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
+    more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
+    text = (
+        f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
+        f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
+    )
+    return [CaptureWarning(codes.IMAGES_SHIFTED, text)]
 
 
 def odd_image(seen: Evidence) -> list[CaptureWarning]:
@@ -59,6 +61,10 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         " the object. Photograph it again, or leave it out."
     )
     return [CaptureWarning(codes.IMAGE_ODD, text)]
+
+
+def doubted_lights(seen: Evidence) -> list[CaptureWarning]:
+    return light_warnings(seen.light_check, seen.lights.origin, seen.lights.frame, strict=seen.strict)
 
 
 def missing_mask(seen: Evidence) -> list[CaptureWarning]:
@@ -142,7 +148,7 @@ EXPLAINED = DOUBTED | {codes.ENCODED_VALUES}
 CHECKS: tuple[tuple[Check, frozenset[str]], ...] = (
     (shifted_images, frozenset()),
     (odd_image, frozenset()),
-    (lambda seen: light_warnings(seen.light_check, seen.lights, strict=seen.strict), frozenset()),
+    (doubted_lights, frozenset()),
     (missing_mask, frozenset()),
     (crowded_lights, frozenset()),
     (same_images, frozenset()),

@@ -22,33 +22,20 @@ from splinecli.maths.solve_3x3 import solve_each
 
 @dataclass(frozen=True, eq=False)
 class StatedLights:
-    """What files or arguments say about the lights of F images.
-
-    Args:
-        names: of the images.
-        directions: (N, 3), all lights of the file, in its order.
-        indices: (F,), those of the images.
-        origin: the file.
-        frame: the frame in which it was read.
-        intensities_measured: whether the intensities are given.
-        intensities_known: whether they are given, or the user says that they are equal.
-        linear: whether the values of the images are taken as linear.
-        lamps: all near lamps, over the grid of the sample that is checked; None if the lights count as distant.
-        has_positions: whether positions of lamps are known.
-        found: whether the lights were found from these images, so that the images cannot contradict them.
-    """
+    """What files or arguments say about the lights of F images."""
 
     names: Sequence[str]
-    directions: NDArray[np.float64]
-    indices: Sequence[int]
-    origin: Path
-    frame: LightFrame
-    intensities_measured: bool
-    intensities_known: bool
-    linear: bool
-    lamps: NearLamps | None
-    has_positions: bool
-    found: bool = False
+    directions: NDArray[np.float64]  # (N, 3), all lights of the file, in its order
+    indices: Sequence[int]  # (F,), those of the images
+    intensities_measured: bool  # whether the intensities are given
+    intensities_known: bool  # whether they are given, or the user says that they are equal
+    # all near lamps, over the grid of the sample that is checked; None if the lights count as distant
+    lamps: NearLamps | None = None
+    has_positions: bool = False  # whether positions of lamps are known
+    found: bool = False  # whether the lights were found from these images, so that the images cannot contradict them
+    origin: Path = Path("light_directions")
+    frame: LightFrame = USUAL_FRAME
+    linear: bool = True  # whether the values of the images are taken as linear
 
     @classmethod
     def of_source(cls, source: CaptureSource, sample: Sample, indices: Sequence[int]) -> StatedLights:
@@ -58,14 +45,14 @@ class StatedLights:
             names=[source.files.images[index].name for index in indices],
             directions=source.light_directions,
             indices=indices,
-            origin=source.files.light_directions or Path("light_directions"),
-            frame=source.light_frame,
             intensities_measured=source.intensities_measured,
             intensities_known=source.intensities_known,
-            linear=source.radiometry.curve == 1,
             lamps=source.lamps_over(sample.mask, step=sample.step) if used else None,
             has_positions=source.lamps is not None,
             found=source.find_lights is not None,
+            origin=source.files.light_directions or Path("light_directions"),
+            frame=source.light_frame,
+            linear=source.radiometry.curve == 1,
         )
 
     @classmethod
@@ -78,11 +65,8 @@ class StatedLights:
             names=[f"images[{index}]" for index in range(capture.n_lights)],
             directions=capture.light_directions,
             indices=range(capture.n_lights),
-            origin=Path("light_directions"),
-            frame=USUAL_FRAME,
             intensities_measured=intensities_measured,
             intensities_known=intensities_measured,
-            linear=True,
             lamps=lamps,
             has_positions=lamps is not None,
             found=capture.light_errors_deg is not None,
@@ -91,22 +75,15 @@ class StatedLights:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A capture as the checks see it; what several of them need is found once.
-
-    Args:
-        lights: what is stated about the lights.
-        sample, closeup: without dark background, not divided by estimated intensities.
-        background: its share.
-        truth: (H, W, 3), the ground truth of the whole images, or None.
-        strict: also warn of what the images do not tell.
-    """
+    """A capture as the checks see it; what several of them need is found once."""
 
     lights: StatedLights
+    # sample, closeup: without dark background, not divided by estimated intensities
     sample: Sample
     closeup: Sample
-    background: float = 0.0
-    truth: NDArray[np.floating] | None = None
-    strict: bool = False
+    background: float = 0.0  # its share
+    truth: NDArray[np.floating] | None = None  # (H, W, 3), the ground truth of the whole images, or None
+    strict: bool = False  # also warn of what the images do not tell
 
     @cached_property
     def directions(self) -> NDArray[np.float64]:
@@ -143,9 +120,9 @@ class Evidence:
 
     @cached_property
     def light_check(self) -> LightCheck:
-        lights = self.lights
+        stated = self.lights
         return check_lights(
-            self.observations, self.sample.mask, lights.directions, lights.indices, lights.names, self.factors
+            self.observations, self.sample.mask, stated.directions, stated.indices, stated.names, self.factors
         )
 
     @cached_property

@@ -17,32 +17,21 @@ from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 
-SMOOTHING = 1.5
-"""Standard deviation in pixels of the smoothing of the normals before they are differentiated."""
-
-RIM_PIXELS = 3
-"""Width of the rim inside the outline, in pixels."""
-
-STEEP_Z = 0.7
-"""A rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction."""
-
+SMOOTHING = 1.5  # standard deviation in pixels of the smoothing of the normals before they are differentiated
+RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
+STEEP_Z = 0.7  # a rim pixel counts as steep if its normal is at least 45 degrees from the viewing direction
 _LOWEST_Z = 0.2  # slopes grow without bound towards the outline
 _FITS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class RoughNormals:
-    """Normals on a grid of pixels.
+    """Normals on a grid of pixels."""
 
-    Args:
-        normals: (h, w, 3), unit in the mask, zero outside.
-        mask: (h, w).
-        outward: (h, w, 2), unit vectors in the image, x right and y up, that point out of the mask, at the pixels of
-            the rim; zero elsewhere.
-    """
-
-    normals: Array
-    mask: NDArray[np.bool_]
+    normals: Array  # (h, w, 3), unit in the mask, zero outside
+    mask: NDArray[np.bool_]  # (h, w)
+    # (h, w, 2), unit vectors in the image, x right and y up, that point out of the mask, at the pixels of the rim; zero
+    # elsewhere
     outward: Array
 
     @property

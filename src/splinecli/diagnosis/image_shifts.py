@@ -13,11 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.capture_warnings import IMAGES_SHIFTED, CaptureWarning
 from splinecli.capture.sample import Sample
 
-LARGEST = 8
-"""The largest shift that is looked for, in pixels of the sample."""
+LARGEST = 8  # largest shift that is looked for, in pixels of the sample
 
 LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
 """A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
@@ -26,13 +24,8 @@ images and more, a polished metal reached 0.44 and 0.17."""
 LEAST_SHIFT = 0.8
 """The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel."""
 
-LEAST_IMAGES = 10
-"""The fewest images: from fewer, polished metals are predicted so badly that right ones would be named."""
-
-LEAST_PIXELS = 1000
-"""The fewest pixels that must stay in the mask under every shift."""
-
-_MOST_NAMED = 4  # images in a sentence
+LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
+LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
 _MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more
 _DETAIL, _CONTRAST = 1.5, 4.0  # standard deviations of blurs in pixels: finer detail, local contrast
 _LIMIT = 4.0  # of detail, in local contrasts: highlights count no more
@@ -46,6 +39,11 @@ class ImageShift(NamedTuple):
     right: int
     down: int
 
+    def __str__(self) -> str:
+        """Return the shift as "2 right 1 up"."""
+        directions = [(self.right, "right", "left"), (self.down, "down", "up")]
+        return " ".join(f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by)
+
 
 def find_shifts(sample: Sample) -> list[ImageShift]:
     """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of the images."""
@@ -54,43 +52,16 @@ def find_shifts(sample: Sample) -> list[ImageShift]:
     if values.shape[1] < LEAST_IMAGES or np.count_nonzero(inner) < LEAST_PIXELS:
         return []
     values = values / np.maximum(values.mean(axis=0), 1e-9)
-    found = _shifts_against(values, range(values.shape[1]), sample.mask, inner)
-    still = [place for place in range(values.shape[1]) if place not in found]
-    if found and len(still) >= _MIN_PREDICTORS:
-        # A shifted image also disturbs the prediction of others.
-        found = _shifts_against(values, still, sample.mask, inner)
-    return [ImageShift(place, right * sample.step, down * sample.step) for place, (right, down) in found.items()]
 
+    def shifts_against(predictors: Sequence[int]) -> list[ImageShift]:
+        predicted = enumerate(_predictions(values, predictors))
+        shifts = ((place, _shift(values[:, place], image, sample.mask, inner)) for place, image in predicted)
+        return [ImageShift(place, *(sample.step * by for by in shift)) for place, shift in shifts if shift is not None]
 
-def _shifts_against(
-    values: NDArray[np.float32],
-    predictors: Sequence[int],
-    mask: NDArray[np.bool_],
-    inner: NDArray[np.float32],
-) -> dict[int, tuple[int, int]]:
-    """Return the shifts (right, down) of those images of (P, F) that some of them show to be shifted."""
-    predictions = enumerate(_predictions(values, predictors))
-    shifts = {place: _shift(values[:, place], predicted, mask, inner) for place, predicted in predictions}
-    return {place: shift for place, shift in shifts.items() if shift is not None}
-
-
-def shift_warnings(shifts: Sequence[ImageShift], names: Sequence[str]) -> list[CaptureWarning]:
-    """Return a warning about images that are shifted, among images of these names; an empty list for none."""
-    if not shifts:
-        return []
-    named = ", ".join(f"{names[shift.place]} {_in_words(shift)}" for shift in shifts[:_MOST_NAMED])
-    more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
-    text = (
-        f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted against the others, in"
-        f" pixels: {named}{more}. The camera or the object moved. Photograph from a tripod, or align the images first."
-    )
-    return [CaptureWarning(IMAGES_SHIFTED, text)]
-
-
-def _in_words(shift: ImageShift) -> str:
-    """Return a shift as "2 right 1 up"."""
-    directions = [(shift.right, "right", "left"), (shift.down, "down", "up")]
-    return " ".join(f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by)
+    found = shifts_against(range(values.shape[1]))
+    still = sorted({*range(values.shape[1])} - {shift.place for shift in found})
+    # A shifted image also disturbs the prediction of others.
+    return shifts_against(still) if found and len(still) >= _MIN_PREDICTORS else found
 
 
 def _predictions(values: NDArray[np.float32], predictors: Sequence[int]) -> Iterator[NDArray[np.float32]]:

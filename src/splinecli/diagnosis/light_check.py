@@ -9,20 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import capture_warnings as codes
+from splinecli.capture.capture_warnings import CaptureWarning
 from splinecli.capture.lights.light_fit import Factors, find_factors
 from splinecli.capture.lights.light_frames import BOTH_NEGATED, PLANE_FRAMES, LightFrame
-from splinecli.diagnosis.frame_evidence import RoughNormals, rough_normals
-from splinecli.diagnosis.light_order import (
-    MIN_LIGHTS,
-    UNKNOWN_ORDER,
-    check_order,
-    shift_steps,
-    shift_words,
-)
+from splinecli.diagnosis.frame_evidence import rough_normals
+from splinecli.diagnosis.light_order import MIN_LIGHTS, UNKNOWN_ORDER, ZENITH, check_order
 from splinecli.diagnosis.odd_image import OddImage, find_odd_image
 
 Array = NDArray[np.float64]
@@ -30,8 +28,8 @@ Array = NDArray[np.float64]
 CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 """The weights of a ratio of curls (its logarithm) and of a difference of rims. From a sum of 1, a frame is better."""
 
-NEAR = 0.1
-"""Candidates whose advantages differ by less are near equals."""
+TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
+NEAR = 0.1  # candidates whose advantages differ by less are near equals
 
 LOWEST_CURL = 0.1
 """Curls below this are noise. On a cap of a sphere, other frames give little more."""
@@ -39,82 +37,55 @@ LOWEST_CURL = 0.1
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""
 
-_AS_GIVEN = "as given"
-
 
 @dataclass(frozen=True)
 class Candidate:
-    """One reading of the light file.
+    """One reading of the light file."""
 
-    Args:
-        name: in words, such as "y negated".
-        frame: its frame, relative to the given one. None where it is an order that no frame stands for.
-        matrix: (3, 3) M, where lights @ M' are those of this reading.
-        misfit: distance between the images and these lights, as a share of the median of random orders; None where
-            there are too few lights.
-        curl: of the normals; 0 is a surface.
-        rim: mean cosine between normals and the outward direction at the outline; None without a closed outline.
-        steps: by how many lights it shifts the order.
-        advantage: evidence for it against the given lights; from 1 it is better.
-    """
-
-    name: str
-    frame: LightFrame | None
-    matrix: Array = field(compare=False)
-    misfit: float | None
-    curl: float
-    rim: float | None
-    steps: int = 0
-    advantage: float = 0.0
+    name: str  # in words, such as "y negated"
+    frame: LightFrame | None  # its frame, relative to the given one. None where it is an order that no frame stands for
+    matrix: Array = field(compare=False)  # (3, 3) M, where lights @ M' are those of this reading
+    curl: float  # of the normals; 0 is a surface
+    rim: float  # mean cosine between normals and the outward direction at the outline; NaN without a closed outline
+    steps: int = 0  # by how many lights it shifts the order
+    advantage: float = 0.0  # evidence for it against the given lights; from 1 it is better
 
 
 @dataclass(frozen=True)
 class LightCheck:
-    """What the images say about the light directions.
+    """What the images say about the light directions."""
 
-    Args:
-        candidates: readings of the light file; the given one first, then from best to worst.
-        order: the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits.
-        given_misfit, order_misfit: as in Candidate, of the given order and of the better one.
-        best: the reading that gives better normals; None if there is none. Its frame is relative to the given one.
-        tried: readings of the order in words, each with its misfit.
-        outline_counts: how much the normals at the mask's edge count, from 0 to 1.
-        odd_image: an image that contradicts the others, without which all this was found; None if there is none.
-        mended: (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no
-            order fits.
-    """
-
-    candidates: tuple[Candidate, ...]
-    order: str | None = None
-    given_misfit: float | None = None
-    order_misfit: float | None = None
-    best: Candidate | None = None
-    tried: tuple[tuple[str, float], ...] = ()
-    outline_counts: float = 0.0
+    candidates: tuple[Candidate, ...]  # readings of the light file; the given one first, then from best to worst
+    # the reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one fits
+    order: str | None
+    # given_misfit, order_misfit: distances between the images and the lights in the given order and in the better one,
+    # as shares of the median of random orders; NaN where there are too few lights
+    given_misfit: float
+    order_misfit: float
+    # the reading that gives better normals; None if there is none. Its frame is relative to the given one
+    best: Candidate | None
+    tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its misfit
+    outline_counts: float  # how much the normals at the mask's edge count, from 0 to 1
+    # (F, 3), the lights of the observations in the best reading; None where the given one is the best, or no order fits
+    mended: Array | None
+    # an image that contradicts the others, without which all this was found; None if there is none
     odd_image: OddImage | None = None
-    mended: Array | None = None
 
     @property
     def given(self) -> Candidate:
         return self.candidates[0]
 
-    def order_fits_better_by(self, share: float) -> bool:
-        """Return whether another order leaves less than this share of the given one's misfit."""
-        if self.order in (None, UNKNOWN_ORDER) or self.order_misfit is None or self.given_misfit is None:
-            return False
-        return self.order_misfit <= share * self.given_misfit
-
     @property
     def unchecked(self) -> list[str]:
         """What the images do not tell about the lights, in words."""
         missing = []
-        if self.given_misfit is None:
+        if np.isnan(self.given_misfit):
             missing.append(f"their order (fewer than {MIN_LIGHTS} lights, too few lit pixels, or a flat object)")
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
             missing.append("their frame (too few pixels)")
-        elif 2 * RIM_WEIGHT * self.outline_counts * abs(self.given.rim or 0) < 1:
+        elif 2 * RIM_WEIGHT * self.outline_counts * abs(np.nan_to_num(self.given.rim)) < 1:
             missing.append("whether x and y are both negated (the mask's edge is no clear outline of the object)")
         return missing
 
@@ -140,14 +111,14 @@ def check_lights(
     factors = find_factors(observations) if factors is None else factors
     check = _check_frame_and_order(observations, mask, light_directions, chosen, names, factors)
     odd = None if factors is None else find_odd_image(factors, light_directions[chosen])
-    if factors is None or odd is None or check.order_fits_better_by(odd.left):
+    other_order = check.order not in (None, UNKNOWN_ORDER)
+    if factors is None or odd is None or (other_order and check.order_misfit <= odd.left * check.given_misfit):
         return check
     kept = np.delete(np.arange(len(chosen)), odd.place)
     others = observations[:, kept]
     factors = find_factors(others, intensities_known=factors.intensities_known)
-    check = _check_frame_and_order(
-        others, mask, light_directions, chosen[kept], [names[int(place)] for place in kept], factors
-    )
+    names = [names[int(place)] for place in kept]
+    check = _check_frame_and_order(others, mask, light_directions, chosen[kept], names, factors)
     return replace(check, odd_image=odd)
 
 
@@ -163,30 +134,26 @@ def _check_frame_and_order(
     found = check_order(observations, factors, light_directions, chosen, names)
     normals = rough_normals(observations / found.intensities, found.lights, mask)
     weight = (normals.rim_steepness - RIM_COUNTS_FROM) / (RIM_COUNTS_FULLY - RIM_COUNTS_FROM)
-    if not found.plausible:
-        weight = 0.0
-    weight = float(np.clip(weight, 0, 1))
-    frames = [
-        _candidate(frame.describe() or _AS_GIVEN, frame, frame.matrix, normals, found.misfit, weight)
-        for frame in PLANE_FRAMES
-        if frame.signs[0] > 0
-    ]
-    first, *others = (*frames, *map(_negated, frames))
-    for row, matrix in found.turns:
-        words, steps = shift_words(row, len(light_directions)), shift_steps(row, len(light_directions))
-        turned = _candidate(words, None, matrix, normals, found.misfit, weight)
-        others.append(replace(turned, steps=steps))
-    ranked = sorted((_judge(other, first, weight) for other in others), key=lambda other: -other.advantage)
-    # Where no order fits, the normals are no evidence.
-    best = None if found.order == UNKNOWN_ORDER else _best(ranked, in_order=found.order is not None)
+    weight = float(np.clip(weight, 0, 1)) if found.plausible else 0.0
+
+    def candidate(name: str, frame: LightFrame | None, matrix: Array, steps: int = 0) -> Candidate:
+        turned = normals.transformed(matrix)
+        return Candidate(name, frame, matrix, turned.curl(), turned.rim() if weight > 0 else np.nan, steps)
+
+    given, *others = (candidate(frame.describe() or "as given", frame, frame.matrix) for frame in PLANE_FRAMES)
+    others += [candidate(turn.words, None, turn.matrix, turn.steps) for turn in found.turns]
+    judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
+    ranked = sorted(judged, key=lambda other: -other.advantage)
     order, mended = found.order, None
-    if order != UNKNOWN_ORDER and (order is not None or best is not None):
-        mended = found.lights if best is None else found.lights @ best.matrix.T
+    # Where no order fits, the normals are no evidence.
+    best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
+    if best is not None:
+        mended = found.lights @ best.matrix.T
+    elif order not in (None, UNKNOWN_ORDER):
+        mended = found.lights
     if order is not None and best is not None and best.frame is None:
         order, best = best.name, None  # one of several orders that fit, told by the normals
-    return LightCheck(
-        (first, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, mended=mended
-    )
+    return LightCheck((given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, mended)
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
@@ -200,25 +167,96 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
     return min(preferred or near, key=lambda candidate: candidate.steps, default=None)
 
 
-def _candidate(
-    name: str, frame: LightFrame | None, matrix: Array, normals: RoughNormals, misfit: float | None, weight: float
-) -> Candidate:
-    normals = normals.transformed(matrix)
-    return Candidate(name, frame, matrix, misfit, normals.curl(), normals.rim() if weight > 0 else None)
-
-
-def _negated(candidate: Candidate) -> Candidate:
-    """Return a candidate with x and y negated in addition: all slopes change sign, and so does the rim."""
-    assert candidate.frame is not None
-    frame = BOTH_NEGATED.after(candidate.frame)
-    rim = None if candidate.rim is None else -candidate.rim
-    return replace(candidate, name=frame.describe(), frame=frame, matrix=frame.matrix, rim=rim)
-
-
-def _judge(other: Candidate, given: Candidate, weight: float) -> Candidate:
-    """Return the candidate with its advantage over the given one."""
+def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
     curls = np.log(max(given.curl, LOWEST_CURL) / max(other.curl, LOWEST_CURL))
-    advantage = CURL_WEIGHT * (curls if np.isfinite(curls) else 0.0)
-    if other.rim is not None and given.rim is not None:
-        advantage += RIM_WEIGHT * weight * (other.rim - given.rim)
-    return replace(other, advantage=float(advantage))
+    rims = weight * (other.rim - given.rim)
+    return float(CURL_WEIGHT * np.nan_to_num(curls) + RIM_WEIGHT * np.nan_to_num(rims))
+
+
+def light_warnings(
+    check: LightCheck, light_file: Path, frame: LightFrame, *, strict: bool = False
+) -> list[CaptureWarning]:
+    """Return the warnings about lights of a file that was read in a frame, which the advice replaces.
+
+    Args:
+        strict: also warn of what the images do not tell. It says nothing about most reliefs without an outline.
+    """
+    warnings = []
+    if check.order is not None:
+        code = codes.LIGHT_FRAME if check.order == ZENITH else codes.LIGHT_ORDER
+        warnings.append(CaptureWarning(code, _order_text(check, light_file)))
+    if check.best is not None:
+        code = codes.LIGHT_FRAME if check.best.frame is not None else codes.LIGHT_ORDER
+        warnings.append(CaptureWarning(code, _frame_text(check, check.best, frame, light_file)))
+    if strict and check.unchecked:
+        text = f"This could not be checked of the lights of {light_file.name}: {'; '.join(check.unchecked)}."
+        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
+    return warnings
+
+
+def _order_text(check: LightCheck, light_file: Path) -> str:
+    given = 100 * check.given_misfit
+    if check.order == UNKNOWN_ORDER:
+        return (
+            f"The images fit {light_file.name} no better than lights in a random order"
+            f" (misfit {given:.0f} % of a random order's). Its lines are in another order than the"
+            " images, or it belongs to another capture."
+        )
+    remedy = "Check that its lines are in the order of the images."
+    if check.order == ZENITH:
+        remedy = "Replace each elevation by 90 degrees minus it."
+    return (
+        f"The images fit the lights of {light_file.name} much better {check.order}"
+        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %). {remedy}"
+    )
+
+
+def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
+    pairs = (("curl", best.curl, check.given.curl, ".2f"), ("outline", best.rim, check.given.rim, "+.2f"))
+    figures = [
+        f"{name} {one:{form}} against {other:{form}}"
+        for name, one, other, form in pairs
+        if f"{one:{form}}" != f"{other:{form}}"
+    ]
+    twin = mirror_twin(check, best)
+    words = best.name if best.frame is None else f"with {best.name}"
+    if twin is not None:
+        words += f" or with {twin.name}"
+    text = f"The lights give normals that fit a surface much better {words} ({', '.join(figures)})"
+    if best.frame is None:
+        return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
+    advice = f"{text}: run again with --light-frame {best.frame.after(frame)}."
+    if twin is not None and twin.frame is not None:
+        return (
+            f"{advice[:-1]} or {twin.frame.after(frame)}. They exchange hollows and bumps; without a closed outline,"
+            " only you can tell which is right."
+        )
+    if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
+        advice += " If the object is hollow up to its outline, as the inside of a bowl, the lights are right."
+    return advice
+
+
+def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
+    """Return the reading with x and y negated in addition, if the evidence cannot tell it from the best one."""
+    if best.frame is None:
+        return None
+    frame = BOTH_NEGATED.after(best.frame)
+    twin = next(candidate for candidate in check.candidates if candidate.frame == frame)
+    return twin if twin is not check.given and twin.advantage > best.advantage - TOLD_APART else None
+
+
+def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
+    """Return the compared readings of a light file as JSON values; figures that cannot be told are null.
+
+    Frames come first, then orders, which are judged by their misfit alone.
+    """
+    readings = [
+        (candidate.name, (check.order_misfit, candidate.curl, candidate.rim, candidate.advantage))
+        for candidate in check.candidates
+    ]
+    readings += [(words, (misfit, np.nan, np.nan, np.nan)) for words, misfit in check.tried]
+    rows = []
+    for words, values in readings:
+        rounded = [round(value, 3) if np.isfinite(value) else None for value in values]
+        rows.append(dict(zip(("reading", "misfit", "curl", "rim", "advantage"), (words, *rounded), strict=True)))
+    return rows

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.lights.light_angles import zenith_as_elevation
 from splinecli.capture.lights.light_fit import (
     Factors,
     fit_residual,
@@ -25,12 +24,12 @@ from splinecli.capture.lights.light_fit import (
     shifted_orders,
     swapped_orders,
 )
+from splinecli.capture.lights.light_rows import zenith_as_elevation
 from splinecli.diagnosis.light_rings import mend_rings
 
 Array = NDArray[np.float64]
 
-MIN_LIGHTS = 6
-"""Fewer lights leave too few equations to judge their order."""
+MIN_LIGHTS = 6  # fewer lights leave too few equations to judge their order
 
 BETTER_ORDER, BETTER_ORDER_OF_FEW, FEW = 0.6, 0.4, 8
 """Another order is better if its misfit is below this share of the given one's; the second for FEW lights or fewer."""
@@ -44,8 +43,7 @@ MIN_MISFIT, MIN_SWAP_MISFIT = 0.25, 0.08
 MIN_RING_MISFIT, BETTER_RINGS = 0.1, 0.75
 """The same for single rings of a dome, and the largest share of the misfit that is left when they are mended."""
 
-CHANCE = 0.02
-"""An order is wrong if more than this share of random orders fits as well."""
+CHANCE = 0.02  # an order is wrong if more than this share of random orders fits as well
 
 MIN_LIGHTS_FOR_CHANCE = 8
 """Fewer lights fit in too many random orders by chance. They are compared under known intensities, if there are any."""
@@ -62,8 +60,7 @@ UNFIT_MISFIT, UNFIT_RATIO = 0.5, 6.0
 """An order is also wrong above this misfit, as a share of random orders', if it is also this many times what no lights
 could explain: highlights and shadows."""
 
-UNKNOWN_ORDER = "unknown"
-"""The order of the lights does not fit, and no simple other one does."""
+UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
 
 ZENITH = "if their elevations count from the camera axis"
 """The reading of lights whose file has zenith angles in place of elevations, in words."""
@@ -77,31 +74,39 @@ MAX_PLAIN_MISFIT, MAX_FREE_MISFIT = 0.5, 0.35
 _FITTED_PIXELS, _FITTED_ORDERS = 800, 9
 
 
+class Turn(NamedTuple):
+    """A shift of the lights that fits as well: in words, its steps, and the matrix (3, 3) that takes lights there."""
+
+    words: str
+    steps: int
+    matrix: Array
+
+
 @dataclass(frozen=True, eq=False)
 class LightOrder:
-    """The order of lights that fits best.
+    """The order of lights that fits best."""
 
-    Args:
-        order: in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found.
-        lights: (F, 3), in this order.
-        intensities: (F,), those that fit these lights best; ones where only known ones tell the order. They make the
-            normals of metals better.
-        given_misfit, misfit: of the given order and of this one, as shares of random orders'; None where there are too
-            few lights.
-        plausible: whether the lights fit well enough for the normals to tell an outline.
-        tried: readings in words, each with its misfit as a share of random orders'.
-        turns: rows of shifted_orders that fit as well, with the matrices (3, 3) that take the lights there. They turn a
-            regular ring of lights.
-    """
-
+    # in words; None for the given order, UNKNOWN_ORDER where it does not fit and no other one was found
     order: str | None
-    lights: Array
+    lights: Array  # (F, 3), in this order
+    # (F,), those that fit these lights best; ones where only known ones tell the order. They make the normals of metals
+    # better
     intensities: Array
-    given_misfit: float | None = None
-    misfit: float | None = None
-    plausible: bool = True
-    tried: tuple[tuple[str, float], ...] = ()
-    turns: tuple[tuple[int, Array], ...] = ()
+    # given_misfit, misfit: of the given order and of this one, as shares of random orders'; NaN where there are too few
+    # lights
+    given_misfit: float = np.nan
+    misfit: float = np.nan
+    plausible: bool = True  # whether the lights fit well enough for the normals to tell an outline
+    tried: tuple[tuple[str, float], ...] = ()  # readings in words, each with its misfit as a share of random orders'
+    turns: tuple[Turn, ...] = ()  # shifts that fit as well. They turn a regular ring of lights
+
+
+class _Reading(NamedTuple):
+    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their misfit."""
+
+    words: str | None
+    lights: Array
+    misfit: float
 
 
 def check_order(
@@ -117,81 +122,58 @@ def check_order(
         factors: of the observations; None where there are too few lit ones.
         light_directions: (N, 3), all lights of the capture, which are shifted and reversed together.
         chosen: (F,) the lights of the observations.
-        names: of the F images.
     """
-    lights = light_directions[chosen]
+    lights, n_all = light_directions[chosen], len(light_directions)
+    unknown = LightOrder(None, lights, np.ones(len(lights)))
     if factors is None or len(lights) < MIN_LIGHTS:
-        return LightOrder(None, lights, np.ones(len(lights)))
+        return unknown
     compared, random = _free_if_possible(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
     if usual < MIN_RANDOM_MISFIT and not factors.intensities_known:
-        return LightOrder(None, lights, np.ones(len(lights)))
+        return unknown
     given = _Reading(None, lights, float(compared.misfits(lights[None])[0]))
-    shifted = light_directions[shifted_orders(len(light_directions))[:, chosen]]
-    shift_misfits = compared.misfits(shifted)
-    shifts, others = _best_shifts(shifted, shift_misfits), _other_readings(compared, lights, names)
-    found = _better_reading(given, (*shifts, *others), usual)
-    if found.misfit > MIN_RING_MISFIT * usual and np.array_equal(chosen, np.arange(len(light_directions))):
-        words, mended, misfit = mend_rings(compared, lights)
-        if words:
-            others.append(_Reading(words, mended, misfit))
-            if misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
-                found = others[-1]
+    shifted = light_directions[shifted_orders(n_all)[:, chosen]]
+    misfits = compared.misfits(shifted)
+    rows = 1 + int(misfits[1:n_all].argmin()), n_all + int(misfits[n_all:].argmin())
+    shifts = [_Reading(_shift_words(row, n_all), shifted[row], float(misfits[row])) for row in rows]
+    exchanged, zenith = _best_exchange(compared, lights, names), zenith_as_elevation(lights)
+    of_angles = _Reading(ZENITH, zenith, float(compared.misfits(zenith[None])[0]))
+    tried, found, share = [*shifts, exchanged, of_angles], given, given.misfit / usual
+    limit = min(given.misfit * (BETTER_ORDER_OF_FEW if len(lights) <= FEW else BETTER_ORDER), MAX_MENDED * usual)
+    best = min((*shifts, of_angles), key=lambda reading: reading.misfit)
+    if share > MIN_MISFIT and best.misfit < limit:
+        found = best
+    elif share > MIN_SWAP_MISFIT and exchanged.misfit < limit:
+        found = exchanged
+    if found.misfit > MIN_RING_MISFIT * usual and np.array_equal(chosen, np.arange(n_all)):
+        rings = _Reading(*mend_rings(compared, lights))
+        if rings.words:
+            tried.append(rings)
+            if rings.misfit < min(found.misfit * BETTER_RINGS, MAX_MENDED * usual):
+                found = rings
     if found is given and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
-    turns: tuple[tuple[int, Array], ...] = ()
-    is_shift = any(found is shift for shift in shifts)
-    if is_shift or (found is given and given.misfit < MIN_MISFIT * usual):
-        turns = _turns(found.lights, shifted, shift_misfits <= max(1.3 * found.misfit, 0.05 * usual))
+    turns: tuple[Turn, ...] = ()
+    if any(found is shift for shift in shifts) or (found is given and share < MIN_MISFIT):
+        turns = _turns(found.lights, shifted, misfits <= max(1.3 * found.misfit, 0.05 * usual))
     return LightOrder(
         found.words,
         found.lights,
         compared.intensities(found.lights[None])[0],
-        given.misfit / usual,
+        share,
         found.misfit / usual,
         _is_plausible(factors, found, usual),
-        tuple((str(reading.words), reading.misfit / usual) for reading in (*shifts, *others)),
+        tuple((str(reading.words), reading.misfit / usual) for reading in tried),
         turns,
     )
 
 
-class _Reading(NamedTuple):
-    """An order of the lights: in words, or None for the given one; its lights (F, 3) and their misfit."""
-
-    words: str | None
-    lights: Array
-    misfit: float
-
-
-def _best_shifts(shifted: Array, misfits: Array) -> list[_Reading]:
-    """Return the best of shifted orders (2 F, f, 3), and the best shift of the reversed order."""
-    n_all = len(shifted) // 2
-    places = 1 + int(misfits[1:n_all].argmin()), n_all + int(misfits[n_all:].argmin())
-    return [_Reading(shift_words(k, n_all), shifted[k], float(misfits[k])) for k in places]
-
-
-def _other_readings(factors: Factors, lights: Array, names: Sequence[str]) -> list[_Reading]:
-    """Return the best exchange of two lights, and the reading of elevations as angles from the camera axis."""
+def _best_exchange(factors: Factors, lights: Array, names: Sequence[str]) -> _Reading:
     swaps = swapped_orders(len(lights))
-    misfits, zenith = factors.misfits(lights[swaps]), zenith_as_elevation(lights)
-    swap = int(misfits.argmin())
-    one, other = (names[int(i)] for i in np.flatnonzero(swaps[swap] != np.arange(len(lights))))
-    words = f"with those of {one} and {other} exchanged"
-    return [
-        _Reading(words, lights[swaps[swap]], float(misfits[swap])),
-        _Reading(ZENITH, zenith, float(factors.misfits(zenith[None])[0])),
-    ]
-
-
-def _better_reading(given: _Reading, others: Sequence[_Reading], usual: float) -> _Reading:
-    """Return the reading that fits much better than the given one, or the given one."""
-    forward, backward, exchanged, of_angles = others
-    share, few = given.misfit / usual, len(given.lights) <= FEW
-    limit = min(given.misfit * (BETTER_ORDER_OF_FEW if few else BETTER_ORDER), MAX_MENDED * usual)
-    best = min((forward, backward, of_angles), key=lambda reading: reading.misfit)
-    if share > MIN_MISFIT and best.misfit < limit:
-        return best
-    return exchanged if share > MIN_SWAP_MISFIT and exchanged.misfit < limit else given
+    misfits = factors.misfits(lights[swaps])
+    best = int(misfits.argmin())
+    one, other = (names[int(i)] for i in np.flatnonzero(swaps[best] != np.arange(len(lights))))
+    return _Reading(f"with those of {one} and {other} exchanged", lights[swaps[best]], float(misfits[best]))
 
 
 def _is_wrong(observations: NDArray[np.floating], factors: Factors, given: _Reading, random: Array) -> bool:
@@ -235,19 +217,18 @@ def _fits_like_random(observations: NDArray[np.floating], factors: Factors, ligh
     return given > RANDOM_FIT * float(np.median(random))
 
 
-def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[tuple[int, Array], ...]:
-    """Return the fitting ones of shifted orders (N, F, 3), each as the matrix that takes the lights (F, 3) to it."""
-    inverse = np.linalg.pinv(lights)
-    matrices = ((int(k), (inverse @ shifted[k]).T) for k in np.flatnonzero(fitting))
-    return tuple((k, matrix) for k, matrix in matrices if not np.allclose(matrix, np.eye(3), atol=1e-6))
+def _turns(lights: Array, shifted: Array, fitting: NDArray[np.bool_]) -> tuple[Turn, ...]:
+    """Return the fitting ones of shifted orders (2 N, F, 3), but not those that leave the lights (F, 3) in place."""
+    inverse, n_all = np.linalg.pinv(lights), len(shifted) // 2
+    turns = []
+    for row in np.flatnonzero(fitting).tolist():
+        matrix = (inverse @ shifted[row]).T
+        if not np.allclose(matrix, np.eye(3), atol=1e-6):
+            turns.append(Turn(_shift_words(row, n_all), min(row % n_all, -row % n_all), matrix))
+    return tuple(turns)
 
 
-def shift_steps(order: int, n_lights: int) -> int:
-    """Return by how many lights a row of shifted_orders is shifted, in the shorter direction."""
-    return min(order % n_lights, -order % n_lights)
-
-
-def shift_words(order: int, n_lights: int) -> str:
+def _shift_words(order: int, n_lights: int) -> str:
     """Return words for a row of shifted_orders."""
     steps = order % n_lights
     if order < n_lights:

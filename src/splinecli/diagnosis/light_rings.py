@@ -16,14 +16,9 @@ from splinecli.capture.lights.light_fit import Factors
 Array = NDArray[np.float64]
 
 FEWEST_IN_RING = 4
-_GAP_DEG = 3.0
-"""Lights belong to one ring if their elevations follow each other at smaller steps."""
-
-_MOST_LEFT = 0.95
-"""One more ring is mended if at most this share of the misfit is left."""
-
-_EQUAL = 1e-3
-"""Share of the misfit by which equal readings may differ."""
+_GAP_DEG = 3.0  # lights belong to one ring if their elevations follow each other at smaller steps
+_MOST_LEFT = 0.95  # one more ring is mended if at most this share of the misfit is left
+_EQUAL = 1e-3  # share of the misfit by which equal readings may differ
 
 _WAYS = {
     "": (1, 1, 1),

@@ -18,11 +18,8 @@ from splinecli.capture.lights.light_fit import Factors
 
 Array = NDArray[np.float64]
 
-MIN_LIGHTS = 10
-"""With fewer lights, a right image may seem odd by chance."""
-
-MIN_MISFIT = 0.04
-"""Smallest misfit of lights, one of whose images is odd, as a share of the brightness."""
+MIN_LIGHTS = 10  # with fewer lights, a right image may seem odd by chance
+MIN_MISFIT = 0.04  # smallest misfit of lights, one of whose images is odd, as a share of the brightness
 
 ODD_MISFIT, OTHER_MISFIT = 0.35, 0.75
 """Largest misfit without the odd image, and smallest one without any other, as shares of that of all images."""
@@ -40,17 +37,12 @@ OTHER_BRIGHTNESS = 0.3
 
 @dataclass(frozen=True)
 class OddImage:
-    """An image that contradicts the others.
-
-    Args:
-        place: of the image.
-        left: what is left without it of the misfit, or of the residual of the factors, as a share of that of all.
-        brightness: of the image, as a share of what its light would give; None where brightness is not its fault, or
-            the intensity of the light is unknown.
-    """
+    """An image that contradicts the others."""
 
     place: int
-    left: float
+    left: float  # what is left without it of the misfit, or of the residual of the factors, as a share of that of all
+    # of the image, as a share of what its light would give; None where brightness is not its fault, or the intensity of
+    # the light is unknown
     brightness: float | None = None
 
 

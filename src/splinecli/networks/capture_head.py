@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20
 _BEND_TURN = 11
-"""Numbers of features of confidence/features.py, and the place of CaptureFeatures.bend_turn."""
+"""Numbers of features of confidence.py, and the place of CaptureFeatures.bend_turn."""
 
 _HIDDEN = 24
 _MOST = 4.0  # standard deviations of a feature from its mean

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from splinecli.capture.layouts.image_lists import natural_key
+from splinecli.capture.layouts.capture_files import natural_key
 from splinecli.errors import InputError
 
 Stamp = tuple[int, int, int]  # number of files, their bytes, and the newest time of a change in nanoseconds

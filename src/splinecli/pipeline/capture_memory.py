@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from splinecli.capture import CaptureSource
-from splinecli.capture.capture_size import capture_bytes
 from splinecli.capture.formats.facts import StoredSize
+from splinecli.capture.formats.image_size import capture_bytes
 from splinecli.errors import SplinecliError
 from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.infer_options import InferOptions

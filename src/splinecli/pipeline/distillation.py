@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splinecli.capture import Capture
-from splinecli.capture.capture_warnings import CaptureWarning, not_distilled
+from splinecli.capture.capture_warnings import NOT_DISTILLED, CaptureWarning
 from splinecli.errors import UsageError
 from splinecli.inference import light_on
 from splinecli.methods import Estimator
@@ -55,7 +55,12 @@ def distil_for(
             return _refuse(wanted, f"{capture.name}: {error.problem}")
         if distilled.distillation.is_good:
             return distilled, []
-    return None, [not_distilled(distilled.distillation.mean_deg, distilled.distillation.expected_deg)]
+    text = (
+        f"The network estimated every pixel. A small one learned from a sample, but was"
+        f" {distilled.distillation.mean_deg:.1f} degrees away from it, where it expects errors of"
+        f" {distilled.distillation.expected_deg:.1f} degrees."
+    )
+    return None, [CaptureWarning(NOT_DISTILLED, text)]
 
 
 def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarning]]:

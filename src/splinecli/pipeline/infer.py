@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from splinecli.capture import Capture, CaptureSource, capture_name
-from splinecli.capture.capture_size import results_bytes
-from splinecli.capture.formats.image_size import check_memory
+from splinecli.capture.formats.image_size import check_memory, results_bytes
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_refinement import refine_capture
 from splinecli.capture.stamp import digest

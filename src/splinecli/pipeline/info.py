@@ -15,7 +15,7 @@ from splinecli.capture.lights.light_files import rows_text
 from splinecli.capture.summary import CaptureSummary, summarise_capture
 from splinecli.diagnosis.checks import check_sample
 from splinecli.diagnosis.evidence import StatedLights
-from splinecli.diagnosis.light_advice import candidate_rows
+from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.errors import InputError, UsageError
 from splinecli.methods.student_size import student_sizes
 from splinecli.pictures.light_sky import sky_plot

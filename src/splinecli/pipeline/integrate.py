@@ -11,9 +11,8 @@ from typing import Any, get_args
 import numpy as np
 
 from splinecli.capture import read_image, read_normal_map
-from splinecli.capture.capture_size import BYTES_OF_SURFACE
-from splinecli.capture.formats.depth_files import read_depth
-from splinecli.capture.formats.image_size import ExpectedSize, check_memory
+from splinecli.capture.formats.image_size import BYTES_OF_SURFACE, ExpectedSize, check_memory
+from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.lights.lamp_files import read_camera_matrix
 from splinecli.errors import InputError, SplinecliError, UsageError, check_one_of
 from splinecli.maths.normals import Convention

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import get_args
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
-from splinecli.capture.layouts.image_lists import check_not_empty, list_images
+from splinecli.capture.layouts.capture_files import check_not_empty, list_images
 from splinecli.capture.lights.found_lights import ESTIMATE, FirstLight, LightFinder
 from splinecli.capture.lights.lamp_files import LampOptions
-from splinecli.capture.lights.light_angles import LightForm
 from splinecli.capture.lights.light_frames import parse_light_frame
+from splinecli.capture.lights.light_rows import LightForm
 from splinecli.capture.paths import check_file
 from splinecli.capture.reader import EQUAL
 from splinecli.capture.restore.white_level import check_white_level

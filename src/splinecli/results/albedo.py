@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource
-from splinecli.capture.linearise import take_pixels
-from splinecli.capture.observations import StoredPixels
+from splinecli.capture.linearise import StoredPixels, take_pixels
 
 LIT = 0.15  # a light counts for a pixel if n.l is above this
 AGREEING = 0.3  # an observation counts within this share of the median albedo: no highlights, no cast shadows

@@ -11,9 +11,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import image_bytes
+from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError, OutputError
 from splinecli.results.files import NORMALS, PAGE, REPORT, read_report
 from splinecli.results.templates import render

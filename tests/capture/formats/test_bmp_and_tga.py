@@ -8,8 +8,8 @@ from PIL import Image
 
 from scenes import ring_lights, write_capture
 from splinecli.capture import capture_warnings, read_capture
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import read_facts
+from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)

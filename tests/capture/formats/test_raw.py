@@ -11,11 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture, read_capture
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.exif import Exposure, find_exposure
 from splinecli.capture.formats.facts import read_facts
-from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named
-from splinecli.capture.layouts.image_lists import list_images
+from splinecli.capture.formats.images import decode_image
+from splinecli.capture.layouts.capture_files import AMBIENT, MASK, find_named, list_images
 from splinecli.errors import InputError
 
 WHITE = 16383

@@ -17,10 +17,9 @@ from scipy.io import savemat
 from scenes import png_chunk
 from splinecli.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.capture import open_capture
-from splinecli.capture.formats.decoding import decode_image
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size
-from splinecli.capture.formats.images import read_mask
+from splinecli.capture.formats.images import decode_image, read_mask
 from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
 from splinecli.capture.lights.light_files import read_light_directions
 from splinecli.errors import InputError

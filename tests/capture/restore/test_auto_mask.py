@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from splinecli.capture.formats.decoding import decode_image
-from splinecli.capture.formats.images import to_linear
+from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import open_capture
 from splinecli.capture.restore.auto_mask import find_object
 from splinecli.errors import InputError

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
 from splinecli.capture import open_capture
-from splinecli.capture.restore.white_level import SaturationFinder, WhiteLevel
+from splinecli.capture.restore.white_level import Saturation, WhiteLevel, look_at
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, unit
 
@@ -34,10 +34,8 @@ def clip(images: NDArray[np.float64], level: int, exposure: float = 2.0) -> NDAr
 
 def find(images: Images, *, given: int | None = None, stated: int | None = None) -> tuple[WhiteLevel | None, int]:
     """The white level of images (F, H, W), and the number of their saturated observations."""
-    finder = SaturationFinder(images[0].size, len(images), given=given)
-    for position, image in enumerate(images):
-        finder.add(position, image.reshape(-1, 1), Path(f"{position}.png"), stated=stated)
-    saturation = finder.finish()
+    found = tuple(look_at(image.reshape(-1, 1), Path("0.png"), given=given, stated=stated) for image in images)
+    saturation = Saturation(images[0].size, found, given)
     number = 0 if saturation.flags is None else int(saturation.flags.sum())
     assert number == saturation.n_saturated.sum()
     return saturation.white_level, number

@@ -10,9 +10,7 @@ from splinecli.capture.formats.facts import ORIENTATION, ImageFacts
 from splinecli.capture.formats.raw import read_shot
 from splinecli.errors import InputError
 
-UPRIGHT = 1
-"""The orientation of images that are shown as they are stored."""
-
+UPRIGHT = 1  # orientation of images that are shown as they are stored
 _SAME = 0.1  # share within which two exposures count as one: shutters and ISO numbers are rounded
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 

@@ -31,11 +31,8 @@ TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _STARTS = {PNG: "PNG", JPEG: "JPEG", **dict.fromkeys(TIFF, "TIFF"), b"BM": "BMP"}
 """The first bytes of the files. Those of a PNG are the longest."""
 
-PILLOW_KINDS = ("BMP", "TGA")
-"""Kinds of files that Pillow reads, of 8 bits and without a transfer curve."""
-
-StoredSize = tuple[tuple[int, ...], int]
-"""The shape (H, W, C) of an image as stored, and the bytes of each number."""
+PILLOW_KINDS = ("BMP", "TGA")  # kinds of files that Pillow reads, of 8 bits and without a transfer curve
+StoredSize = tuple[tuple[int, ...], int]  # shape (H, W, C) of an image as stored, and the bytes of each number
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
 _KEPT = (0x829A, 0x829D, 0x8827, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
@@ -46,23 +43,16 @@ _MAX_SAMPLE_VALUE, _PROFILE, _WHITE_LEVEL = 281, 34675, 50717  # tags of TIFF an
 _MOST_PARTS = 10_000
 """Chunks of a PNG before its pixels, or segments of a JPEG before its frame. Real files have a few dozen."""
 
-_RAW_WHITE = 65_535
-"""The white level of developed RAW files; see decode_raw."""
+_RAW_WHITE = 65_535  # white level of developed RAW files; see decode_raw
 
 
 @dataclass(frozen=True)
 class StatedCurve:
-    """What a file says of its transfer curve.
+    """What a file says of its transfer curve."""
 
-    Args:
-        curve: see TransferCurve; linear where the file says nothing.
-        by: what says so, for people; empty for nothing.
-        unread: whether there is a colour profile whose curve cannot be read.
-    """
-
-    curve: TransferCurve = 1.0
-    by: str = ""
-    unread: bool = False
+    curve: TransferCurve = 1.0  # see TransferCurve; linear where the file says nothing
+    by: str = ""  # what says so, for people; empty for nothing
+    unread: bool = False  # whether there is a colour profile whose curve cannot be read
 
 
 _FILM, _ENCODED = StatedCurve(BT709, "PNG of a film"), StatedCurve(SRGB, "PNG that says so")
@@ -72,25 +62,18 @@ _CODE_POINTS = {1: _FILM, 6: _FILM, 14: _FILM, 15: _FILM, 8: StatedCurve(), 13: 
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What the header of an image file states.
-
-    Args:
-        kind: "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them.
-        stated_size: None for a RAW file, and for a damaged one.
-        curve: that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA.
-        white_level: the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is
-            in the unit of the decoded values: full scale for a RAW file, whatever its tags say.
-        exif: orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads.
-        damage: why the file cannot be read. It is raised when the size is wanted.
-    """
+    """What the header of an image file states."""
 
     path: Path
-    kind: str = ""
-    stated_size: StoredSize | None = None
-    curve: StatedCurve = StatedCurve()
+    kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
+    stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
+    curve: StatedCurve = StatedCurve()  # that of cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
+    # the white level of a 16-bit image, 2^bits - 1 where the file states bits; None without one. It is in the unit of
+    # the decoded values: full scale for a RAW file, whatever its tags say
     white_level: int | None = None
+    # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only LibRaw reads
     exif: Mapping[int, Any] | None = field(default_factory=dict)
-    damage: InputError | None = None
+    damage: InputError | None = None  # why the file cannot be read. It is raised when the size is wanted
 
     @cached_property
     def size(self) -> StoredSize:

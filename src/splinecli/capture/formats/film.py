@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.damage import damage_as_input_error
+from splinecli.capture.formats.damage import damage_as_input_error, native_stderr
 from splinecli.capture.formats.image_size import check_stored_size
-from splinecli.capture.formats.native_stderr import native_stderr
 from splinecli.capture.paths import check_file, is_folder
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit

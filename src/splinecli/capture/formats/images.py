@@ -1,17 +1,163 @@
-"""Images as linear values, and masks."""
+"""Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files; as linear values, and as masks.
+
+Damaged files are refused. OpenCV fills the missing part of a truncated file with gray and only prints to stderr. So the
+container is checked before it is decoded, and the messages of the C libraries are caught and searched.
+"""
 
 from __future__ import annotations
 
+import os
+import re
+import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.decoding import decode_image, decode_with_alpha
-from splinecli.capture.formats.image_size import ExpectedSize
+from splinecli.capture.formats.damage import COPY_AGAIN, DAMAGED, damage_as_input_error, native_stderr
+from splinecli.capture.formats.facts import PILLOW_KINDS, PNG, facts_in, open_image, open_with_pillow
+from splinecli.capture.formats.image_size import ExpectedSize, check_stored_size, image_bytes
+from splinecli.capture.formats.raw import decode_raw
+from splinecli.capture.formats.tiff import decode_tiff
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
+
+# In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else ends the scan.
+_END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# Messages of libpng and libjpeg about pixels that they could not read.
+_DAMAGE = re.compile(r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE)
+
+_LONGEST_METADATA = 1 << 26  # bytes of a file beside its pixels, such as previews and colour profiles
+
+
+def decode_image(path: Path, expected: ExpectedSize | None = None) -> NDArray[Any]:
+    """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
+
+    The dtype is that of the file: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or 255). PNG, JPEG
+    and TIFF files are recognised by their content. RAW files are recognised by name and developed (see decode_raw). An
+    EXIF orientation is ignored, because all images of a capture share one pixel grid. The header is compared with the
+    expected size.
+
+    Raises:
+        InputError: the file is missing, of another format, truncated or damaged, or a RAW file without rawpy; or the
+            image has not the expected size, or is too large (see check_stored_size).
+    """
+    return decode_with_alpha(path, expected)[0]
+
+
+def decode_with_alpha(path: Path, expected: ExpectedSize | None = None) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Return the pixels as decode_image does, and the alpha channel (H, W) or None. Raises InputError."""
+    with damage_as_input_error(path, DAMAGED, COPY_AGAIN), open_image(path) as (file, kind):
+        size = facts_in(file, kind, path).size
+        check_stored_size(*size, path, expected)
+        length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + _LONGEST_METADATA
+        if length > most:  # it is read as a whole
+            raise InputError(
+                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of this size",
+                path=path,
+            )
+        file.seek(0)
+        pixels = _decode(file, kind, path)
+    if expected is not None:
+        expected.check(pixels.shape, path)
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.shape[2] not in (1, 2, 3, 4):
+        raise InputError(f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path=path)
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * np.uint8(255)
+    if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
+        raise InputError(
+            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones",
+            path=path,
+            hint="Save the image with 16 bits",
+        )
+    if pixels.shape[2] in (2, 4):
+        return pixels[:, :, :-1], pixels[:, :, -1]
+    return pixels, None
+
+
+def _decode(file: BinaryIO, kind: str, path: Path) -> NDArray[Any]:
+    """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
+    if kind == "RAW":
+        return decode_raw(file.read(), path)
+    if kind == "TIFF":
+        pixels = decode_tiff(file, path)
+        if pixels is not None:
+            return pixels
+        file.seek(0)
+    if kind in PILLOW_KINDS:
+        with open_with_pillow(file, kind, path) as picture:
+            mode = {"1": "L", "L": "L", "LA": "LA", "RGBA": "RGBA"}.get(picture.mode, "RGB")
+            return np.asarray(picture.convert(mode))
+    data = file.read()
+    if kind != "TIFF":
+        (_check_png if kind == "PNG" else _check_jpeg)(data, path)
+    return _decode_with_opencv(data)
+
+
+def _decode_with_opencv(data: bytes) -> NDArray[Any]:
+    """Return pixels (H, W) or (H, W, C), in RGB or RGBA order. Raises ValueError or cv2.error for a damaged file."""
+    import cv2
+
+    with native_stderr() as messages:
+        try:
+            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation alone.
+            pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error as error:
+            if error.code == cv2.Error.StsNoMem:
+                raise MemoryError from None
+            raise
+    if pixels is None or _DAMAGE.search("".join(messages)):
+        raise ValueError
+    if pixels.ndim == 2 or pixels.shape[2] not in (3, 4):
+        return pixels
+    if pixels.dtype in (np.uint8, np.uint16, np.float32):
+        code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
+        return np.asarray(cv2.cvtColor(pixels, code, dst=pixels))  # in place, and far faster than an index
+    return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
+
+
+_MOST_SMALL_CHUNKS, _USUAL_CHUNK = 10_000, 1024
+"""A PNG has no more chunks than these, and one for each so many bytes. Writers make chunks of 8 kB and more."""
+
+
+def _check_png(data: bytes, path: Path) -> None:
+    """Raise InputError unless all chunks up to IEND are complete and have the right checksum."""
+    position, view = len(PNG), memoryview(data)
+    for _ in range(_MOST_SMALL_CHUNKS + len(data) // _USUAL_CHUNK):
+        if position + 12 > len(data):
+            break
+        length = int.from_bytes(data[position : position + 4], "big")
+        body, end = position + 4, position + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise InputError("the PNG is damaged (a checksum is wrong)", path=path, hint=COPY_AGAIN)
+        if data[body : body + 4] == b"IEND":
+            return
+        position = end
+    raise InputError("the PNG is truncated", path=path, hint=COPY_AGAIN)
+
+
+def _check_jpeg(data: bytes, path: Path) -> None:
+    """Raise InputError unless there is an end-of-image marker; a second picture after it is ignored."""
+    position = 2
+    while position + 2 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xD9:
+            return
+        if marker == 0xFF:  # fill
+            position += 1
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == 0xDA:  # a scan: the compressed pixels follow its header, without a length
+            following = _END_OF_SCAN.search(data, position)
+            if following is None:
+                break
+            position = following.start()
+    raise InputError("the JPEG is truncated", path=path, hint=COPY_AGAIN)
 
 
 def read_image(path: StrPath, expected: ExpectedSize | None = None) -> NDArray[np.float32]:

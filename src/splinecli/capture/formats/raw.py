@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.native_stderr import native_stderr
+from splinecli.capture.formats.damage import native_stderr
 from splinecli.errors import InputError
 from splinecli.system.extras import import_extra
 

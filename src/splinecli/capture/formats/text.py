@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,54 +23,42 @@ _LINE_END = re.compile(r"\r\n|\r|\n")
 _BYTES_OF_LINE = 20  # at least, on average, in a file of the greatest length: each line takes time and memory
 _FROM_PIPES: dict[Path, bytes] = {}
 
+WordRow = tuple[int, str, list[str]]  # one-based line of a row in its file, this line without comments, and its words
+
 MOST_TEXT = 1_000_000
 """Bytes of the longest text file that is read, unless the images say how long it may be: 14,000 lights."""
 
-DECIMAL_POINT = "A comma separates columns; write decimals with a point"
-"""Hint for a line with decimal commas."""
+DECIMAL_POINT = "A comma separates columns; write decimals with a point"  # hint for a line with decimal commas
+
+
+class Row(NamedTuple):
+    """A row of numbers, its one-based line in the file, and this line as written, without comments."""
+
+    numbers: tuple[float, ...]
+    line: int
+    text: str = ""
 
 
 @dataclass(frozen=True)
 class NumberRows:
-    """The rows of numbers of a text file, all finite; their lengths may differ.
-
-    `lines` has the one-based line of each row in the file, `texts` these lines as written, without comments.
-    """
+    """The rows of numbers of a text file, at least one, all finite; their lengths may differ."""
 
     path: Path
-    rows: tuple[tuple[float, ...], ...]
-    lines: tuple[int, ...]
-    texts: tuple[str, ...] = field(repr=False)
-
-    @classmethod
-    def from_words(cls, path: Path, rows: Sequence[tuple[int, str, list[str]]]) -> NumberRows:
-        """Return the numbers of rows of (line, text, words).
-
-        Raises:
-            InputError: with the line, for a word that is no finite number; also where there are no rows.
-        """
-        if not rows:
-            raise InputError("the file contains no numbers", path=path)
-        numbers = tuple(tuple(parse_number(word, path, line) for word in words) for line, _, words in rows)
-        return cls(path, numbers, tuple(line for line, *_ in rows), tuple(text for _, text, _ in rows))
-
-    def drop_first(self) -> NumberRows:
-        """Return the rows without the first one (a count line)."""
-        return NumberRows(self.path, self.rows[1:], self.lines[1:], self.texts[1:])
+    rows: tuple[Row, ...] = field(repr=False)
 
     def as_array(self) -> NDArray[np.float64]:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
-        lengths = [len(row) for row in self.rows]
+        lengths = [len(row.numbers) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
-        for row, line, text in zip(self.rows, self.lines, self.texts, strict=True):
-            if len(row) != usual:
+        for (_, line, text), length in zip(self.rows, lengths, strict=True):
+            if length != usual:
                 raise InputError(
-                    f"found {columns(len(row))}, expected {usual} as in the other lines",
+                    f"found {columns(length)}, expected {usual} as in the other lines",
                     path=self.path,
                     line=line,
-                    hint=DECIMAL_POINT if len(row) > usual and has_decimal_commas(text) else None,
+                    hint=DECIMAL_POINT if length > usual and has_decimal_commas(text) else None,
                 )
-        return np.array(self.rows, np.float64)
+        return np.array([row.numbers for row in self.rows], np.float64)
 
 
 def columns(count: int) -> str:
@@ -151,11 +140,33 @@ def read_number_rows(path: Path, *, expected: str = "a text file", most: int = M
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without numbers.
     """
+    return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
+
+
+def read_rows_of_words(path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT) -> list[WordRow]:
+    """Return the words of each line that has any, with points for decimal commas. Raises InputError.
+
+    Args:
+        n_numbers: how many numbers stand at the end of a line.
+        expected, most: see read_text.
+    """
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
-    commas = uses_decimal_commas([text for _, text in content if text], 3)
-    rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
-    return NumberRows.from_words(path, [(line, text, words) for line, text, words in rows if words])
+    content = [(line, text) for line, text in content if text.strip(" ,;")]
+    commas = uses_decimal_commas([text for _, text in content], n_numbers)
+    return [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
+
+
+def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
+    """Return the numbers of rows of words.
+
+    Raises:
+        InputError: with the line, for a word that is no finite number; also where there are no rows.
+    """
+    if not rows:
+        raise InputError("the file contains no numbers", path=path)
+    parsed = (Row(tuple(parse_number(word, path, line) for word in words), line, text) for line, text, words in rows)
+    return NumberRows(path, tuple(parsed))
 
 
 def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:

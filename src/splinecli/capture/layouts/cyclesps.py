@@ -17,14 +17,14 @@ from splinecli.capture.layouts.capture_files import (
     Overrides,
     find_named,
     folder_name,
+    list_folder,
+    list_images,
 )
-from splinecli.capture.layouts.image_lists import list_folder, list_images
 from splinecli.capture.lights.light_files import read_light_directions
 from splinecli.capture.paths import is_folder, resolve
 from splinecli.errors import InputError
 
-TREES = ("PRPS", "PRPS_Diffuse")
-"""The folders of objects in the published tree."""
+TREES = ("PRPS", "PRPS_Diffuse")  # folders of objects in the published tree
 
 _PREFIX = "images_"
 _LIGHTS = "light.txt"

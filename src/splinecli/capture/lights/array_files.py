@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.matlab import read_matrices
-from splinecli.capture.formats.text import MOST_TEXT, NumberRows, check_length, read_text
+from splinecli.capture.formats.text import MOST_TEXT, NumberRows, Row, check_length, read_text
 from splinecli.errors import InputError
 
 Array = NDArray[np.float64]
@@ -51,8 +51,8 @@ def read_array_file(path: Path, n_images: int | None = None) -> NumberRows:
             f"found an array of shape {array.shape} and type {array.dtype}, expected finite numbers N x 3",
             path=path,
         )
-    rows = tuple(tuple(row) for row in array.astype(np.float64).tolist())
-    return NumberRows(path, rows, tuple(range(1, len(rows) + 1)), ("",) * len(rows))
+    rows = enumerate(array.astype(np.float64).tolist(), start=1)
+    return NumberRows(path, tuple(Row(tuple(numbers), line) for line, numbers in rows))
 
 
 def _choose(matrices: Mapping[str, Array], path: Path, n_images: int | None) -> Array:

@@ -13,8 +13,7 @@ from splinecli.capture.formats.text import read_lines, split_words
 from splinecli.capture.record import MIN_LIGHTS, in_one_plane
 from splinecli.errors import InputError, UsageError
 
-Draw = tuple[int, ...]
-"""Zero-based indices of lights in the whole capture."""
+Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
 DRAWS_STREAM, NOISE_STREAM, PIXELS_STREAM = 1, 2, 3
 """First numbers of the seeds, so that draws, light noise and the choice of pixels are independent."""
@@ -64,13 +63,7 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
 
 @dataclass(frozen=True)
 class DrawsFile:
-    """The draws of a file, all with the same number of lights.
-
-    Args:
-        path: the file.
-        draws: at least one, in the file's order.
-        lines: the one-based line of each draw.
-    """
+    """The draws of a file, all with the same number of lights."""
 
     path: Path
     draws: tuple[Draw, ...]

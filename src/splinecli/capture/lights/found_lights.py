@@ -9,26 +9,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FirstLight = Literal["left", "right", "above", "below"]
-"""Side of the image from which a light comes."""
-
-ESTIMATE = "estimate"
-"""Given in place of a light file: the lights are found from the images."""
+FirstLight = Literal["left", "right", "above", "below"]  # side of the image from which a light comes
+ESTIMATE = "estimate"  # given in place of a light file: the lights are found from the images
 
 
 @dataclass(frozen=True, eq=False)
 class FoundLights:
-    """Lights of F images.
+    """Lights of F images."""
 
-    Args:
-        directions: (F, 3) float64, unit; x right, y up, z to the camera.
-        errors_deg: (F,), the expected errors of the directions in degrees.
-        intensities: (F,), with a mean of 1; None where they are known.
-    """
-
-    directions: NDArray[np.float64]
-    errors_deg: NDArray[np.float64]
-    intensities: NDArray[np.float64] | None = None
+    directions: NDArray[np.float64]  # (F, 3) float64, unit; x right, y up, z to the camera
+    errors_deg: NDArray[np.float64]  # (F,), the expected errors of the directions in degrees
+    intensities: NDArray[np.float64] | None = None  # (F,), with a mean of 1; None where they are known
 
 
 def placeholders(n_lights: int) -> NDArray[np.float64]:

@@ -223,17 +223,15 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
 
 def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -> NDArray[np.float64]:
     """Return the lobes (F, 4) of lamps at positions (F, 3); see NearLamps. Raises InputError."""
-    table, hint = (
-        read_number_rows(path),
-        "A line has the direction in which a lamp shines most, x y z, and its exponent",
-    )
-    if len(table.rows) not in (1, len(positions)):
-        raise InputError(f"found {len(table.rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
-    for row, line in zip(table.rows, table.lines, strict=True):
-        if len(row) != 4 or not any(row[:3]) or row[3] < 0:
-            found = " ".join(f"{number:g}" for number in row)
-            raise InputError(f'found "{found[:60]}", expected x y z mu', path=path, line=line, hint=hint)
-    lobes = np.repeat(table.as_array(), len(positions) // len(table.rows), axis=0)
+    hint = "A line has the direction in which a lamp shines most, x y z, and its exponent"
+    rows = read_number_rows(path).rows
+    if len(rows) not in (1, len(positions)):
+        raise InputError(f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
+    for numbers, line, text in rows:
+        if len(numbers) != 4 or not any(numbers[:3]) or numbers[3] < 0:
+            raise InputError(f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint)
+    rows *= len(positions) // len(rows)
+    lobes = np.array([row.numbers for row in rows])
     lobes[:, :3] = unit(lobes[:, :3] @ frame.matrix.T)
     away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
     if away.any():
@@ -241,7 +239,7 @@ def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -
         raise InputError(
             f"lamp {lamp + 1} shines away from the object",
             path=path,
-            line=table.lines[min(lamp, len(table.lines) - 1)],
+            line=rows[lamp].line,
             hint="The directions point from the lamps to the object",
         )
     return lobes

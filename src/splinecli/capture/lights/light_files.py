@@ -6,6 +6,7 @@ Frame: x right, y up, z to the camera; a direction points from the object to the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +20,17 @@ from splinecli.capture.formats.text import (
     read_number_rows,
 )
 from splinecli.capture.lights.array_files import SUFFIXES, read_array_file
-from splinecli.capture.lights.light_angles import (
+from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
+from splinecli.capture.lights.light_rows import (
     COLUMNS,
+    LightRows,
     RowForm,
     check_angles,
     counts_rows,
     directions_from_angles,
+    read_light_rows,
     refuse_angles,
 )
-from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.light_rows import LightRows, read_light_rows
 from splinecli.capture.paths import StrPath
 from splinecli.errors import InputError
 
@@ -47,9 +49,7 @@ def read_light_directions(
     gives their order. Vectors may have any length above zero.
 
     Args:
-        path: the file.
         n_images: the number of lights that is expected, if it is known.
-        frame: the frame of the file.
         form: whether a row is a vector, two angles, or the position of a lamp.
 
     Raises:
@@ -70,17 +70,7 @@ def read_light_table(path: Path, n_images: int | None, form: RowForm) -> LightRo
 
 def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> NDArray[np.float64]:
     """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
-    table, vectors, transposed = _vectors(table, n_images, form)
-    if form in ("azel", "slant-tilt"):
-        check_angles(table, form)
-        vectors = directions_from_angles(vectors, form)
-    return unit_directions(
-        vectors @ frame.matrix.T + 0.0,  # no -0
-        table.path,
-        [table.lines[2 if transposed else light] for light in range(len(vectors))],
-        [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))],
-        of_lamps=form == "positions",
-    )
+    return _lights_of(table, n_images, frame, form)[1]
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
@@ -91,24 +81,33 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
             rows that name their images.
     """
     rows = read_light_table(Path(path), n_images, "positions")
-    directions_of(rows.numbers, n_images, frame, "positions")
+    positions, _ = _lights_of(rows.numbers, n_images, frame, "positions")
     if rows.names is not None:
         raise InputError(
             f"found the name {rows.names[0]!r}, expected x y z",
             path=Path(path),
-            line=rows.numbers.lines[0],
+            line=rows.numbers.rows[0].line,
             hint="Positions have a line for each image, in the order of the images",
         )
-    return np.asarray(_vectors(rows.numbers, n_images, "positions")[1] @ frame.matrix.T)
+    return positions
 
 
-def _vectors(table: NumberRows, n_images: int | None, form: RowForm) -> tuple[NumberRows, NDArray[np.float64], bool]:
-    """Return the table without counts, its vectors or angles, and whether the file has one light in each column."""
+def _lights_of(
+    table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length."""
     table = _sort_by_count(_drop_count_line(table, n_images), min(COLUMNS[form]), n_images)
     if form == "xyz":
         refuse_angles(table)
     what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
-    return table, *_one_light_a_row(table, COLUMNS[form], what, n_images)
+    vectors, transposed = _one_light_a_row(table, COLUMNS[form], what, n_images)
+    if form in ("azel", "slant-tilt"):
+        check_angles(table, form)
+        vectors = directions_from_angles(vectors, form)
+    vectors = vectors @ frame.matrix.T + 0.0  # no -0
+    lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
+    places = [f" in column {light + 1}" if transposed else "" for light in range(len(vectors))]
+    return vectors, unit_directions(vectors, table.path, lines, places, of_lamps=form == "positions")
 
 
 def unit_directions(
@@ -123,8 +122,6 @@ def unit_directions(
 
     Args:
         vectors: of any length.
-        path: the file, for messages.
-        lines: the line of each vector in the file.
         places: words for the place of each vector on its line.
         of_lamps: whether the vectors are positions of lamps, for messages.
 
@@ -175,47 +172,42 @@ def read_light_intensities(path: StrPath, n_images: int) -> NDArray[np.float64]:
             f"found the intensity {value:g}{place}, expected a number"
             f" {'above 0' if value <= 0 else f'from {1 / _STRONGEST:g} to {_STRONGEST:g}'}",
             path=table.path,
-            line=table.lines[channel if transposed else light],
+            line=table.rows[channel if transposed else light].line,
         )
     return np.broadcast_to(intensities, (n_images, 3)).copy()
 
 
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
     """Return the table in the order of a first column that counts the lights, and without that column."""
-    if {len(row) for row in table.rows} != {n_columns + 1} or n_images not in (None, len(table.rows)):
+    rows = table.rows
+    if {len(row.numbers) for row in rows} != {n_columns + 1} or n_images not in (None, len(rows)):
         return table
-    if n_images is None and len(table.rows) == n_columns:
+    if n_images is None and len(rows) == n_columns:
         return table  # one light in each column
-    first = counts_rows([row[0] for row in table.rows])
-    if first is None:
+    if counts_rows([row.numbers[0] for row in rows]) is None:
         return table
-    order = np.argsort([row[0] for row in table.rows])
-    return NumberRows(
-        table.path,
-        tuple(table.rows[i][1:] for i in order),
-        tuple(table.lines[i] for i in order),
-        tuple(table.texts[i] for i in order),
-    )
+    ordered = sorted(rows, key=lambda row: row.numbers[0])
+    return replace(table, rows=tuple(row._replace(numbers=row.numbers[1:]) for row in ordered))
 
 
 def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     """Return the table without a first line that only counts the lights."""
-    if len(table.rows[0]) != 1 or len(table.rows) == 1:
+    first, *following = table.rows
+    if len(first.numbers) != 1 or not following:
         return table
-    following = table.drop_first()
-    count = table.rows[0][0]
-    if all(len(row) == 1 for row in following.rows):
+    without, count = replace(table, rows=tuple(following)), first.numbers[0]
+    if all(len(row.numbers) == 1 for row in following):
         # In a single column, the first number is a count only if the rest then fits.
-        return following if len(following.rows) == count == n_images else table
-    if count in (len(following.rows), len(following.rows[0])):
-        return following
+        return without if len(following) == count == n_images else table
+    if count in (len(following), len(following[0].numbers)):
+        return without
     if not count.is_integer():
-        expected = columns(len(following.rows[0]))
-        raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=table.lines[0])
+        expected = columns(len(following[0].numbers))
+        raise InputError(f"found 1 column, expected {expected} or a count", path=table.path, line=first.line)
     raise InputError(
-        f"the count line says {count:.0f}, but {len(following.rows)} rows follow",
+        f"the count line says {count:.0f}, but {len(following)} rows follow",
         path=table.path,
-        line=table.lines[0],
+        line=first.line,
         hint="Correct the count or leave it out",
     )
 
@@ -227,23 +219,18 @@ def _one_light_a_row(
 
     Args:
         names: the possible counts of numbers for a light, each with its meaning.
-        what: what the numbers are, for messages.
     """
     values = table.as_array()
-    n_rows, n_columns = values.shape
-    readings = []
-    if n_columns in names:
-        readings.append((values, False))
-    if n_rows in names:
-        readings.append((values.T, True))
+    n_columns = values.shape[1]
+    readings = [(lights, lights is not values) for lights in (values, values.T) if lights.shape[1] in names]
     if not readings:
         expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
-        text = table.texts[0]
+        text = table.rows[0].text
         decimal_commas = n_columns > 3 and (has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3))
         raise InputError(
             f"found {columns(n_columns)}, expected {expected}",
             path=table.path,
-            line=table.lines[0],
+            line=table.rows[0].line,
             hint=DECIMAL_POINT if decimal_commas else None,
         )
     for lights, transposed in readings:

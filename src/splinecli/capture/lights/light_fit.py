@@ -17,8 +17,7 @@ from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_sca
 
 Array = NDArray[np.float64]
 
-LIT_SHARE = 0.1
-"""Observations below this share of a pixel's largest one count as shadow."""
+LIT_SHARE = 0.1  # observations below this share of a pixel's largest one count as shadow
 
 DARK_SHARES = (0.1, 0.02)
 """Pixels below this share of the brightest hundredth are left out: background. The second counts where too few are left
@@ -26,14 +25,9 @@ by the first, because highlights outshine the object."""
 
 MIN_PIXELS_PER_LIGHT = 10
 
-MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000
-"""Limits of the sample that the factors are found from."""
-
-RANDOM_ORDERS = 250
-"""The number of random orders of the lights that a given order is compared with."""
-
-INTENSITY_PRIOR = 0.01
-"""Weight of equal intensities against those that fit best, where nobody measured them."""
+MAX_PIXELS, MAX_OBSERVATIONS = 4000, 120_000  # limits of the sample that the factors are found from
+RANDOM_ORDERS = 250  # number of random orders of the lights that a given order is compared with
+INTENSITY_PRIOR = 0.01  # weight of equal intensities against those that fit best, where nobody measured them
 
 INTENSITY_LIMITS = (0.1, 10.0)
 
@@ -44,18 +38,14 @@ _FITS = 5
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """The best factors of rank 3 of some observations.
+    """The best factors of rank 3 of some observations."""
 
-    Args:
-        matrix: (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between
-            two such matrices is one between images, as a share of the mean brightness.
-        image_residuals: (F,), the root mean square of what the factors do not explain of each image, in the same unit.
-        intensities_known: whether the observations were divided by measured light intensities.
-    """
-
+    # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a distance between two such
+    # matrices is one between images, as a share of the mean brightness
     matrix: Array
+    # (F,), the root mean square of what the factors do not explain of each image, in the same unit
     image_residuals: Array
-    intensities_known: bool = True
+    intensities_known: bool = True  # whether the observations were divided by measured light intensities
 
     @property
     def residual(self) -> float:

@@ -20,23 +20,16 @@ AXIS_WORDS = {
 }
 """What --light-frame takes: the axis of the file and the sign with which it enters."""
 
-EXCHANGED = "exchanged"
-"""The word for files whose first column is y and whose second is x."""
-
-FRAME_WORDS = (*AXIS_WORDS, EXCHANGED)
+EXCHANGED = "exchanged"  # word for files whose first column is y and whose second is x
 
 
 @dataclass(frozen=True)
 class LightFrame:
-    """The frame of a light file.
+    """The frame of a light file."""
 
-    Args:
-        signs: of x, y and z, 1 for right, up and to the camera, -1 for left, down and away.
-        exchanged: whether the file has y before x. The signs are those of x and y, wherever they stand.
-    """
-
+    # of x, y and z, 1 for right, up and to the camera, -1 for left, down and away
     signs: tuple[int, int, int] = (1, 1, 1)
-    exchanged: bool = False
+    exchanged: bool = False  # whether the file has y before x. The signs are those of x and y, wherever they stand
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -67,8 +60,7 @@ class LightFrame:
         return LightFrame((x, y, z), exchanged)
 
 
-USUAL_FRAME = LightFrame()
-"""x right, y up, z to the camera, as in docs/files-and-frames.md."""
+USUAL_FRAME = LightFrame()  # x right, y up, z to the camera, as in docs/files-and-frames.md
 
 BOTH_NEGATED = LightFrame((-1, -1, 1))
 
@@ -93,9 +85,8 @@ def parse_light_frame(text: str | None) -> LightFrame:
             exchanged = True
             continue
         if word not in AXIS_WORDS:
-            raise UsageError(
-                f"--light-frame is {text!r}; expected words of {', '.join(FRAME_WORDS)}, separated by commas"
-            )
+            words = ", ".join((*AXIS_WORDS, EXCHANGED))
+            raise UsageError(f"--light-frame is {text!r}; expected words of {words}, separated by commas")
         axis, sign = AXIS_WORDS[word]
         if axis in signs:
             raise UsageError(f"--light-frame is {text!r}; {'xyz'[axis]} comes twice", hint="Leave one out")

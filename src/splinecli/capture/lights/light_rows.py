@@ -3,12 +3,121 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
-from splinecli.capture.formats.text import NumberRows, is_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_angles import AZEL_HINT, refuse_zenith
+import numpy as np
+from numpy.typing import NDArray
+
+from splinecli.capture.formats.text import NumberRows, is_number, parse_rows, read_rows_of_words
 from splinecli.errors import InputError
+
+LightForm = Literal["xyz", "azel", "slant-tilt"]
+"""The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are in degrees."""
+
+RowForm = LightForm | Literal["positions"]  # numbers of a row in a file of lights or of near lamps
+
+COLUMNS: dict[RowForm, dict[int, str]] = {
+    "xyz": {3: "x y z"},
+    "azel": {2: "azimuth elevation"},
+    "slant-tilt": {2: "slant tilt"},
+    "positions": {3: "x y z"},
+}
+"""The number of columns of each form, and their meaning."""
+
+_ZENITH = ("zen", "polar", "incl", "colat", "coelev")
+
+AZEL_HINT = "If they are azimuth and elevation in degrees, add --lights-format azel"
+
+
+def directions_from_angles(angles_deg: NDArray[np.float64], form: RowForm) -> NDArray[np.float64]:
+    """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in degrees.
+
+    Azimuth and tilt count from x (right) towards y (up), the elevation from the image plane towards the camera, the
+    slant from the camera axis.
+    """
+    azimuth, elevation = np.radians([_azimuth_elevation(row, form) for row in angles_deg.tolist()]).T
+    level = np.cos(elevation)
+    return np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
+
+
+def _azimuth_elevation(row: Sequence[float], form: RowForm) -> tuple[float, float]:
+    first, second = row[-2:]
+    return (second, 90 - first) if form == "slant-tilt" else (first, second)
+
+
+def check_angles(table: NumberRows, form: RowForm) -> None:
+    """Raise InputError, with the line, for rows whose last two columns are no such angles."""
+    for row in table.rows:
+        first, second = row.numbers[-2:]
+        azimuth, elevation = _azimuth_elevation(row.numbers, form)
+        if not (0 < elevation <= 90 and abs(azimuth) <= 360):
+            if form == "slant-tilt":
+                problem = f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360 to 360 degrees"
+                hint = "The slant counts from the camera axis"
+            else:
+                problem = f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and above 0 to 90"
+                problem += " degrees"
+                hint = "The elevation counts from the image plane: 90 is the direction of the camera"
+            raise InputError(problem, path=table.path, line=row.line, hint=hint)
+    if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
+        raise InputError(
+            "no angle is above 2 pi, so they look like radians, expected degrees",
+            path=table.path,
+            line=table.rows[0].line,
+            hint="Multiply them by 180 / pi = 57.2958",
+        )
+
+
+def refuse_zenith(header: list[str], path: Path, line: int) -> None:
+    """Raise InputError for a header with an angle from the camera axis in place of the elevation."""
+    found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
+    if found is not None:
+        raise InputError(
+            f'found the column "{found[:40]}", expected azimuth and elevation',
+            path=path,
+            line=line,
+            hint="The elevation is 90 minus the angle from the camera axis",
+        )
+
+
+def zenith_as_elevation(light_directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lights (..., 3) whose angles from the camera axis are the elevations of these."""
+    level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
+    across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
+    return np.concatenate((across, level), axis=-1)
+
+
+def refuse_angles(table: NumberRows) -> None:
+    """Raise InputError for rows that are plainly angles: two columns, or with a count, or with one radius for all."""
+    rows = [row.numbers for row in table.rows]
+    lengths = {len(row) for row in rows}
+    if len(rows) <= 3 or lengths not in ({2}, {3}):
+        return
+    numbered = lengths == {3} and counts_rows([row[0] for row in rows]) is not None
+    found, hint = "", AZEL_HINT
+    if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
+        found = f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3 columns (x y z)"
+    elif lengths == {3} and not numbered and _have_one_radius(np.array(rows)):
+        found, hint = f"azimuth, elevation and {rows[0][2]:g}, expected x y z", f"Leave the third column out. {hint}"
+    if found:
+        raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
+
+
+def _have_one_radius(rows: NDArray[np.float64]) -> bool:
+    """Return whether rows look like azimuth, elevation and the same radius; vectors around an object have y < 0."""
+    azimuth, elevation, radius = rows.T
+    all_in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
+    return bool(np.ptp(radius) == 0 and all_in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90)
+
+
+def counts_rows(column: list[float]) -> int | None:
+    """Return the first number of a column that counts the rows in some order, 0 or 1; None for any other column."""
+    ordered = sorted(column)
+    return next((first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None)
+
 
 _FOLDERS = re.compile(r"[/\\]")
 _AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
@@ -18,14 +127,10 @@ _AXES, _ANGLES = ("x", "y", "z"), ("az", "el")
 
 @dataclass(frozen=True)
 class LightRows:
-    """The rows of a light file.
+    """The rows of a light file."""
 
-    Args:
-        numbers: without a header and without names.
-        names: the name of each row's image, without folders; None where the rows begin with numbers.
-    """
-
-    numbers: NumberRows
+    numbers: NumberRows  # without a header and without names
+    # the name of each row's image, without folders; None where the rows begin with numbers
     names: tuple[str, ...] | None = None
 
 
@@ -36,18 +141,13 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
     that names them, as "z y x" or "elevation azimuth", gives their order.
 
     Args:
-        expected: what the file should be, for messages.
         n_numbers: the number of numbers that follow a name.
 
     Raises:
         InputError: with the line, for a word that is no finite number; also for a file without rows, and for a header
             or rows that are plainly other angles than expected.
     """
-    numbered = enumerate(read_lines(path, expected=expected), start=1)
-    content = [(line, text.partition("#")[0].strip()) for line, text in numbered]
-    content = [(line, text) for line, text in content if text.strip(" ,;")]
-    commas = uses_decimal_commas([text for _, text in content], n_numbers)
-    rows = [(line, text, split_words(text, decimal_commas=commas)) for line, text in content]
+    rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
     if len(rows) > 1 and not any(is_number(word) for word in rows[0][2]):
         line, _, header = rows.pop(0)
@@ -59,7 +159,7 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
     if body and all(len(words) > n_numbers and not is_number(words[0]) for _, _, words in body):
         names = tuple(image_name(text, words[-n_numbers:]) for _, text, words in body)
         without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
-        return LightRows(_reordered(NumberRows.from_words(path, without_names), order), names)
+        return LightRows(_reordered(parse_rows(without_names, path), order), names)
     if n_numbers == len(_AXES) and body and all(_is_named_angles(words) for *_, words in body):
         raise InputError(
             "found a name and 2 numbers, expected a name and 3 (x y z)",
@@ -67,7 +167,7 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
             line=body[0][0],
             hint=AZEL_HINT,
         )
-    return LightRows(_reordered(NumberRows.from_words(path, rows), order))
+    return LightRows(_reordered(parse_rows(rows, path), order))
 
 
 def _order_of(header: list[str]) -> list[int]:
@@ -80,13 +180,18 @@ def _order_of(header: list[str]) -> list[int]:
     return list(range(len(header)))
 
 
-def _reordered(numbers: NumberRows, order: list[int]) -> NumberRows:
+def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
     """Return rows whose last numbers are in the order given."""
     first = -len(order)
-    rows = tuple(
-        (*row[:first], *(row[first:][i] for i in order)) if len(row) >= len(order) else row for row in numbers.rows
+    if order == sorted(order):
+        return table
+    rows = (
+        row._replace(numbers=(*row.numbers[:first], *(row.numbers[first:][i] for i in order)))
+        if len(row.numbers) >= len(order)
+        else row
+        for row in table.rows
     )
-    return replace(numbers, rows=rows)
+    return replace(table, rows=tuple(rows))
 
 
 def _is_named_angles(words: list[str]) -> bool:

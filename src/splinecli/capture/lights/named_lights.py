@@ -7,7 +7,6 @@ the folder are matched to them by base name, then by name without suffix, then b
 from __future__ import annotations
 
 import json
-import re
 import reprlib
 import sys
 from collections.abc import Callable, Sequence
@@ -19,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_angles import RowForm
 from splinecli.capture.lights.light_files import directions_of, read_light_table, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
-from splinecli.capture.lights.light_rows import image_name
+from splinecli.capture.lights.light_rows import RowForm, image_name
 from splinecli.errors import InputError
 from splinecli.system.files import parse_json
 
@@ -30,26 +28,17 @@ Array = NDArray[np.float64]
 
 SUFFIXES = (".lp", ".json")
 _MOST_DIGITS = 9  # of the number of lights
-_FOLDERS = re.compile(r"[/\\]")
 
 
 @dataclass(frozen=True, eq=False)
 class NamedLights:
-    """F lights, each with the name of its image.
-
-    Args:
-        path: the file.
-        names: names of the images, without folders.
-        lines: the line of each light in the file; None for each where the file has no lines.
-        directions: (F, 3) float64, unit; x right, y up, z to the camera.
-        intensities: (F, 3) float64, RGB, or None where the file has none.
-    """
+    """F lights, each with the name of its image."""
 
     path: Path
-    names: tuple[str, ...]
-    lines: tuple[int | None, ...]
-    directions: NDArray[np.float64]
-    intensities: NDArray[np.float64] | None = None
+    names: tuple[str, ...]  # names of the images, without folders
+    lines: tuple[int | None, ...]  # the line of each light in the file; None for each where the file has no lines
+    directions: NDArray[np.float64]  # (F, 3) float64, unit; x right, y up, z to the camera
+    intensities: NDArray[np.float64] | None = None  # (F, 3) float64, RGB, or None where the file has none
 
     def match(self, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
         """Return the image of each light, and how it was matched: "name", "name without suffix" or "order".
@@ -102,7 +91,8 @@ def read_lights(
     rows = read_light_table(path, n_images, form)
     if rows.names is None:
         return directions_of(rows.numbers, n_images, frame, form)
-    return NamedLights(path, rows.names, rows.numbers.lines, directions_of(rows.numbers, None, frame, form))
+    lines = tuple(row.line for row in rows.numbers.rows)
+    return NamedLights(path, rows.names, lines, directions_of(rows.numbers, None, frame, form))
 
 
 def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
@@ -162,7 +152,7 @@ def _read_json(path: Path, frame: LightFrame) -> NamedLights:
                 path=path,
                 hint="Calibrate for distant lights, one direction a light",
             )
-        names.append(_FOLDERS.split(str(light.get("viewId", number)))[-1])
+        names.append(image_name(str(light.get("viewId", number)), []))
         vectors.append(_three_numbers(light, "direction", number, path))
         if "intensity" in light:
             intensities.append(_three_numbers(light, "intensity", number, path))

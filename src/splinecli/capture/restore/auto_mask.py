@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError
 
-_SMALLEST, _LARGEST = 0.005, 0.98
-"""Smallest and largest share of the picture that an object can cover."""
+_SMALLEST, _LARGEST = 0.005, 0.98  # smallest and largest share of the picture that an object can cover
 
 
 def find_object(brightness: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -26,11 +26,8 @@ FLAT_SPREAD = 0.35
 """Normals with a smaller spread (their second largest standard deviation) belong to a flat object, as a coin or a
 painting. There, a tilt of all normals together looks like other intensities, so the tilt is the likeliest one."""
 
-TILT = 0.09
-"""Standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees."""
-
-MAX_ERROR_RATIO = 0.35
-"""Largest accepted residual, as a share of the residual under equal intensities."""
+TILT = 0.09  # standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees
+MAX_ERROR_RATIO = 0.35  # largest accepted residual, as a share of the residual under equal intensities
 
 MAX_ERROR = 0.035
 """Largest accepted residual: the median, as a share of a pixel's brightest observation. Metals have more."""

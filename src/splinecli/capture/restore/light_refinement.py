@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture import capture_warnings
+from splinecli.capture.capture_warnings import KEPT_LIGHTS, REFINED_LIGHTS, CaptureWarning
 from splinecli.capture.lights.light_fit import Factors
 from splinecli.capture.record import Capture
 from splinecli.capture.robust_fit import fit_robustly, lit_rows
@@ -24,13 +24,11 @@ from splinecli.maths.normals import angle_between_deg, unit
 
 Array = NDArray[np.float64]
 
-LIGHT_ERROR_DEG = 5.0
-"""Usual error of a rough direction."""
+LIGHT_ERROR_DEG = 5.0  # usual error of a rough direction
 
 LARGEST_LIGHT_ERROR_DEG = 30.0
 
-MIN_LIGHTS = 6
-"""With fewer lights, an error of a light looks like one of the normals."""
+MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like one of the normals
 
 BETTER_FIT = 0.7
 """Refined lights are taken if the median residual falls below this share of that under the given lights. On rendered
@@ -44,8 +42,7 @@ ROUGH_MISFIT = 0.04
 """Smallest misfit of rough directions, as a share of the brightness. Below it, refinement is not tried only to be
 suggested. Few matte or shiny captures with exact lights have more."""
 
-INTENSITY_ERROR = 0.15
-"""Standard deviation of intensities that nobody measured, in the prior."""
+INTENSITY_ERROR = 0.15  # standard deviation of intensities that nobody measured, in the prior
 
 _MAX_PIXELS = 2000
 _MIN_PIXELS = 100
@@ -60,17 +57,12 @@ _CONVERGED = 1e-4
 
 
 class LightFit(NamedTuple):
-    """Lights that fit the images best near given ones.
+    """Lights that fit the images best near given ones."""
 
-    Attributes:
-        directions: (F, 3), unit.
-        intensities: (F,), relative to those of the observations.
-        before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
-            observation.
-    """
-
-    directions: Array
-    intensities: Array
+    directions: Array  # (F, 3), unit
+    intensities: Array  # (F,), relative to those of the observations
+    # before, after: the median residuals under the given lights and under these, as shares of a pixel's brightest
+    # observation
     before: float
     after: float
 
@@ -84,7 +76,6 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
     """Return the capture with refined lights, or as it is where they do not fit much better. A warning says which.
 
     Args:
-        capture: under distant lights.
         error_deg: the usual error of the given directions; None for LIGHT_ERROR_DEG.
         intensities_known: whether the light intensities were measured.
 
@@ -98,18 +89,22 @@ def refine_capture(capture: Capture, *, error_deg: float | None = None, intensit
         capture.observations, capture.light_directions, error_deg=error_deg, intensities_known=intensities_known
     )
     if found is None:
-        return replace(capture, warnings=(*capture.warnings, capture_warnings.kept_lights(_why_kept(capture))))
+        kept = CaptureWarning(KEPT_LIGHTS, f"The light directions were not refined: {_why_kept(capture)}.")
+        return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
     if not intensities_known:
         intensities = found.intensities if intensities is None else intensities * found.intensities
     moved_deg = angle_between_deg(found.directions, capture.light_directions)
-    warning = capture_warnings.refined_lights(moved_deg, found.fit_ratio)
+    text = (
+        f"The light directions were refined: moved by {moved_deg.mean():.1f} degrees on average, at most"
+        f" {moved_deg.max():.1f}. The images fit them better: {100 * found.fit_ratio:.0f} % of the misfit is left."
+    )
     return replace(
         capture,
         observations=np.asarray(capture.observations / found.intensities, np.float32),
         light_directions=found.directions,
         estimated_intensities=intensities,
-        warnings=(*capture.warnings, warning),
+        warnings=(*capture.warnings, CaptureWarning(REFINED_LIGHTS, text)),
     )
 
 

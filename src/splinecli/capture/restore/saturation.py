@@ -18,8 +18,7 @@ RAISED_WEIGHT = np.float32(0.1)
 """Weight of an observation that the last fit raised; one that the fit meets has 50. It determines nothing but what the
 others leave open."""
 
-MAX_BRIGHTENING = 8.0
-"""No observation is restored to more than this many times the pixel's brightest stored one."""
+MAX_BRIGHTENING = 8.0  # no observation is restored to more than this many times the pixel's brightest stored one
 
 _TILE_PIXELS = 8192
 

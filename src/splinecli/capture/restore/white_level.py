@@ -22,23 +22,18 @@ from splinecli.errors import InputError, UsageError
 
 Origin = Literal["given", "file", "images", "full scale"]
 
-FEWEST_IMAGES = 3
-"""An image counts as clipped at the common maximum only if at least this many images reach it..."""
-
-FEWEST_IMAGES_AT_BITS = 2
-"""... or this many, if the maximum is the largest number of 8 to 15 bits."""
+FEWEST_IMAGES = 3  # an image counts as clipped at the common maximum only if so many images reach it
+FEWEST_IMAGES_AT_BITS = 2  # or this many, if the maximum is the largest number of 8 to 15 bits
 
 FEWEST_PIXELS, SMALLEST_SHARE = 3, 1e-4
 """An image reaches the maximum at no fewer pixels, and at no smaller share of the pixels."""
 
-COMPARED_VALUES = 16
-"""The number of different values below the maximum whose observations are counted."""
+COMPARED_VALUES = 16  # number of different values below the maximum whose observations are counted
 
 LOWEST_COMPARED = 0.5
 """They must not be smaller than this share of the maximum: clipping cuts through a continuous range of values."""
 
-SPIKE = 5
-"""The maximum occurs at least this many times as often as any of the compared values."""
+SPIKE = 5  # the maximum occurs at least this many times as often as any of the compared values
 
 _BLOCK, _NEAR = 1 << 20, 1 << 10
 _FULL_SCALE_16_BIT = 65_535
@@ -66,48 +61,29 @@ class WhiteLevel:
 _NOTHING = np.empty(0, np.int64)
 
 
-class _ImageValues(NamedTuple):
-    """What decides whether observations of one image are saturated.
+class ImageValues(NamedTuple):
+    """What decides whether observations of one image are saturated."""
 
-    Attributes:
-        full_scale: the largest value that the file can store; None for floating-point images.
-        stated: the white level that the file states; None where it states none.
-        saturated: the pixels at the given white level or above, or at full scale where none is given.
-        maximum: the largest value of a 16-bit image; 0 for other images.
-        at_maximum: the pixels with this value.
-        below: the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED.
-        counts: how often each of these values occurs.
-    """
-
-    full_scale: int | None = None
-    stated: int | None = None
-    saturated: NDArray[np.integer] = _NOTHING
-    maximum: int = 0
-    at_maximum: NDArray[np.integer] = _NOTHING
+    full_scale: int | None  # the largest value that the file can store; None for floating-point images
+    stated: int | None  # the white level that the file states; None where it states none
+    saturated: NDArray[np.integer]  # the pixels at the given white level or above, or at full scale where none is given
+    maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
+    at_maximum: NDArray[np.integer] = _NOTHING  # the pixels with this value
+    # the largest values below the maximum, at most COMPARED_VALUES and none below LOWEST_COMPARED
     below: NDArray[np.int64] = _NOTHING
-    counts: NDArray[np.int64] = _NOTHING
-
-
-_NOT_ADDED = _ImageValues()
+    counts: NDArray[np.int64] = _NOTHING  # how often each of these values occurs
 
 
 @dataclass(frozen=True, eq=False)
 class Saturation:
-    """The white level of some images and their saturated observations, decided from these images alone.
+    """The white level of some images and their saturated observations, decided from these images alone."""
 
-    Args:
-        n_pixels: P, the number of the mask's pixels.
-        images: what is known of each of the F images.
-        given: the white level that the user gave; None to find it.
-        rows: the pixels whose observations are wanted; None for all. The level is decided from all pixels.
-        even: whether the images show an even target, of which one image may be clipped, and all of it.
-    """
-
-    n_pixels: int
-    images: tuple[_ImageValues, ...]
-    given: float | None = None
+    n_pixels: int  # P, the number of the mask's pixels
+    images: tuple[ImageValues, ...]
+    given: float | None = None  # the white level that the user gave; None to find it
+    # the pixels whose observations are wanted; None for all. The level is decided from all pixels
     rows: NDArray[np.integer] | None = None
-    even: bool = False
+    even: bool = False  # whether the images show an even target, of which one image may be clipped, and all of it
 
     @property
     def white_level(self) -> WhiteLevel | None:
@@ -165,7 +141,7 @@ class Saturation:
 
         PNG asks for values that are shifted to fill 16 bits. Many programs store them unshifted.
         """
-        levels = {image.stated for image in self.images if image is not _NOT_ADDED}
+        levels = {image.stated for image in self.images}
         stated = levels.pop() if len(levels) == 1 else None
         if stated is None or maximum <= stated:
             return stated
@@ -193,53 +169,31 @@ class Saturation:
         return number >= SPIKE * int(counts[-COMPARED_VALUES:].max(initial=0))
 
 
-class SaturationFinder:
-    """Find the saturated observations of a capture from its images, one at a time.
+def look_at(pixels: NDArray[Any], path: Path, *, given: float | None = None, stated: int | None = None) -> ImageValues:
+    """Return what decides which of an image's pixels (P, C), as stored, are saturated.
 
     Args:
-        n_pixels: P, the number of the mask's pixels.
-        n_images: F.
         given: the white level that the user gave; None to find it.
-        even: see Saturation.
+        stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
+
+    Raises:
+        InputError: the white level that the user gave is above the image's full scale.
     """
-
-    def __init__(self, n_pixels: int, n_images: int, *, given: float | None = None, even: bool = False) -> None:
-        self.shape = n_pixels, n_images
-        self.given, self.even = given, even
-        self._images = [_NOT_ADDED] * n_images
-
-    def add(self, position: int, pixels: NDArray[Any], path: Path, *, stated: int | None = None) -> None:
-        """Add the mask's pixels (P, C) of the image at this position, as stored.
-
-        Args:
-            stated: the white level that the file states, 2^bits - 1 for a number of bits; None where it states none.
-
-        Raises:
-            InputError: the white level that the user gave is above the image's full scale.
-        """
-        full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
-        if self.given is not None and full_scale is not None and self.given > full_scale:
+    full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
+    if given is not None:
+        if full_scale is not None and given > full_scale:
             raise InputError(
-                f"the white level is {self.given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
+                f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at {full_scale}",
                 path=path,
                 hint="Lower the white level, or leave it out",
             )
-        found = _ImageValues(full_scale, stated)
-        if self.given is not None:
-            found = found._replace(saturated=_indices(in_any_channel(pixels >= self.given)))
-        elif pixels.dtype != np.uint16 or not pixels.size:
-            found = found._replace(saturated=_indices(find_saturated(pixels)))
-        elif maximum := int(pixels.max()):
-            at_maximum = _indices(in_any_channel(pixels == maximum))
-            saturated = at_maximum if maximum == full_scale else _NOTHING
-            below, counts = _largest_values(pixels, maximum)
-            found = _ImageValues(full_scale, stated, saturated, maximum, at_maximum, below, counts)
-        self._images[position] = found
-
-    def finish(self) -> Saturation:
-        """Return the white level and the saturated observations. Images that were not added have none."""
-        n_pixels, _ = self.shape
-        return Saturation(n_pixels, tuple(self._images), self.given, even=self.even)
+        return ImageValues(full_scale, stated, _indices(in_any_channel(pixels >= given)))
+    maximum = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else 0
+    if not maximum:
+        return ImageValues(full_scale, stated, _indices(find_saturated(pixels)))
+    at_maximum = _indices(in_any_channel(pixels == maximum))
+    saturated = at_maximum if maximum == full_scale else _NOTHING
+    return ImageValues(full_scale, stated, saturated, maximum, at_maximum, *_largest_values(pixels, maximum))
 
 
 def _indices(flags: NDArray[np.bool_]) -> NDArray[np.integer]:

@@ -1,14 +1,14 @@
-"""Exposures in EXIF tags, written by Pillow."""
+"""What EXIF tags say of the images: exposures and orientations, one of each for all, written by Pillow."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
 from splinecli.capture import open_capture
-from splinecli.capture.formats.exif import Exposure, find_exposure
+from splinecli.capture.formats.exif import UPRIGHT, Exposure, common_orientation, find_exposure
 from splinecli.capture.formats.facts import read_facts
 from splinecli.errors import InputError
 
@@ -56,3 +56,30 @@ def test_exposures_that_are_one(tmp_path: Path) -> None:
     folder = capture(tmp_path / "balanced", (1, 60), (1, 60), (1, 60))
     write(folder / "1.jpg", (1, 120), iso=200)
     open_capture(folder)
+
+
+def turned(folder: Path, name: str, orientation: int | None) -> Path:
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    Image.new("L", (4, 3), 90).save(folder / name, exif=exif)
+    return folder / name
+
+
+@pytest.mark.parametrize(("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)])
+def test_one_orientation(tmp_path: Path, tag: int | None, expected: int) -> None:
+    images = [turned(tmp_path, "a.jpg", tag), turned(tmp_path, "b.tif", tag), turned(tmp_path, "c.png", tag)]
+    assert common_orientation([read_facts(image) for image in images]) == expected
+
+
+def test_the_pixels_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decoding takes seconds for an image of 24 megapixels."""
+    image = turned(tmp_path, "c.png", 6)
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+    assert common_orientation([read_facts(image)]) == 6
+
+
+def test_different_orientations_are_refused(tmp_path: Path) -> None:
+    images = [turned(tmp_path, "a.jpg", None), turned(tmp_path, "b.jpg", 1), turned(tmp_path, "c.jpg", 8)]
+    with pytest.raises(InputError, match=r"c\.jpg: found EXIF orientation 8, expected 1 as in a\.jpg"):
+        common_orientation([read_facts(image) for image in images])

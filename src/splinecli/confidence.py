@@ -1,4 +1,4 @@
-"""What the images of a capture, all together, say against its lights, its values, and the normals that were found.
+"""Correct what a network expects of its errors by what the images of the capture, all together, say against it.
 
 A pixel cannot tell wrong lights or values from an unusual reflectance. Many pixels can: errors of calibration follow
 the lights, the place in the image, or the brightness in the same way everywhere.
@@ -6,25 +6,29 @@ the lights, the place in the image, or the brightness in the same way everywhere
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.capture import Capture
 from splinecli.capture.lights.light_fit import LIT_SHARE, MIN_PIXELS_PER_LIGHT, find_factors
 from splinecli.capture.robust_fit import absolute_weights, fit_robustly, fit_scaled_normals
 from splinecli.diagnosis.frame_evidence import smooth_normals
 from splinecli.light.indirect_light import PixelPlaces
-from splinecli.light.lamp_light import LightOf, parts_of_rows
+from splinecli.light.lamp_light import LightOf, Rows, parts_of_rows
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.methods.estimator import Estimator
 from splinecli.surface.blocks import Blocks
+from splinecli.system.side_by_side import side_by_side
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.floating]
+Floats32 = NDArray[np.float32]
 Places = NDArray[np.integer]
 
-FEWEST_LIGHTS = 5
-"""With fewer, a fit leaves too little to judge a capture by."""
+FEWEST_LIGHTS = 5  # with fewer, a fit leaves too little to judge a capture by
 
 FEWEST_PIXELS = 50
 
@@ -40,64 +44,91 @@ _GRAZING = 0.05  # cosine of the light, below which a prediction is too uncertai
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
-@dataclass(frozen=True)
-class CaptureFeatures:
+def correct_errors(
+    capture: Capture, estimator: Estimator, light_of: LightOf, normals: Floats32, errors: Floats32
+) -> bool:
+    """Correct the distributions of errors (P, 2) in place; return whether that was possible.
+
+    It is not where the capture is too small, or where the correction was not made for the estimator's weights. A pixel
+    that is dark under every light stays as it is.
+
+    Args:
+        light_of: gives the observations and the light directions of some pixels.
+        normals, errors: (P, 3) and (P, 2), the estimate. See networks/error_head.py.
+    """
+    import torch
+
+    from splinecli.networks.weights import capture_head
+
+    head = None if estimator.weights is None else capture_head(estimator.weights["sha256"])
+    if head is None:
+        return False
+    found = capture_features(capture.mask, light_of, normals, errors, capture.light_directions)
+    if found is None:
+        return False
+    features, scale = found
+    whole = torch.tensor(features, dtype=torch.float32)
+    places = PixelPlaces(capture.mask)
+
+    def correct(rows: Rows) -> None:
+        brightness = capture.observations[rows].mean(axis=1)
+        rows, brightness = rows[brightness > 0], brightness[brightness > 0]
+        pixels = scale.features(brightness, normals[rows], *places.places(rows))
+        own = torch.from_numpy(errors[rows])
+        errors[rows] = head(own, torch.from_numpy(pixels.astype(np.float32)), whole).numpy()
+
+    for _ in side_by_side(correct, parts_of_rows(len(normals))):
+        pass
+    return True
+
+
+def add_light_error(errors: Floats32, light_errors_deg: NDArray[np.float64]) -> None:
+    """Widen distributions of errors (P, 2) in place by the expected errors (F,) of lights that were estimated.
+
+    Such lights are wrong together: the normals turn with them, by about as much. The medians of both errors add up as
+    those of independent errors do.
+    """
+    turn = np.radians(light_errors_deg.mean())
+    errors[:, 0] = np.logaddexp(2 * errors[:, 0], 2 * np.log(turn)) / 2
+
+
+class CaptureFeatures(NamedTuple):
     """Numbers that describe how well a capture fits what is assumed. NaN is unknown.
 
-    misfit, free_misfit: log of the median over pixels of what a matte surface leaves of the images, with the estimated
-        normals and with those that fit best, as a share of the brightness.
-    rank_residual: log of what three free images, the best for this capture, leave of all.
-    light_misfit, free_light_misfit: log of how far the lights are from those three; with any intensities.
-    decoding: log of what decoding the values once more leaves of the misfit.
-    nearness: of lamps as near as the images look: the width of the object over their distance.
-    near_share: the share of the residual that it explains.
-    near_turn: log of the median angle in degrees by which it turns the normals.
-    bend, bend_share, bend_turn: the same for an exponent of the values; `bend` is its logarithm, and only exponents
-        below 1 turn normals, as encoded values have: gloss looks like others.
-    curl: log of the curl of the normals over their derivatives.
-    rim: |cosine| between normals and the outward direction at a steep outline, which is 1 for a ball and for a bowl.
-    lights: log of their number. spread: how well they determine a normal.
-    difference: log of the median angle in degrees between the estimated normals and those that fit best.
-    expected: mean logarithm of the expected errors.
-    shadow, dark: shares of shadowed observations and of dark pixels.
+    A misfit is the log of the median over pixels of what a matte surface leaves of the images, as a share of the
+    brightness; a turn the log of the median angle in degrees by which normals would turn.
     """
 
-    misfit: float
-    free_misfit: float
-    rank_residual: float
-    light_misfit: float
-    free_light_misfit: float
-    decoding: float
-    nearness: float
-    near_share: float
+    misfit: float  # with the estimated normals
+    free_misfit: float  # with those that fit best
+    rank_residual: float  # log of what three free images, the best for this capture, leave of all
+    light_misfit: float  # log of how far the lights are from those three
+    free_light_misfit: float  # the same with any intensities
+    decoding: float  # log of what decoding the values once more leaves of the misfit
+    nearness: float  # of lamps as near as the images look: the width of the object over their distance
+    near_share: float  # the share of the residual that it explains
     near_turn: float
-    bend: float
+    bend: float  # the log of an exponent of the values; only below 1, as encoded values have, it turns normals
     bend_share: float
     bend_turn: float
-    curl: float
-    rim: float
-    lights: float
-    spread: float
-    difference: float
-    expected: float
-    shadow: float
-    dark: float
+    curl: float  # log of the curl of the normals over their derivatives
+    rim: float  # |cosine| between normals and the outward direction at a steep outline: 1 for a ball and for a bowl
+    lights: float  # log of their number
+    spread: float  # how well they determine a normal
+    difference: float  # log of the median angle in degrees between the estimated normals and those that fit best
+    expected: float  # mean logarithm of the expected errors
+    shadow: float  # share of shadowed observations
+    dark: float  # share of dark pixels
 
 
 @dataclass(frozen=True)
 class PixelScale:
-    """What relates pixels to their capture.
+    """What relates pixels to their capture."""
 
-    Args:
-        bright: brightness of a bright pixel.
-        middle: row and column of the middle of the object. width: of the object, in pixels.
-        turning: (3, 3, 2), the turn of a normal by near lamps, over the normal and the place.
-    """
-
-    bright: float
-    middle: tuple[float, float]
-    width: float
-    turning: Doubles
+    bright: float  # brightness of a bright pixel
+    middle: tuple[float, float]  # row and column of the middle of the object
+    width: float  # of the object, in pixels
+    turning: Doubles  # (3, 3, 2), the turn of a normal by near lamps, over the normal and the place
 
     def features(self, brightness: Floats, normals: Floats, rows: Places, columns: Places) -> Doubles:
         """Return for pixels (n, 2): log of their relative brightness, and of their turn by near lamps in degrees."""
@@ -115,8 +146,8 @@ class PixelScale:
 def capture_features(
     mask: NDArray[np.bool_],
     light_of: LightOf,
-    normals: NDArray[np.float32],
-    errors: NDArray[np.float32],
+    normals: Floats32,
+    errors: Floats32,
     lights: Doubles,
 ) -> tuple[CaptureFeatures, PixelScale] | None:
     """Return the features of a capture, and what relates its pixels to it; None where too little can be told.
@@ -167,30 +198,19 @@ def capture_features(
 
     places = PixelPlaces(mask)
     row, column = places.places(rows[kept])
-    scale = PixelScale(
-        bright, (float(row.mean()), float(column.mean())), float(np.sqrt(len(normals))), np.zeros((3, 3, 2))
-    )
+    middle = float(row.mean()), float(column.mean())
+    scale = PixelScale(bright, middle, float(np.sqrt(len(normals))), np.zeros((3, 3, 2)))
     at = scale.places(row, column)
     # To first order in width over distance, observations under near lamps are n.l (1 + 3 l.x) - n.x.
     near = explain(3 * fitted * (at @ lights[:, :2].T) - (scaled[:, :2] * at).sum(axis=1, keepdims=True), 1)
     bend = explain(values * np.log(values.clip(min=0.01)), -1)
-    rank, known, free, decoding = _of_factors(values, lights)
-    curl, rim = _of_shape(mask, places, normals)
     features = CaptureFeatures(
-        misfit=_log_median((np.abs(left) * lit).sum(axis=1) / shaded),
-        free_misfit=_log_median((np.abs(residuals) * lit).sum(axis=1) / shaded),
-        rank_residual=rank,
-        light_misfit=known,
-        free_light_misfit=free,
-        decoding=decoding,
-        nearness=near[0],
-        near_share=near[1],
-        near_turn=near[2],
-        bend=bend[0],
-        bend_share=bend[1],
-        bend_turn=bend[2],
-        curl=curl,
-        rim=rim,
+        _log_median((np.abs(left) * lit).sum(axis=1) / shaded),
+        _log_median((np.abs(residuals) * lit).sum(axis=1) / shaded),
+        *_of_factors(values, lights),
+        *near,
+        *bend,
+        *_of_shape(mask, places, normals),
         lights=float(np.log(n_lights)),
         spread=float(np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(n_lights)),
         difference=_log_median(difference, _LEAST_DEG),
@@ -198,8 +218,7 @@ def capture_features(
         shadow=float(1 - lit.mean()),
         dark=float(1 - kept.mean()),
     )
-    turning = max(near[0], 0.0) * _turning(lights)
-    return features, PixelScale(bright, scale.middle, scale.width, turning)
+    return features, replace(scale, turning=max(near[0], 0.0) * _turning(lights))
 
 
 def _log_median(values: Doubles, least: float = _LEAST_SHARE) -> float:
