@@ -1,5 +1,6 @@
 """Parts of a computation on all cores."""
 
+import ctypes
 import threading
 import time
 from collections.abc import Iterator
@@ -48,6 +49,20 @@ def test_an_error_comes_in_its_turn_and_ends_the_rest(threads: int) -> None:
     assert [next(results) for _ in range(5)] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="part 5"):
         next(results)
+    assert torch.get_num_threads() == threads
+
+
+def test_a_new_thread_begins_with_one_thread_of_its_own(threads: int) -> None:
+    """OpenMP's number, which PyTorch sets in a thread only before its first operation there."""
+    openmp = ctypes.CDLL(None)
+    if not hasattr(openmp, "omp_get_max_threads"):
+        pytest.skip("PyTorch does not use a shared OpenMP here")
+    assert list(side_by_side(lambda _: openmp.omp_get_max_threads(), range(threads))) == [1] * threads
+
+
+def test_two_callers_at_a_time_restore_the_number_of_threads(threads: int) -> None:
+    with one_thread_each() as first, one_thread_each() as second:
+        assert (first, second) == (threads, threads)
     assert torch.get_num_threads() == threads
 
 

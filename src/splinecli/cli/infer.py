@@ -106,7 +106,7 @@ def infer(
     surface: bool = Option(
         False, "--surface", help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
     ),
-    stiffness: float = shared.STIFFNESS,
+    stiffness: float = Option(2.0, metavar="K", min=0, help=shared.STIFFNESS),
     convention: NormalConvention = Option(
         NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
     ),

@@ -36,7 +36,12 @@ def integrate(
         help="Image of the object's colours, for the mesh."
         " [default: albedo.png beside NORMALS, if NORMALS is a folder]",
     ),
-    stiffness: float = shared.STIFFNESS,
+    stiffness: float | None = Option(
+        None,
+        metavar="K",
+        min=0,
+        help=f"{shared.STIFFNESS} [default: as in report.json beside the normal map, or 2]",
+    ),
     prior: Path | None = Option(
         None,
         metavar="FILE",

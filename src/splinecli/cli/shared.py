@@ -7,6 +7,7 @@ from typer import Option
 from splinecli.cli.values import Device, LightForm, Precision, complete_curves, complete_list, complete_weights
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
+STIFFNESS = "How easily the surface of integrate or --surface tears at edges: more with a larger number, never with 0."
 PIXEL_SIZE = "Near lamps: the width of a pixel on the object. [default: pixel_size.txt in CAPTURE]"
 
 # Input and lights.
@@ -91,9 +92,6 @@ WEIGHTS = Option(
     metavar="NAME|FILE",
     help="Weights: a shipped name or a file. [default: those of the method]",
     autocompletion=complete_weights,
-)
-STIFFNESS = Option(
-    2.0, metavar="K", min=0, help="How easily the surface of integrate or --surface tears at edges. 0 never tears it."
 )
 DEVICE = Option(Device.auto, help="Device to compute on. auto is a CUDA GPU if there is one, else the CPU.")
 PRECISION = Option(Precision.auto, help="Number format. auto is bfloat16 if the hardware supports it, else float32.")

@@ -16,6 +16,7 @@ from splinecli.methods import Estimator
 from splinecli.methods.estimator import ConfidentEstimator, tells_confidence
 from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize, student_sizes
 from splinecli.pipeline.observer import SILENT, Observer
+from splinecli.system.devices import count_available_cores
 
 if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator
@@ -73,7 +74,8 @@ def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: StudentSiz
     """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
     from splinecli.methods.distilled import seconds_of_learning
 
-    light = light_on(capture, np.linspace(0, capture.n_pixels - 1, 1024).astype(np.intp))
+    count = max(1024, 256 * count_available_cores())  # a batch for each core
+    light = light_on(capture, np.linspace(0, capture.n_pixels - 1, count).astype(np.intp))
     for _ in range(2):  # the first time, a GPU also loads its kernels
         started = time.perf_counter()
         estimator.estimate(light.observations, light.directions)

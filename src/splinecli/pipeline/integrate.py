@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +41,7 @@ class IntegrateOptions:
     output: Path | None = None
     mask: Path | None = None
     camera_matrix: Path | None = None
-    stiffness: float = STIFFNESS
+    stiffness: float | None = None
     prior: Path | None = None
     prior_detail: float | None = None
     largest_step: float | None = None
@@ -102,6 +103,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         options.normals,
         hint="Mask the object with --mask, or reduce the normal map (infer --scale)",
     )
+    stiffness = options.stiffness
+    if stiffness is None:
+        stiffness = STIFFNESS if made_by is None else float(made_by["options"]["stiffness"])
     camera_matrix = None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
     pixel_size = options.pixel_size
     if made_by is not None:
@@ -121,7 +125,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             mask,
             camera_matrix,
             colours,
-            stiffness=options.stiffness,
+            stiffness=stiffness,
             largest_step=options.largest_step,
             n_triangles=options.decimate,
             pixel_size_mm=pixel_size,
@@ -192,7 +196,8 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
-        if report["options"]["convention"] in get_args(Convention):
+        convention, stiffness = report["options"]["convention"], float(report["options"]["stiffness"])
+        if convention in get_args(Convention) and 0 <= stiffness < math.inf:
             return report
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
         pass

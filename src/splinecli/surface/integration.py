@@ -35,7 +35,7 @@ _MOST_SOLVES, _FEWEST_SOLVES = 20, 4  # the most at finer scales, of small maps 
 _SOLVED_PIXELS = 1_000_000  # in all solves at a scale together, but for the fewest
 _PRIOR_DETAIL = 0.15  # of the root of the mask's area
 _CORRELATED = 0.3  # slopes of prior and normals
-_LEAST_STEEP, _MOST_STEEP = 0.02, 5.0  # times the normals' slopes; a blurred prior is flatter
+_LEAST_STEEP, _MOST_STEEP = 0.2, 5.0  # times the normals' slopes; a blurred prior is flatter
 _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the block contains an edge
 
 RELIEF_WIDTH = 64.0

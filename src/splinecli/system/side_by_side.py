@@ -6,10 +6,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from threading import Lock
 from typing import TypeVar
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
+
+_lock, _users, _threads = Lock(), 0, 0
 
 
 @contextmanager
@@ -21,12 +24,20 @@ def one_thread_each() -> Iterator[int]:
     """
     import torch
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    global _users, _threads
+    with _lock:
+        if not _users:
+            _threads = torch.get_num_threads()
+            torch.set_num_threads(1)
+        _users += 1
+        threads = _threads
     try:
         yield threads
     finally:
-        torch.set_num_threads(threads)
+        with _lock:
+            _users -= 1
+            if not _users:
+                torch.set_num_threads(threads)
 
 
 def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
@@ -43,7 +54,8 @@ def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> I
 
     waiting: deque[Future[Result]] = deque()
     with one_thread_each() as threads:
-        pool = ThreadPoolExecutor(threads, "part")
+        # Each new thread has the number of threads of OpenMP, until PyTorch sets its own.
+        pool = ThreadPoolExecutor(threads, "part", lambda: torch.set_num_threads(1))
         try:
             for part in parts:
                 waiting.append(pool.submit(compute, part))

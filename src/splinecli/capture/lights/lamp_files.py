@@ -23,6 +23,7 @@ from splinecli.maths.normals import unit
 PIXEL_SIZE = ("pixel_size.txt",)
 CAMERA_MATRIX = ("camera_matrix.txt",)
 LOBES = ("light_lobes.txt",)
+_MOST_NARROW = 100  # the exponent of a lamp that has half of its light 7 degrees off its axis
 
 SCALE_HINT = "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
 
@@ -112,7 +113,7 @@ class LampFiles:
             else f"the object is {self.object_width:g} wide"
         )
         where = f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
-        return f"{where}; {scale}"
+        return f"{where}; {scale}" + ("" if self.lobes is None else f"; lobes as in {self.lobes}")
 
     def over(
         self,
@@ -223,12 +224,12 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
 
 def _read_lobes(path: Path, positions: NDArray[np.float64], frame: LightFrame) -> NDArray[np.float64]:
     """Return the lobes (F, 4) of lamps at positions (F, 3); see NearLamps. Raises InputError."""
-    hint = "A line has the direction in which a lamp shines most, x y z, and its exponent"
+    hint = f"A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to {_MOST_NARROW}"
     rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):
         raise InputError(f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint)
     for numbers, line, text in rows:
-        if len(numbers) != 4 or not any(numbers[:3]) or numbers[3] < 0:
+        if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= _MOST_NARROW:
             raise InputError(f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint)
     rows *= len(positions) // len(rows)
     lobes = np.array([row.numbers for row in rows])

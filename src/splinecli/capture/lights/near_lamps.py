@@ -18,8 +18,8 @@ from splinecli.maths.normals import angle_between_deg
 
 Floats = NDArray[np.float64]
 
-_LEAST_SHARE = 1e-3
-"""Least intensity of a lobe: observations are divided by it."""
+_LEAST_SHARE = 0.05
+"""Least intensity of a lobe. Observations are divided by it, and so is their noise. Outside, a pixel looks shadowed."""
 
 
 @dataclass(frozen=True, eq=False)
