@@ -29,7 +29,6 @@ def medallion() -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.flo
     directions = np.loadtxt(MEDALLION / "light_directions.txt")
     intensities = np.loadtxt(MEDALLION / "light_intensities.txt")
     mask = cv2.imread(str(MEDALLION / "mask.png"), cv2.IMREAD_GRAYSCALE)
-    assert mask is not None
     return images, directions, intensities, mask > 0
 
 
@@ -89,7 +88,6 @@ def test_normals_and_confidence_of_the_network() -> None:
     assert sum(done) == small.sum() > 0
     np.testing.assert_allclose(np.linalg.norm(estimate.normal_map[small], axis=1), 1, atol=1e-5)
     assert not estimate.normal_map[~small].any()
-    assert estimate.confidence_map is not None
     assert 0.5 < estimate.confidence_map[small].mean() <= 1
     assert not estimate.confidence_map[~small].any()
 

@@ -32,7 +32,6 @@ class Fake:
         self.lights: list[NDArray[np.float64]] = []
         self.observations: list[NDArray[np.float32]] = []
         capture = read_capture(folder)
-        assert capture.ground_truth is not None
         truth = capture.ground_truth[capture.mask]
         self._truth = truth[truth.any(axis=1)].astype(np.float64)
         self._angles = np.radians(angles_deg)

@@ -31,7 +31,6 @@ BLOCK = 4
 def load_benchmark() -> ModuleType:
     path = Path(__file__).parents[2] / "benchmarks" / "render_accuracy.py"
     specification = importlib.util.spec_from_file_location("render_accuracy", path)
-    assert specification is not None and specification.loader is not None
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module
@@ -55,7 +54,6 @@ def bowl_with_ring() -> Mesh:
         return smooth_union(bowl, ring(points), 0.05)
 
     mesh = triangulate(distance, (1.0, 1.0, 1.0), 0.03)
-    assert mesh is not None
     return fit_to_frame(mesh)
 
 

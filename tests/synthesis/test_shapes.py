@@ -51,7 +51,6 @@ def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
 
 def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
     mesh = fields.triangulate(fields.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
-    assert mesh is not None
     assert np.abs(fields.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
     ring = mesh.vertices * (1, 1, 0)
     centre = 0.6 * ring / np.linalg.norm(ring, axis=1, keepdims=True)
@@ -68,7 +67,6 @@ def test_crumbs_and_the_empty_field_are_dropped() -> None:
         return np.minimum(large, small)
 
     mesh = fields.triangulate(two_balls, (1.0, 1.0, 1.0), 0.04)
-    assert mesh is not None
     assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.51
     assert fields.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
 
@@ -82,7 +80,6 @@ def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch: pyte
     sparse = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
     monkeypatch.setattr(fields, "COARSE", 1)
     dense = fields.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
-    assert sparse is not None and dense is not None
     assert len(sparse.faces) == len(dense.faces)
     np.testing.assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
 
