@@ -118,7 +118,6 @@ def test_the_normals_are_not_the_lights(run):
     write_balls(Path("ball"))
     half = LIGHTS + np.array((0, 0, 1))
     np.savetxt("mistake.txt", half / np.linalg.norm(half, axis=1, keepdims=True))
-    np.savetxt("right.txt", LIGHTS)
     result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")
     assert result.code == 0
     assert "the compared file differs by 13." in result.err
@@ -126,16 +125,10 @@ def test_the_normals_are_not_the_lights(run):
         "warning: The compared file contains the normals of the ball at the highlights instead of the light"
         in result.err
     )
-    result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "right.txt", "--overwrite")
-    assert "the compared file differs by 0." in result.err
-    assert "warning" not in result.err
 
 
-def test_balls_that_disagree_and_an_uncertain_outline(run):
+def test_an_uncertain_outline(run):
     write_balls(Path("one"))
-    write_balls(Path("two"), LIGHTS[::-1])
-    result = run("calibrate", "one", "two", "--circle", "60,48,40", "--circle", "60,48,40")
-    assert "warning: The balls disagree by up to" in result.err
     mask = normals()[1].astype(np.uint8) * 255
     mask[:48] = 0
     cv2.imwrite("half.png", mask)

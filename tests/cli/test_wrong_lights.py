@@ -107,18 +107,6 @@ def test_mended_lights(run, medallion):
     assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
 
 
-def test_lights_as_angles(run, medallion):
-    def angles(lights):
-        return np.degrees(np.stack((np.arctan2(lights[:, 1], lights[:, 0]), np.arcsin(lights[:, 2])), axis=1))
-
-    write_lights(medallion, angles)
-    refused = run("infer", medallion, "--method", "ls")
-    assert refused.code == 3
-    assert "found 2 columns of angles, expected 3 columns (x y z). If they are" in refused.err
-    read = run("infer", medallion, "--method", "ls", "--lights-format", "azel")
-    assert (read.code, read.err) == (0, "")
-
-
 def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     usual = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "-o", "usual")
     assert (usual.code, usual.err) == (0, "")
