@@ -13,8 +13,8 @@ from urllib.parse import unquote
 import cv2
 import numpy as np
 import pytest
-import tifffile
 
+from capture.layouts.test_cyclesps import write_object
 from cli.conftest import read_report
 from splinecli.capture import source
 from splinecli.errors import InputError, OutputError, UsageError
@@ -54,14 +54,7 @@ def test_links_are_called_by_their_own_names(capture, run):
 
 def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     holder = capture.parent / "Ball"
-    for kind in ("specular", "metallic"):
-        (holder / f"images_{kind}").mkdir(parents=True)
-        for index in range(8):
-            picture = cv2.imread(str(capture / f"image{index + 1}.png"), cv2.IMREAD_UNCHANGED)
-            tifffile.imwrite(holder / f"images_{kind}/{index:05}.tif", np.dstack([picture] * 3))
-    (holder / "light.txt").write_bytes((capture / "light_directions.txt").read_bytes())
-    for name in ("inboundary.png", "onboundary.png"):
-        (holder / name).write_bytes((capture / "mask.png").read_bytes())
+    write_object(holder, "specular", "metallic")
     result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
     assert result.code == 0
     assert result.err.endswith("2 captures: 2 done; see out/index.html\n")

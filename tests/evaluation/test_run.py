@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from splinecli.capture import read_capture
-from splinecli.capture.lights.draws import draw_lights
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate, evaluate_all
@@ -90,16 +89,6 @@ def test_all_methods_and_captures_see_the_same_draws(write_dome: WriteDome) -> N
     backwards = Fake(folders[0])
     evaluate(folders[::-1], [backwards], protocol)
     np.testing.assert_array_equal(first.lights, backwards.lights)
-
-
-def test_a_trial_sees_the_lights_of_its_draw(write_dome: WriteDome) -> None:
-    folder = write_dome()
-    fake, whole = Fake(folder), read_capture(folder)
-    evaluate([folder], [fake], Protocol(n_lights=3, trials=2, seed=0))
-    draws = draw_lights(whole.light_directions, 3, trials=2, seed=0)
-    for draw, lights, observations in zip(draws, fake.lights, fake.observations, strict=True):
-        np.testing.assert_array_equal(lights, whole.light_directions[list(draw)])
-        np.testing.assert_array_equal(observations, whole.observations[:, list(draw)])
 
 
 def test_a_draws_file_goes_before_random_draws(write_dome: WriteDome, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "fuzz"), str(Path(__file__).pare
 from run import prepare_process, run_warm  # noqa: E402
 from sync_order import missing_syncs, record_calls  # noqa: E402
 
-from kills import changes_files, content  # noqa: E402
+from kills import changes_files, content, killer  # noqa: E402
 
 _MEASURED = re.compile(rb'("(?:seconds|peak_memory_mib|minutes)\\?": ?)(?:[\d.e-]+|{[^}]*})')
 
@@ -182,7 +182,7 @@ class KilledCommand:
         child = os.fork()
         if child == 0:
             if step is not None:
-                sys.addaudithook(_killer(step))
+                sys.addaudithook(killer(step))
             os._exit(run_warm(self.case, self.replacement.new))
         if seconds is not None:
             time.sleep(seconds)
@@ -201,19 +201,6 @@ def _without_measurements(name: str, value: bytes) -> bytes:
         end = 8 + int.from_bytes(value[:8], "little")
         value = value[8:end].rstrip() + value[end:]
     return _MEASURED.sub(rb"\1", value)
-
-
-def _killer(step: int):
-    left = step
-
-    def count(event: str, args: tuple[object, ...]) -> None:
-        nonlocal left
-        if changes_files(event, args):
-            if left == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-            left -= 1
-
-    return count
 
 
 def _print_problems(what: str, problems: Iterable[str]) -> bool:

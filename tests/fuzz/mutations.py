@@ -23,16 +23,8 @@ ODD_NUMBERS = (
     "4294967296", "2147483648", "-2147483649", "1e308", "1,5",
 )  # fmt: skip
 ODD_TEXTS = (
-    "",
-    "\x00",
-    "\x1b[2J",
-    "a\nsplinecli: warning: fake",
-    "../../etc/passwd",
-    "/dev/zero",
-    "𝔘\u202e",
-    "%s",
-    "a" * 5000,
-)
+    "", "\x00", "\x1b[2J", "a\nsplinecli: warning: fake", "../../etc/passwd", "/dev/zero", "𝔘\u202e", "%s", "a" * 5000,
+)  # fmt: skip
 ODD_VALUES: tuple[Any, ...] = (
     None, True, False, [], {}, "", -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "a\nb", [[[]]], {"a": 1},
     [1, 2, 3], -(2**63), 2**31,

@@ -153,30 +153,21 @@ def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
 IMAGES = tuple(Path(f"img{number}.png") for number in (1, 2, 3, 10))
 
 
-@pytest.mark.parametrize(
-    ("text", "encoding"),
-    [
-        ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
-        ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
-        ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
-        ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
-        ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
-        ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
-        ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
-        ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
-    ],
-    ids=[
-        "header",
-        "utf-16",
-        "decimal-commas",
-        "commas-and-semicolons",
-        "counted-from-1",
-        "z-first",
-        "y-first",
-        "counted-from-0",
-    ],
-)
-def test_plain_files(tmp_path: Path, text: str, encoding: str) -> None:
+PLAIN = {
+    "header": ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
+    "utf-16": ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
+    "decimal-commas": ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
+    "commas-and-semicolons": ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
+    "counted-from-1": ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
+    "z-first": ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
+    "y-first": ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
+    "counted-from-0": ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
+}
+
+
+@pytest.mark.parametrize("form", PLAIN)
+def test_plain_files(tmp_path: Path, form: str) -> None:
+    text, encoding = PLAIN[form]
     path = write(tmp_path, ("\ufeff" if encoding == "utf-16-le" else "") + text, encoding)
     np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-15)
 
