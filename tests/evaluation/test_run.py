@@ -172,12 +172,7 @@ def test_progress(write_dome: WriteDome) -> None:
     folders = [write_dome("a"), write_dome("b")]
     seen: list[tuple[float, str]] = []
     protocols = [Protocol(n_lights=7, trials=2), Protocol()]
-    evaluate_all(
-        folders,
-        [make_estimator("ls")],
-        protocols,
-        on_progress=lambda share, note: seen.append((share, note)),
-    )
+    evaluate_all(folders, [make_estimator("ls")], protocols, on_progress=lambda share, note: seen.append((share, note)))
     shares, notes = zip(*seen, strict=True)
     assert min(shares) == 0
     assert sum(shares) == pytest.approx(1)

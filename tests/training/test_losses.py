@@ -10,14 +10,7 @@ from torch import Tensor
 
 from splinecli.maths.observation_map import cell_directions
 from splinecli.training.config import Norm
-from splinecli.training.objective import (
-    AXIS_LENGTH,
-    angles,
-    asymmetric_loss,
-    asymmetries,
-    map_loss,
-    mirror,
-)
+from splinecli.training.objective import AXIS_LENGTH, angles, asymmetric_loss, asymmetries, map_loss, mirror
 
 
 def at(zenith_deg: float, azimuth_deg: float = 0.0) -> Tensor:
