@@ -125,7 +125,6 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
         ({"mask": np.zeros((5, 6))}, InputError, "the mask is empty"),
         ({"light_intensities": np.ones(3)}, UsageError, "found light intensities of shape (3,)"),
         ({"light_intensities": np.zeros(4)}, InputError, "not a finite number above 0"),
-        ({"method": "l2"}, UsageError, "no method named 'l2'"),
     ],
 )
 def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message: str) -> None:

@@ -55,15 +55,10 @@ def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest
         np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
 
 
-def test_refusals(tmp_path: Path) -> None:
-    images = np.zeros((3, 20, 30, 3))
-    folder = write(tmp_path / "dark", images, None)
-    with pytest.raises(InputError, match="dark or overexposed"):
-        measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
+def test_a_ball_without_a_mask_is_refused(tmp_path: Path) -> None:
+    folder = write(tmp_path / "dark", np.zeros((3, 20, 30, 3)), None)
     with pytest.raises(InputError, match="images of the gray ball need a mask"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
-    with pytest.raises(InputError, match="found 3 images, expected 2"):
-        measure_light_intensities(find_ball_files(folder), LIGHTS[:2], "card")
 
 
 def test_images_and_masks_of_another_size(tmp_path: Path) -> None:

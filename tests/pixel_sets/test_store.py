@@ -294,10 +294,3 @@ def test_no_manifest(make_set: MakeSet, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         open_pixel_set(folder)
     assert caught.value.path == folder / MANIFEST
-
-
-def test_no_set_at_all(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"not a pixel set: its manifest\.json cannot be read") as caught:
-        open_pixel_set(tmp_path / "nowhere")
-    assert caught.value.path == tmp_path / "nowhere"
-    assert "splinecli prepare" in str(caught.value)

@@ -58,20 +58,11 @@ def test_a_seed_says_everything() -> None:
 
 def test_matte_pixels_obey_lambert_s_law() -> None:
     batch = draw(500, NOTHING)
-    scene = replace(
-        batch.truth,
-        material=replace(
-            batch.truth.material,
-            **{
-                name: torch.zeros(500, 1)
-                for name in ("metallic", "specular", "sheen", "clearcoat", "second_share", "retro")
-            },
-            minnaert=torch.ones(500, 1),
-            # What an interface mirrors is much where it is smooth, and a larger share of dark surfaces.
-            base=batch.truth.material.base.clamp(min=0.2),
-            roughness=batch.truth.material.roughness.clamp(min=0.5),
-        ),
-    )
+    drawn, absent = batch.truth.material, ("metallic", "specular", "sheen", "clearcoat", "second_share", "retro")
+    material = replace(drawn, **dict.fromkeys(absent, torch.zeros(500, 1)), minnaert=torch.ones(500, 1))
+    # What an interface mirrors is much where it is smooth, and a larger share of dark surfaces.
+    material = replace(material, base=drawn.base.clamp(min=0.2), roughness=drawn.roughness.clamp(min=0.5))
+    scene = replace(batch.truth, material=material)
     lights = batch.light_directions
     observed = scene.radiance(lights)
     cosine = (scene.normals[:, None] * lights).sum(dim=-1).clamp(min=0)

@@ -28,7 +28,6 @@ def test_settings_left_out_have_their_defaults() -> None:
     ("values", "message"),
     [
         ({"stepz": 5}, "unknown training setting 'stepz'; known are angle_weight, asymmetric_weight"),
-        ({"pixels": {"lights": 5}}, "unknown training setting 'lights'; known are ambient_share, cast_shadows"),
         ({"network": {"lights": 5}}, "unknown network setting 'lights'"),
         ({"pixels": ["wall_share"]}, "'pixels' is .* expected a table of settings"),
         ({"steps": 0}, "training setting 'steps' is 0; expected a whole number from 1"),
@@ -41,11 +40,9 @@ def test_settings_left_out_have_their_defaults() -> None:
             {"pixels": {"min_lights": 9, "max_lights": 8}},
             "min_lights, usual_lights, max_lights are 9, 10, 8; expected them in rising order",
         ),
-        ({"shards": 3}, "'batch_size' is 256; expected a multiple of shards = 3"),
         ({"ne_net_norm": ["sum"]}, "expected 'mean' or 'sum'"),
         ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),
         ({"sources": {"set": True}}, "the weight of source 'set' is True; expected a number from 0"),
-        ({"sources": {"set": 0}}, "'sources' has no weight above 0"),
     ],
 )
 def test_refused(values: dict[str, Any], message: str) -> None:

@@ -108,16 +108,6 @@ def test_find_captures(tree: Path) -> None:
     assert names[1:5] == ["Bunny9_specular", "Bunny10_metallic", "Bunny10_specular", "Bunny9_diffuse"]
 
 
-def test_a_missing_image(tmp_path: Path) -> None:
-    folder = tmp_path / "Bunny/images_specular"
-    write_object(tmp_path / "Bunny", "specular")
-    (folder / "00003.tif").unlink()
-    assert message(lambda: open_capture(folder)) == (
-        f"{folder / '00003.tif'}: the image does not exist,"
-        " expected 5 (00000.tif to 00004.tif), one for each light in light.txt."
-    )
-
-
 def test_missing_files_of_the_object(tmp_path: Path) -> None:
     folder = tmp_path / "Bunny"
     write_object(folder, "specular")

