@@ -88,26 +88,16 @@ def test_the_tutorial(tmp_path, monkeypatch, capfd):
         assert (TUTORIAL.parent / picture).is_file()
 
 
-@pytest.fixture(scope="module")
-def rendering(script):
-    return script.render()
-
-
-def test_the_stored_images_are_what_the_script_renders(rendering):
+def test_the_stored_capture_is_what_the_script_renders(script):
+    rendering = script.render()
     for number, image in enumerate(rendering.images, start=1):
         stored = read_png(MEDALLION / f"{number:02d}.png")
         assert stored.dtype == np.uint16
         assert stored.shape == image.shape
         assert counts_apart(stored, image) <= ONE_COUNT, f"image {number}"
-
-
-def test_the_stored_mask_and_normals_are_what_the_script_makes(rendering):
     np.testing.assert_array_equal(read_png(MEDALLION / "mask.png") == 255, rendering.mask)
     stored = read_png(MEDALLION / "normals_gt.png")
     assert counts_apart(stored, encode_picture(rendering.normals, rendering.mask)) <= ONE_COUNT
-
-
-def test_the_stored_lights_are_those_of_the_script(rendering):
     directions = np.loadtxt(MEDALLION / "light_directions.txt")
     np.testing.assert_allclose(directions, rendering.light_directions, rtol=0, atol=1.1e-6)
     np.testing.assert_array_equal(np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from splinecli.system.side_by_side import one_thread_each, side_by_side
+from splinecli.system.side_by_side import side_by_side
 
 
 @pytest.fixture(params=[1, 3], autouse=True)
@@ -48,10 +48,4 @@ def test_an_error_comes_in_its_turn_and_ends_the_rest(threads: int) -> None:
     assert [next(results) for _ in range(5)] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="part 5"):
         next(results)
-    assert torch.get_num_threads() == threads
-
-
-def test_an_error_restores_the_number_of_threads(threads: int) -> None:
-    with pytest.raises(ValueError, match="within"), one_thread_each():
-        raise ValueError("within")
     assert torch.get_num_threads() == threads

@@ -193,11 +193,8 @@ def test_a_planted_record_of_a_film_deletes_nothing(tmp_path: Path, monkeypatch:
     Path("out/frames/clip").mkdir(parents=True)
     own = Path("out/frames/clip/frame-holiday.png")
     own.write_bytes(b"mine")
-    record = {
-        "film": "x",
-        "sha256": "y",
-        "frames": dict.fromkeys([own.name] * 1 + [f"frame-00000{i}.png" for i in range(6)], 4),
-    }
+    frames = dict.fromkeys([own.name, *(f"frame-00000{i}.png" for i in range(6))], 4)
+    record = {"film": "x", "sha256": "y", "frames": frames}
     Path("out/frames/clip/film.json").write_text(json.dumps(record))
     result = run("infer", film, "--lights", "estimate", "--update")
     assert result.code == 5 and own.read_bytes() == b"mine"

@@ -59,9 +59,3 @@ def test_refusals(refuse):
     refuse("import-weights", cases, "import_weights_refusals.txt")
     assert not Path("new.safetensors").exists()
     assert Path("there.safetensors").read_bytes() == b""
-
-
-def test_a_checkpoint_in_place_of_weights_gets_a_hint(run, make_capture):
-    result = run("infer", make_capture("sphere"), "--weights", "9-G.ckpt")
-    assert result.code == 4
-    assert "splinecli import-weights" in result.err

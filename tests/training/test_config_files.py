@@ -67,13 +67,14 @@ def test_what_is_wrong_in_a_file_names_the_file(tmp_path: Path, text: str, messa
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="found a folder, expected a text file"):
         read_config_file(tmp_path)
-    with pytest.raises(ModelError, match=r"a\.json: is not JSON"):
-        read_config_file(write(tmp_path / "a.json", "{"))
-    with pytest.raises(ModelError, match=r"a\.json: is not a table of settings"):
-        read_config_file(write(tmp_path / "a.json", "[1]"))
-    (tmp_path / "b.toml").write_bytes(b"preset = '\xff'")
-    with pytest.raises(ModelError, match=r"b\.toml: the file is not UTF-8 text"):
-        read_config_file(tmp_path / "b.toml")
+    for name, content, message in (
+        ("a.json", b"{", r"a\.json: is not JSON"),
+        ("a.json", b"[1]", r"a\.json: is not a table of settings"),
+        ("b.toml", b"preset = '\xff'", r"b\.toml: the file is not UTF-8 text"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ModelError, match=message):
+            read_config_file(tmp_path / name)
 
 
 @pytest.mark.parametrize(
