@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import write_capture
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.circle import Circle
 from splinecli.calibration.gray import Target, measure_light_intensities
@@ -19,12 +20,7 @@ LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, -0.48, np.sqrt(1 - 0.
 
 
 def write(folder: Path, images: NDArray[np.float64], mask: NDArray[np.bool_] | None) -> Path:
-    folder.mkdir()
-    for number, image in enumerate(images):
-        assert cv2.imwrite(str(folder / f"{number}.png"), np.rint(image * 65535).astype(np.uint16)[..., ::-1])
-    if mask is not None:
-        assert cv2.imwrite(str(folder / "mask.png"), mask.astype(np.uint8) * 255)
-    return folder
+    return write_capture(folder, np.rint(images * 65535).astype(np.uint16), None, mask=mask, names="{}.png")
 
 
 def ball_images() -> NDArray[np.float64]:

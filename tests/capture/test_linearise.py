@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import with_chunk
+from scenes import with_chunk, write_capture
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.linearise import linear_light
 from splinecli.errors import InputError
 
-LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
+LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (-0.5, 0, 1)])
 
 
 @pytest.fixture
@@ -25,11 +25,7 @@ def light() -> NDArray[np.float64]:
 
 
 def store(folder: Path, images: NDArray[Any]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, image in enumerate(images):
-        write(folder / f"{number}.png", image)
-    (folder / "lights.txt").write_text(LIGHTS)
-    return folder
+    return write_capture(folder, np.rint(images * 65535).astype(np.uint16), LIGHTS, names="{}.png")
 
 
 def write(path: Path, image: NDArray[Any]) -> Path:

@@ -26,12 +26,10 @@ def photographs() -> NDArray[np.uint16]:
 
 
 @pytest.fixture
-def capture_folder(tmp_path: Path, write_image: WriteImage, photographs: NDArray[np.uint16]) -> Path:
+def capture_folder(tmp_path: Path, photographs: NDArray[np.uint16]) -> Path:
     """tmp_path/vase: four photographs and light_directions.txt, nothing else."""
-    for number, pixels in enumerate(photographs, start=8):  # img8, img9, img10, img11: not in the order of text
-        write_image(f"vase/img{number}.png", pixels)
-    np.savetxt(tmp_path / "vase/light_directions.txt", LIGHTS)
-    return tmp_path / "vase"
+    # img8, img9, img10, img11: not in the order of text
+    return write_capture(tmp_path / "vase", photographs, LIGHTS, names="img{}.png", first=8)
 
 
 def texts(warnings: Iterable[CaptureWarning]) -> tuple[str, ...]:

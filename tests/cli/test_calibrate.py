@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import write_capture
 from splinecli.capture import read_light_directions
 
 SIZE, CENTRE, RADIUS = (100, 120), (60.0, 48.0), 40.0
@@ -34,13 +35,9 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
 
 
 def write_gray(folder: Path, intensities) -> Path:
-    folder.mkdir()
     n, inside = normals()
-    for number, (light, intensity) in enumerate(zip(LIGHTS, intensities, strict=True)):
-        picture = np.where(inside, 0.5 * intensity * (n @ light).clip(0), 0)
-        cv2.imwrite(str(folder / f"{number}.png"), np.rint(picture * 65535).astype(np.uint16))
-    cv2.imwrite(str(folder / "mask.png"), inside.astype(np.uint8) * 255)
-    return folder
+    images = 0.5 * np.array(intensities)[:, None, None] * (n @ LIGHTS.T).clip(0).transpose(2, 0, 1) * inside
+    return write_capture(folder, np.rint(images * 65535).astype(np.uint16), None, mask=inside, names="{}.png")
 
 
 @pytest.fixture(autouse=True)

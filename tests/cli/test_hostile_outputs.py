@@ -13,6 +13,7 @@ import pytest
 
 from splinecli.evaluation.trials import TrialStore
 from splinecli.system.publishing import UNDONE, NewFiles
+from test_publishing import LINKS
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
 
@@ -35,14 +36,8 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 }  # fmt: skip
 """A command, the folder that it writes, and names in it that somebody may have taken."""
 
-PLANTS: dict[str, Callable[[Path, Path], object]] = {
-    "link": lambda path, target: path.symlink_to(target),
-    "dangling": lambda path, target: path.symlink_to(target.with_name("new")),
-    "loop": lambda path, _: path.symlink_to(path.name),
+PLANTS: dict[str, Callable[[Path, Path], object]] = LINKS | {
     "folder": lambda path, _: path.mkdir(),
-    "folder link": lambda path, target: path.symlink_to(target.parent),
-    "pipe": lambda path, _: os.mkfifo(path),
-    "hard link": lambda path, target: path.hardlink_to(target),
     "wrong": lambda path, _: path.write_bytes(b'{"files": ["../../x", 5, "\\ud800"], "entries": 5}'),
 }
 
