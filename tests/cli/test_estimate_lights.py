@@ -178,7 +178,7 @@ def test_films_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     result = run("infer", film)
     assert result.code == 2 and "Add --lights estimate" in result.err
     result = run("infer", film, "--lights", "estimate")
-    assert result.code == 3 and "clip.avi: found 1 of 10 frames" in result.err
+    assert result.code == 3 and "clip.avi: found 1 of 10 frames that are sharp and differ in their light" in result.err
     assert not Path("out/frames").exists()
     result = run("infer", "none.mp4", "--lights", "estimate")
     assert result.code == 3 and "the film does not exist" in result.err

@@ -56,9 +56,6 @@ def test_albedo_and_preview_where_they_are_asked_for(capture, run):
     preview = cv2.imread(str(out / "preview.png"), cv2.IMREAD_GRAYSCALE)
     # The light comes from the upper left.
     assert preview[6, 6] > preview[12, 12] > preview[17, 17] > preview[0, 0] == 0
-    # Not asked for, they are taken away with the other earlier results.
-    assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
-    assert "albedo.png" not in {path.name for path in out.iterdir()}
 
 
 def test_a_surface_in_the_albedo_s_colours(capture, run):

@@ -110,19 +110,6 @@ def test_recipes_are_compared(tmp_path: Path, matte_pixels: Callable[..., Any]) 
     assert writer.difference("a", {"seed": 1}) == "scenes = {'lights': 30}, not None"
 
 
-def test_an_entry_is_replaced_as_a_whole(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
-    writer = PixelSetWriter(tmp_path)
-    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    writer.finish()
-    again = PixelSetWriter(tmp_path)
-    again.add("a", "a", "a test", {"seed": 2}, matte_pixels(9, 4, seed=1))
-    with pytest.raises(InputError, match="not finished"):
-        open_pixel_set(tmp_path)
-    (entry,) = again.finish().entries
-    assert (entry.n_pixels, entry.n_lights, entry.recipe) == (9, 4, {"seed": 2})
-    assert open_pixel_set(tmp_path).entries == (entry,)
-
-
 def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(
     tmp_path: Path, matte_pixels: Callable[..., Any]
 ) -> None:

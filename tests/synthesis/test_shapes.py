@@ -5,7 +5,7 @@ import pytest
 
 from splinecli.synthesis import fields
 from splinecli.synthesis.meshes import REACH, Floats
-from splinecli.synthesis.shapes import KINDS, draw_shape, draw_shape_of_kind
+from splinecli.synthesis.shapes import KINDS, draw_shape_of_kind
 from synthesis.test_meshes import outward_volume
 
 pytest.importorskip("skimage", reason="needs the extra 'render'")
@@ -107,12 +107,3 @@ def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatc
     here, there = (rng.integers(len(mesh.vertices), size=4000) for _ in range(2))
     above = ((mesh.vertices[there] - mesh.vertices[here]) * mesh.vertex_normals[here]).sum(axis=1) > 0.02
     assert above.mean() > 0.03
-
-
-def test_the_same_generator_draws_the_same_shape(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splinecli.synthesis.shapes.SPACING", 0.04)
-    monkeypatch.setattr("splinecli.synthesis.shapes.FEWEST_FACES", 100)
-    (kind, one), (same, other) = (draw_shape(np.random.default_rng(3)) for _ in range(2))
-    assert kind == same
-    np.testing.assert_array_equal(one.vertices, other.vertices)
-    np.testing.assert_array_equal(one.faces, other.faces)
