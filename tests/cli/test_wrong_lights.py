@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
+from cli.conftest import EXAMPLE
 
 
 def write_lights(folder: Path, change) -> None:

@@ -170,10 +170,7 @@ def test_other_and_damaged_manifests_are_left_alone(tmp_path: Path, manifest: di
     assert content(tmp_path) == {MANIFEST: text.encode()}
 
 
-def test_an_unfinished_set_is_refused(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
-    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    with pytest.raises(InputError, match=r"not finished\. Run the same 'splinecli prepare' again to finish it\."):
-        open_pixel_set(tmp_path)
+def test_a_set_without_entries_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
         PixelSetWriter(tmp_path / "empty").finish()
         open_pixel_set(tmp_path / "empty")
