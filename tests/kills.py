@@ -18,6 +18,20 @@ def changes_files(event: str, args: tuple[object, ...]) -> bool:
     return event in CHANGES
 
 
+def killer(step: int) -> Callable[[str, tuple[object, ...]], None]:
+    """Return an audit hook that kills its process before its change number `step`, from 0."""
+    left = step
+
+    def count(event: str, args: tuple[object, ...]) -> None:
+        nonlocal left
+        if changes_files(event, args):
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            left -= 1
+
+    return count
+
+
 def killed_at(step: int, work: Callable[[], object]) -> bool:
     """Run `work` in a forked process and kill it (SIGKILL) before its change number `step`, from 0.
 
@@ -32,17 +46,8 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
             return True
         assert os.WEXITSTATUS(status) == 0, "the work failed"
         return False
-    done = 0
-
-    def count(event: str, args: tuple[object, ...]) -> None:
-        nonlocal done
-        if changes_files(event, args):
-            if done == step:
-                os.kill(os.getpid(), signal.SIGKILL)
-            done += 1
-
     try:
-        sys.addaudithook(count)
+        sys.addaudithook(killer(step))
         work()
     except BaseException:
         traceback.print_exc()

@@ -14,7 +14,6 @@ import figure_tables
 from splinecli.capture import capture_warnings
 from splinecli.cli.app import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
-from test_imports import ROOMS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
@@ -126,14 +125,6 @@ def test_every_warning_is_explained():
     codes = {value for name, value in vars(capture_warnings).items() if name.isupper() and isinstance(value, str)}
     explained = re.findall(r"^\| `(\w+)` \|", text_of("docs/troubleshooting.md"), re.MULTILINE)
     assert sorted(codes) == explained
-
-
-def test_rooms_of_the_contributing_page():
-    """The table has the rooms of tests/test_imports.py in their order."""
-    cells = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", text_of("CONTRIBUTING.md"), re.MULTILINE)
-    shown = [set(re.findall(r"\w+", cell)) for cell in cells]
-    ranked = [rooms - {"__init__"} for rooms in ROOMS if rooms != {"__main__"}]
-    assert shown == ranked
 
 
 def test_places_of_the_contributing_page():

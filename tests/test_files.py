@@ -24,16 +24,6 @@ def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     assert (tmp_path / "written").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_a_folder_that_cannot_be(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="cannot be written") as caught:
-        write_bytes(tmp_path / "file" / "out.bin", b"content")
-    assert caught.value.exit_code == 5
-    assert caught.value.path == tmp_path / "file" / "out.bin"
-    assert names_in(tmp_path) == ["file"]
-    assert (tmp_path / "file").read_text() == "in the way"
-
-
 def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "out.bin"
     write_bytes(path, b"old")

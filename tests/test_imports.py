@@ -1,33 +1,16 @@
-"""Imports only point downwards through the rooms of the house (CONTRIBUTING.md)."""
+"""Imports only point downwards through the rooms of the house, as the table of CONTRIBUTING.md ranks them."""
 
 import ast
+import re
 from pathlib import Path
 
 import splinecli
 
+CONTRIBUTING = Path(__file__).resolve().parents[1] / "CONTRIBUTING.md"
+TABLE = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", CONTRIBUTING.read_text("utf-8"), re.MULTILINE)
 # From the top; a room may import from those below it, and its own files from each other.
-ROOMS = [
-    {"__main__"},
-    {"cli"},
-    {"pipeline"},
-    {"evaluation"},
-    {"results"},
-    {"training"},
-    {"pictures"},
-    {"pixel_sets"},
-    {"synthesis", "inference"},
-    {"confidence"},
-    {"methods"},
-    {"refinement"},
-    {"light"},
-    {"diagnosis"},
-    {"networks"},
-    {"fits", "calibration"},
-    {"capture"},
-    {"surface"},
-    {"system", "maths"},
-    {"errors", "__init__"},
-]
+ROOMS = [{"__main__"}, *(set(re.findall(r"\w+", cell)) for cell in TABLE)]
+ROOMS[-1].add("__init__")
 HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}
 SOURCE = Path(splinecli.__file__).parent
 

@@ -47,22 +47,3 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
     assert sum(done) == n_pixels
     assert len(done) == -(-n_pixels // tile_pixels)
     assert max(done) <= tile_pixels
-
-
-def test_errors_against_the_ground_truth() -> None:
-    normals, mask = bowl()
-    # Half of the truth is flipped, and the first row of the mask has none.
-    truth = np.where(np.arange(normals.shape[1])[:, None] % 2, normals, -normals)
-    first = np.flatnonzero(mask.any(axis=1))[0]
-    truth[first] = 0
-    estimate = estimate_normals(capture(truth), LeastSquares())
-    assert estimate.error_map_deg is not None
-    assert estimate.errors is not None
-    scored = mask.copy()
-    scored[first] = False
-    assert np.isnan(estimate.error_map_deg[~scored]).all()
-    expected = np.where(np.arange(mask.shape[1]) % 2, 0.0, 180.0)
-    np.testing.assert_allclose(estimate.error_map_deg[scored], np.broadcast_to(expected, mask.shape)[scored], atol=1e-4)
-    flipped = np.broadcast_to(expected > 0, mask.shape)[scored].mean()
-    assert estimate.errors.mean == pytest.approx(180 * flipped, abs=1e-3)
-    assert estimate.errors.under_5 == pytest.approx(1 - flipped)

@@ -20,7 +20,6 @@ def test_error_map() -> None:
 
 def test_summary_of_a_known_list() -> None:
     errors = summarise_errors(np.array([np.nan, *range(11), np.nan]))
-    assert errors is not None
     # 0, 1, ... 10: mean and median 5, the ninth tenth at 9; five of eleven under 5, ten under 10.
     assert (errors.mean, errors.median, errors.p90) == (5, 5, 9)
     assert errors.under_5 == pytest.approx(5 / 11)
@@ -29,7 +28,6 @@ def test_summary_of_a_known_list() -> None:
 
 def test_float32_maps_are_summed_in_float64() -> None:
     errors = summarise_errors(np.full(10_000_000, 0.1, np.float32))
-    assert errors is not None
     assert errors.mean == pytest.approx(float(np.float32(0.1)), rel=1e-9)
 
 

@@ -37,15 +37,6 @@ def fail(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_new_files_replace_earlier_ones_and_leave_others(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    publish(folder, OLD)
-    assert content(folder) == OLD
-    write(folder, MINE)
-    publish(folder)
-    assert content(folder) == NEW | MINE
-
-
 @pytest.mark.parametrize("first", [True, False])
 def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path: Path, first: bool) -> None:
     reports, step = [], 0

@@ -21,19 +21,12 @@ def turned(directions: NDArray[np.float64], degrees: float) -> NDArray[np.float6
     return directions @ np.array([(1, 0, 0), (0, cosine, sine), (0, -sine, cosine)])
 
 
-def ball(directions: NDArray[np.float64], circle: Circle | None = None) -> BallCalibration:
+def ball(directions: NDArray[np.float64]) -> BallCalibration:
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
     highlights = tuple(Highlight(1.23456, 2.0, 0.25) for _ in directions)
-    return BallCalibration(
-        files,
-        circle or Circle(50, 40, 30),
-        "--circle",
-        highlights,
-        directions,
-        unit(directions + np.array((0, 0, 1))),
-        View(np.eye(3), "assumed distant", 1.0),
-        (100, 100),
-    )
+    normals = unit(directions + np.array((0, 0, 1)))
+    view = View(np.eye(3), "assumed distant", 1.0)
+    return BallCalibration(files, Circle(50, 40, 30), "--circle", highlights, directions, normals, view, (100, 100))
 
 
 def report(balls: list[BallCalibration], known: NDArray[np.float64] | None = None) -> dict:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import with_chunk
+from scenes import with_chunk, write_capture
 from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
 from splinecli.capture.formats.facts import read_facts
 from splinecli.capture.linearise import linear_light
 from splinecli.errors import InputError
 
-LIGHTS = "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n"
+LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (-0.5, 0, 1)])
 
 
 @pytest.fixture
@@ -25,11 +25,7 @@ def light() -> NDArray[np.float64]:
 
 
 def store(folder: Path, images: NDArray[Any]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, image in enumerate(images):
-        write(folder / f"{number}.png", image)
-    (folder / "lights.txt").write_text(LIGHTS)
-    return folder
+    return write_capture(folder, np.rint(images * 65535).astype(np.uint16), LIGHTS, names="{}.png")
 
 
 def write(path: Path, image: NDArray[Any]) -> Path:
@@ -94,14 +90,14 @@ def test_falloff_is_divided_out(tmp_path: Path, light: NDArray[np.float64], one:
 def test_files_that_do_not_fit(tmp_path: Path, light: NDArray[np.float64]) -> None:
     folder = store(tmp_path / "capture", light)
     small, black = write(tmp_path / "small.png", light[0, :5]), write(tmp_path / "black.png", 0 * light[0])
-    with pytest.raises(InputError, match=r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"):
-        observed(folder, ambient=small)
-    with pytest.raises(InputError, match=r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"):
-        observed(folder, flat_field=(small,))
-    with pytest.raises(InputError, match="found 2 flat-field images, expected 1 or 4"):
-        observed(folder, flat_field=(small, small))
-    with pytest.raises(InputError, match=r"black\.png: the flat-field image is black"):
-        observed(folder, flat_field=(black,))
+    for settings, message in (
+        ({"ambient": small}, r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"),
+        ({"flat_field": (small,)}, r"small\.png: found an image of 11 x 5 pixels, expected 11 x 9"),
+        ({"flat_field": (small, small)}, "found 2 flat-field images, expected 1 or 4"),
+        ({"flat_field": (black,)}, r"black\.png: the flat-field image is black"),
+    ):
+        with pytest.raises(InputError, match=message):
+            observed(folder, **settings)
 
 
 def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np.float64]) -> None:

@@ -26,12 +26,10 @@ def photographs() -> NDArray[np.uint16]:
 
 
 @pytest.fixture
-def capture_folder(tmp_path: Path, write_image: WriteImage, photographs: NDArray[np.uint16]) -> Path:
+def capture_folder(tmp_path: Path, photographs: NDArray[np.uint16]) -> Path:
     """tmp_path/vase: four photographs and light_directions.txt, nothing else."""
-    for number, pixels in enumerate(photographs, start=8):  # img8, img9, img10, img11: not in the order of text
-        write_image(f"vase/img{number}.png", pixels)
-    np.savetxt(tmp_path / "vase/light_directions.txt", LIGHTS)
-    return tmp_path / "vase"
+    # img8, img9, img10, img11: not in the order of text
+    return write_capture(tmp_path / "vase", photographs, LIGHTS, names="img{}.png", first=8)
 
 
 def texts(warnings: Iterable[CaptureWarning]) -> tuple[str, ...]:
@@ -67,7 +65,6 @@ def test_mask_and_ground_truth(capture_folder: Path, write_image: WriteImage, ph
     capture = read_capture(capture_folder)
     np.testing.assert_array_equal(capture.mask, mask)
     np.testing.assert_allclose(capture.observations, expected(photographs, np.ones((4, 3)))[mask.ravel()], rtol=1e-6)
-    assert capture.ground_truth is not None
     np.testing.assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
 
 
@@ -138,7 +135,6 @@ def test_least_squares_on_diligent(shared_data: Path, name: str, n_pixels: int, 
     capture = read_capture(shared_data / "DiLiGenT/pmsData" / name)
     assert (capture.name, capture.observations.shape) == (name, (n_pixels, 96))
     solution = np.linalg.lstsq(capture.light_directions, capture.observations.T.astype(np.float64), rcond=None)[0]
-    assert capture.ground_truth is not None
     truth = capture.ground_truth[capture.mask]
     scored = truth.any(axis=1)
     assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(mae_deg, abs=0.02)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from scenes import write_capture
 from splinecli.capture import RadiometricCalibration, open_capture
 from splinecli.capture.stamp import digest
 
@@ -19,17 +19,14 @@ OTHERS = ("light_directions.txt", "light_intensities.txt", "mask.png", "normals_
 @pytest.fixture
 def folder(tmp_path: Path, write_image: WriteImage) -> Path:
     """A capture with every kind of file."""
-    for number in range(3):
-        write_image(f"vase/{number}.png", np.full((4, 5), 1000 * number + 500, np.uint16))
-    write_image("vase/mask.png", np.full((4, 5), 255, np.uint8))
     write_image("vase/ambient.png", np.full((4, 5), 100, np.uint16))
     write_image("flat.png", np.full((4, 5), 60_000, np.uint16))
-    np.savetxt(tmp_path / "vase/light_directions.txt", [[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
-    np.savetxt(tmp_path / "vase/light_intensities.txt", np.ones((3, 3)))
-    normals: NDArray[np.float32] = np.zeros((4, 5, 3), np.float32)
-    normals[..., 2] = 1
-    np.save(tmp_path / "vase/normals_gt.npy", normals)
-    return tmp_path / "vase"
+    images = np.full((3, 4, 5), 500, np.uint16) + 1000 * np.arange(3, dtype=np.uint16)[:, None, None]
+    lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+    mask, normals = np.ones((4, 5), bool), np.tile(np.float32((0, 0, 1)), (4, 5, 1))
+    return write_capture(
+        tmp_path / "vase", images, lights, mask=mask, normals=normals, intensities=np.ones((3, 3)), names="{}.png"
+    )
 
 
 def stamp(folder: Path) -> str:

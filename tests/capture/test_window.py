@@ -26,7 +26,6 @@ def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None)
     window = parse_window(crop, scale)
     whole = open_capture(MEDALLION).read(as_stored=True)
     part = open_capture(MEDALLION, window=window).read(as_stored=True)
-    assert whole.ground_truth is not None and part.ground_truth is not None
     np.testing.assert_array_equal(part.mask, window.of(whole.mask))
     np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
     image = np.zeros((*whole.mask.shape, whole.n_lights), np.float32)
@@ -125,7 +124,6 @@ def test_near_lamps_light_a_part_as_they_light_the_whole(
             camera_matrix=str(matrix) if perspective else None,
         )
         capture = record.open(MEDALLION).read(as_stored=True)
-        assert capture.lamps is not None
         places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
         points = surface_points(capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps)))
         lit = LampLight.of(capture.observations, replace(capture.lamps, points=points))
@@ -143,7 +141,6 @@ def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
         options.open(MEDALLION)
     narrow = InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION).read()
     wide = InferOptions(light_distance=400.0, object_width=10.0).open(MEDALLION).read()
-    assert narrow.lamps is not None and wide.lamps is not None
     assert narrow.lamps.pixel_size == pytest.approx(3 * wide.lamps.pixel_size, rel=0.03)
 
 

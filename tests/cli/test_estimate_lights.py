@@ -178,7 +178,7 @@ def test_films_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     result = run("infer", film)
     assert result.code == 2 and "Add --lights estimate" in result.err
     result = run("infer", film, "--lights", "estimate")
-    assert result.code == 3 and "clip.avi: found 1 of 10 frames" in result.err
+    assert result.code == 3 and "clip.avi: found 1 of 10 frames that are sharp and differ in their light" in result.err
     assert not Path("out/frames").exists()
     result = run("infer", "none.mp4", "--lights", "estimate")
     assert result.code == 3 and "the film does not exist" in result.err
@@ -193,11 +193,8 @@ def test_a_planted_record_of_a_film_deletes_nothing(tmp_path: Path, monkeypatch:
     Path("out/frames/clip").mkdir(parents=True)
     own = Path("out/frames/clip/frame-holiday.png")
     own.write_bytes(b"mine")
-    record = {
-        "film": "x",
-        "sha256": "y",
-        "frames": dict.fromkeys([own.name] * 1 + [f"frame-00000{i}.png" for i in range(6)], 4),
-    }
+    frames = dict.fromkeys([own.name, *(f"frame-00000{i}.png" for i in range(6))], 4)
+    record = {"film": "x", "sha256": "y", "frames": frames}
     Path("out/frames/clip/film.json").write_text(json.dumps(record))
     result = run("infer", film, "--lights", "estimate", "--update")
     assert result.code == 5 and own.read_bytes() == b"mine"

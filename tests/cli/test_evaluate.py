@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import write_capture
+from splinecli.maths.normals import unit
+
 
 @pytest.fixture
 def dataset(make_capture):
@@ -42,14 +45,11 @@ def overexposed(make_capture):
     folder = make_capture("overexposed")
     y, x = np.mgrid[0.8:-0.8:24j, -0.8:0.8:24j]
     height = np.sqrt(np.maximum(1 - x**2 - y**2, 0.1))
-    normals = np.stack((x, y, height), axis=2)
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    np.save(folder / "normals_gt.npy", normals.astype(np.float32))
-    lights = np.loadtxt(folder / "light_directions.txt")
-    for index, intensity in enumerate((1.0, 0.8, 1.2, 0.7, 1.3, 0.9, 1.1, 1.0)):
-        image = np.clip(0.9 * intensity * (normals @ lights[index]), 0, 1) * 65535
-        cv2.imwrite(str(folder / f"image{index + 1}.png"), np.rint(image).astype(np.uint16))
-    return folder
+    normals = unit(np.stack((x, y, height), axis=2))
+    intensities = np.array((1.0, 0.8, 1.2, 0.7, 1.3, 0.9, 1.1, 1.0))
+    images = np.clip(0.9 * intensities * (normals @ np.loadtxt(folder / "light_directions.txt").T), 0, 1) * 65535
+    pictures = np.rint(np.moveaxis(images, 2, 0)).astype(np.uint16)
+    return write_capture(folder, pictures, None, normals=normals.astype(np.float32), names="image{}.png", first=1)
 
 
 @pytest.mark.parametrize("n_lights", ["all", 7])

@@ -13,51 +13,31 @@ import pytest
 
 from splinecli.evaluation.trials import TrialStore
 from splinecli.system.publishing import UNDONE, NewFiles
+from test_publishing import LINKS
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX links, pipes and signals")
 
-COMMANDS: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
+COMMANDS: dict[str, tuple[str, str, str]] = {
     "infer": (
-        ("infer", "sphere", "--method", "ls", "--format", "npy,png8", "-o", "out"),
-        "out/sphere",
-        ("report.json", "normals.npy", "normals_8bit.png", ".lock"),
+        "infer sphere --method ls --format npy,png8 -o out", "out/sphere",
+        "report.json normals.npy normals_8bit.png .lock",
     ),
-    "infer here": (
-        ("infer", "sphere", "--method", "ls", "--format", "npy", "-o", "."),
-        "sphere",
-        ("report.json", "normals.npy", "mesh.glb"),
-    ),
-    "integrate": (
-        ("integrate", "n.npy", "--format", "npy,ply", "-o", "out"),
-        "out",
-        ("surface.json", "depth.npy", "mesh.ply", "mesh.glb"),
-    ),
+    "infer here": ("infer sphere --method ls --format npy -o .", "sphere", "report.json normals.npy mesh.glb"),
+    "integrate": ("integrate n.npy --format npy,ply -o out", "out", "surface.json depth.npy mesh.ply mesh.glb"),
     "evaluate": (
-        ("evaluate", "sphere", "--method", "ls", "--n-lights", "4", "--trials", "1", "--figures", "-o", "out"),
-        "out",
-        ("results.json", "results.csv", "trials.jsonl", "lights.png", "figures/sphere.png", "figures"),
+        "evaluate sphere --method ls --n-lights 4 --trials 1 --figures -o out", "out",
+        "results.json results.csv trials.jsonl lights.png figures/sphere.png figures",
     ),
-    "prepare": (
-        ("prepare", "sphere", "-o", "out"),
-        "out",
-        ("manifest.json", "contact_sheet.png", "sphere/mask.npy", "sphere"),
-    ),
+    "prepare": ("prepare sphere -o out", "out", "manifest.json contact_sheet.png sphere/mask.npy sphere"),
     "calibrate": (
-        ("calibrate", "ball", "--circle", "60,48,40", "-o", "out"),
-        "out",
-        ("calibration.json", "light_directions.txt", "light_intensities.txt", "calibration.png"),
+        "calibrate ball --circle 60,48,40 -o out", "out",
+        "calibration.json light_directions.txt light_intensities.txt calibration.png",
     ),
-}
+}  # fmt: skip
 """A command, the folder that it writes, and names in it that somebody may have taken."""
 
-PLANTS: dict[str, Callable[[Path, Path], object]] = {
-    "link": lambda path, target: path.symlink_to(target),
-    "dangling": lambda path, target: path.symlink_to(target.with_name("new")),
-    "loop": lambda path, _: path.symlink_to(path.name),
+PLANTS: dict[str, Callable[[Path, Path], object]] = LINKS | {
     "folder": lambda path, _: path.mkdir(),
-    "folder link": lambda path, target: path.symlink_to(target.parent),
-    "pipe": lambda path, _: os.mkfifo(path),
-    "hard link": lambda path, target: path.hardlink_to(target),
     "wrong": lambda path, _: path.write_bytes(b'{"files": ["../../x", 5, "\\ud800"], "entries": 5}'),
 }
 
@@ -105,7 +85,8 @@ def everything_but(folder: Path) -> dict[str, tuple[object, ...]]:
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
-    arguments, given, names = COMMANDS[name]
+    command, given, names = COMMANDS[name]
+    arguments = command.split()
     again = (*arguments, "--update" if name == "prepare" else "--overwrite")
     folder = Path(given)
     keep = shutil.copytree(inputs, "keep") if folder == inputs else None
@@ -114,7 +95,7 @@ def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
     # `prepare` writes an entry again only if the capture has changed.
     lights = inputs / "light_directions.txt"
     lights.write_text(lights.read_text() + "\n")
-    for taken in names:
+    for taken in names.split():
         shutil.rmtree(folder)
         shutil.copytree(keep or "whole", folder)
         place, target = folder / taken, Path("victim", Path(taken).name).absolute()
@@ -141,8 +122,8 @@ def test_planted_orders_and_hidden_files(inputs, run):
     """What earlier versions carried out, and hidden files of the names that the commands make."""
     Path("victim").write_text("precious")
     plan = {"remove": ["../victim", "link"], "report": "report.json"}
-    for arguments, given, _ in COMMANDS.values():
-        if arguments[0] == "prepare" or given == "sphere":
+    for command, given, _ in COMMANDS.values():
+        if command.startswith("prepare") or given == "sphere":
             continue
         hidden = Path(given, ".new.splinecli-complete")
         (hidden / "files").mkdir(parents=True)
@@ -151,7 +132,7 @@ def test_planted_orders_and_hidden_files(inputs, run):
         Path(given, "link").symlink_to(Path("victim").absolute())
         Path(given, ".scene0.splinecli-unfinished").symlink_to(Path("victim").absolute())
         Path(given, ".0123456789abcdef.splinecli-unfinished").write_text("left")
-        result = run(*arguments)
+        result = run(*command.split())
         assert (result.code, UNDONE in result.err) == (0, True)
         assert Path("victim").read_text() == "precious"
         assert (hidden / "plan.json").exists() and Path(given, "link").is_symlink()
@@ -182,8 +163,8 @@ def test_an_interrupt_at_the_very_end(inputs, run, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(NewFiles, "publish", interrupt)
-    for arguments, _, _ in COMMANDS.values():
-        result = run(*arguments)
+    for command, _, _ in COMMANDS.values():
+        result = run(*command.split())
         assert (result.code, result.err.splitlines()[-1]) == (130, "splinecli: interrupted."), result.err
         shutil.rmtree("out", ignore_errors=True)
 

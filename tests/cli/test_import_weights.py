@@ -8,34 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from splinecli.networks.li_net import PaperLINet
-from splinecli.networks.ne_net import PaperNENet
-
-# Our module names and theirs. tests/networks/test_official.py checks what the networks compute.
-NE_NET = {
-    "stem.": "conv1.",
-    "dense1.first.": "denseblock1_1.1.",
-    "dense1.second.": "denseblock1_2.1.",
-    "transition1.": "transition.1.",
-    "dense2.first.": "denseblock2_1.1.",
-    "dense2.second.": "denseblock2_2.1.",
-    "transition2.": "conv2.",
-    "hidden.": "dense.0.",
-    "out.": "dense.1.",
-}
+from networks.test_official import AuthorsLINet, AuthorsNENet
 
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("authors")
     torch.manual_seed(0)
-    li_net = {name.replace("layers", "main"): value for name, value in PaperLINet().state_dict().items()}
-    ne_net = {}
-    for name, value in PaperNENet(2, 32).state_dict().items():
-        module = next(module for module in NE_NET if name.startswith(module))
-        ne_net[name.replace(module, NE_NET[module])] = value
-    torch.save(li_net, folder / "9-G.ckpt")
-    torch.save(ne_net, folder / "9-D.ckpt")
+    torch.save(AuthorsLINet().state_dict(), folder / "9-G.ckpt")
+    torch.save(AuthorsNENet().state_dict(), folder / "9-D.ckpt")
     return folder / "9-G.ckpt", folder / "9-D.ckpt"
 
 
@@ -78,9 +59,3 @@ def test_refusals(refuse):
     refuse("import-weights", cases, "import_weights_refusals.txt")
     assert not Path("new.safetensors").exists()
     assert Path("there.safetensors").read_bytes() == b""
-
-
-def test_a_checkpoint_in_place_of_weights_gets_a_hint(run, make_capture):
-    result = run("infer", make_capture("sphere"), "--weights", "9-G.ckpt")
-    assert result.code == 4
-    assert "splinecli import-weights" in result.err

@@ -7,33 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import tifffile
+
+from capture.layouts.test_cyclesps import normals, write_object
 
 
 @pytest.fixture
-def cycles_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The published layout: one object, 7 x 10 pixels, three kinds, four lights; each value identifies its pixel."""
+def cycles_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
+    """The images (F, H, W, 3) by kind of one object in the published layout, below the folder `cycles`."""
     monkeypatch.chdir(tmp_path)
-    for tree, kinds in (("PRPS", ("specular", "metallic")), ("PRPS_Diffuse", ("diffuse",))):
-        folder = tmp_path / "cycles" / tree / "Turtle"
-        folder.mkdir(parents=True)
-        lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
-        np.savetxt(folder / "light.txt", lights, fmt="%.6f")
-        normals = np.zeros((7, 10, 3))
-        normals[..., 0] = np.linspace(-0.5, 0.5, 10)
-        normals[..., 2] = np.sqrt(1 - normals[..., 0] ** 2)
-        tifffile.imwrite(folder / "gt_normal.tif", np.rint((normals + 1) / 2 * 65535).astype(np.uint16))
-        inside, boundary = np.zeros((2, 7, 10), np.uint8)
-        inside[1:6, 2:8] = 255
-        boundary[1:6, 8] = 1
-        cv2.imwrite(str(folder / "inboundary.png"), inside)
-        cv2.imwrite(str(folder / "onboundary.png"), boundary)
-        for kind in kinds:
-            (folder / f"images_{kind}").mkdir()
-            for light in range(4):
-                image = np.arange(7 * 10 * 3, dtype=np.uint16).reshape(7, 10, 3) + 1000 * light
-                tifffile.imwrite(folder / f"images_{kind}" / f"{light:05}.tif", image)
-    return Path("cycles")
+    shiny = write_object(Path("cycles/PRPS/Turtle"), "specular", "metallic", n_lights=4)
+    return shiny | write_object(Path("cycles/PRPS_Diffuse/Turtle"), "diffuse", seed=1, n_lights=4)
 
 
 def arrays(entry: str) -> dict[str, np.ndarray]:
@@ -54,19 +37,19 @@ def test_a_capture(run, capture, truth):
     )
 
 
-def test_a_cycles_tree_reads_to_the_values_put_in(run, cycles_tree):
-    result = run("prepare", cycles_tree, "-o", "set", "--json")
+def test_a_cycles_tree_reads_to_the_values_put_in(run, cycles_images):
+    result = run("prepare", "cycles", "-o", "set", "--json")
     summary = json.loads(result.out)
     assert (result.code, summary["entries"], summary["scenes"]) == (0, 3, 1)
     whole, half = arrays("Turtle_diffuse"), arrays("Turtle_specular")
-    image = np.arange(7 * 10 * 3).reshape(7, 10, 3).mean(axis=2)
-    expected = np.stack([image[1:6, 2:9].ravel() + 1000 * light for light in range(4)], axis=1) / 65535
-    np.testing.assert_allclose(whole["observations"], expected, rtol=1e-6)
-    np.testing.assert_allclose(whole["normals"][:7, 0], np.linspace(-0.5, 0.5, 10)[2:9], atol=2e-5)  # 16 bits
+    # The masks are a box of 5 x 7 pixels.
+    expected = {kind: images.mean(axis=3)[:, 1:6, 2:9] / 65535 for kind, images in cycles_images.items()}
+    np.testing.assert_allclose(whole["observations"], expected["diffuse"].reshape(4, 35).T, rtol=1e-6)
+    np.testing.assert_allclose(whole["normals"], normals()[1:6, 2:9].reshape(35, 3), atol=2.5e-5)  # 16 bits
     # PRPS gives rows 2 and 4 and columns 2, 4, 6 and 8, as in the training of CNN-PS.
-    inner = expected.reshape(5, 7, 4)[1::2, ::2].reshape(8, 4)
+    inner = expected["specular"][:, 1::2, ::2].reshape(4, 8).T
     np.testing.assert_allclose(half["observations"], inner, rtol=1e-6)
-    assert half["mask"].shape == (4, 5)
+    assert half["mask"].shape == (4, 6)
     manifest = json.loads(Path("set/manifest.json").read_text())
     assert {entry["scene"] for entry in manifest["entries"]} == {"Turtle"}
     assert manifest["complete"] is True
@@ -179,9 +162,9 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
         assert (found["observations"] >= 0).all() and found["observations"].max() > 0
         np.testing.assert_allclose(np.linalg.norm(found["normals"], axis=1), 1, atol=1e-5)
     # The middle of the cube's top looks at the camera.
-    normals = np.zeros((16, 16, 3))
-    normals[found["mask"]] = found["normals"]
-    assert normals[7, 7, 2] > 0.9
+    normal_map = np.zeros((16, 16, 3))
+    normal_map[found["mask"]] = found["normals"]
+    assert normal_map[7, 7, 2] > 0.9
     before = Path("set/scene0000-diffuse/observations.npy").read_bytes()
     # A larger N adds scenes and keeps the others.
     assert run(*arguments, "--scenes", 2, "--quiet").code == 0
@@ -218,7 +201,7 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
     assert result.err.startswith("splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z")
 
 
-def test_refusals(refuse, make_capture, cycles_tree):
+def test_refusals(refuse, make_capture, cycles_images):
     blind = make_capture("blind")
     (blind / "normals_gt.npy").unlink()
     Path("cycles/PRPS/Turtle/images_metallic/00002.tif").unlink()

@@ -18,8 +18,6 @@ from splinecli.training.run_log import RunLog
 @pytest.fixture(autouse=True)
 def small_runs(tmp_path, monkeypatch):
     """Tiny networks and few validation pixels: these tests are about the command, not about learning."""
-    import torch
-
     from splinecli.networks.config import NetworkConfig
     from splinecli.training import config, tasks
 
@@ -27,11 +25,6 @@ def small_runs(tmp_path, monkeypatch):
     monkeypatch.setitem(config.PRESETS, "compact", tiny)
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
     monkeypatch.chdir(tmp_path)
-    # More threads only wait for each other in networks this small.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
+from cli.conftest import EXAMPLE
 
 
 def write_lights(folder: Path, change) -> None:
@@ -105,18 +105,6 @@ def test_mended_lights(run, medallion):
     np.testing.assert_allclose(np.loadtxt("mended.txt"), right, atol=1e-6)
     assert run("info", medallion, "--mended-lights", "mended.txt").code == 5
     assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
-
-
-def test_lights_as_angles(run, medallion):
-    def angles(lights):
-        return np.degrees(np.stack((np.arctan2(lights[:, 1], lights[:, 0]), np.arcsin(lights[:, 2])), axis=1))
-
-    write_lights(medallion, angles)
-    refused = run("infer", medallion, "--method", "ls")
-    assert refused.code == 3
-    assert "found 2 columns of angles, expected 3 columns (x y z). If they are" in refused.err
-    read = run("infer", medallion, "--method", "ls", "--lights-format", "azel")
-    assert (read.code, read.err) == (0, "")
 
 
 def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):

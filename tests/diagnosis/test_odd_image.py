@@ -35,7 +35,6 @@ def shade(normals: Array, light_directions: Array, shine: float = 0.3) -> Array:
 
 def find(observations: Array, *, intensities_known: bool = True) -> OddImage | None:
     factors = find_factors(observations, intensities_known=intensities_known)
-    assert factors is not None
     return find_odd_image(factors, LIGHTS)
 
 
@@ -80,7 +79,6 @@ def test_real_captures_have_no_odd_image(shared_data: Path, name: str) -> None:
     chosen = list(range(3, 96, 9)) if "PNG" in name else None
     capture = read_capture(shared_data / name, light_indices=chosen)
     factors = find_factors(capture.observations)
-    assert factors is not None
     assert find_odd_image(factors, capture.light_directions) is None
 
 

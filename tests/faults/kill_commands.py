@@ -30,7 +30,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "fuzz"), str(Path(__file__).pare
 from run import prepare_process, run_warm  # noqa: E402
 from sync_order import missing_syncs, record_calls  # noqa: E402
 
-from kills import changes_files, content  # noqa: E402
+from kills import changes_files, content, killer  # noqa: E402
 
 _MEASURED = re.compile(rb'("(?:seconds|peak_memory_mib|minutes)\\?": ?)(?:[\d.e-]+|{[^}]*})')
 
@@ -55,24 +55,18 @@ class Replacement:
 
 _INFER = "infer capture --method ls -o out --overwrite -q"
 _CALIBRATE = "calibrate ball -o out --overwrite -q"
-_INTEGRATE = "integrate n.npy -o out --overwrite -q"
-_EVALUATE = "evaluate capture --method ls --n-lights 4 -o out -q"
+_INTEGRATE = "integrate n.npy -o out --overwrite -q --format"
+_EVALUATE = "evaluate capture --method ls --n-lights 4 -o out -q --trials"
+_PREPARE = "prepare -o out/set -q"
+_INFO = "info --plot out/p.png -q"
 _TRAIN = "train set -o out/run -q --config a.toml"
 REPLACEMENTS = {
     "infer": Replacement("earlier", _INFER, f"{_INFER} --format png8,tiff --maps preview", "out/capture"),
     "calibrate": Replacement("ball", f"{_CALIBRATE} --gray-ball gray", _CALIBRATE, report="calibration.json"),
-    "integrate": Replacement(
-        "normals", f"{_INTEGRATE} --format ply,npy", f"{_INTEGRATE} --format obj,npy", report="surface.json"
-    ),
-    "evaluate": Replacement(
-        "earlier", f"{_EVALUATE} --trials 1", f"{_EVALUATE} --trials 2 --n-lights 5", report="results.json"
-    ),
-    "prepare": Replacement(
-        "earlier", "prepare capture -o out/set -q", "prepare capture more -o out/set -q", "out/set", "manifest.json"
-    ),
-    "info": Replacement(
-        "earlier", "info capture --plot out/p.png -q", "info more --plot out/p.png --overwrite -q", report=None
-    ),
+    "integrate": Replacement("normals", f"{_INTEGRATE} ply,npy", f"{_INTEGRATE} obj,npy", report="surface.json"),
+    "evaluate": Replacement("earlier", f"{_EVALUATE} 1", f"{_EVALUATE} 2 --n-lights 5", report="results.json"),
+    "prepare": Replacement("earlier", f"{_PREPARE} capture", f"{_PREPARE} capture more", "out/set", "manifest.json"),
+    "info": Replacement("earlier", f"{_INFO} capture", f"{_INFO} more --overwrite", report=None),
     "train": Replacement("training", _TRAIN, f"{_TRAIN} --resume --steps 3", "out/run", None),
 }
 
@@ -182,7 +176,7 @@ class KilledCommand:
         child = os.fork()
         if child == 0:
             if step is not None:
-                sys.addaudithook(_killer(step))
+                sys.addaudithook(killer(step))
             os._exit(run_warm(self.case, self.replacement.new))
         if seconds is not None:
             time.sleep(seconds)
@@ -201,19 +195,6 @@ def _without_measurements(name: str, value: bytes) -> bytes:
         end = 8 + int.from_bytes(value[:8], "little")
         value = value[8:end].rstrip() + value[end:]
     return _MEASURED.sub(rb"\1", value)
-
-
-def _killer(step: int):
-    left = step
-
-    def count(event: str, args: tuple[object, ...]) -> None:
-        nonlocal left
-        if changes_files(event, args):
-            if left == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-            left -= 1
-
-    return count
 
 
 def _print_problems(what: str, problems: Iterable[str]) -> bool:

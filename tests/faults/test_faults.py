@@ -192,15 +192,11 @@ def test_two_writers_of_one_folder(folder: Path) -> None:
     assert set(content(folder / "out" / "a")) in ({"normals.npy", "report.json"}, {"normals.tiff", "report.json"})
 
 
-def test_folders_and_files_without_permission(folder: Path) -> None:
+def test_an_output_folder_without_permission(folder: Path) -> None:
     """As an ordinary user, also where the tests run as root."""
-    (folder / "a" / "2.png").chmod(0)
     (folder / "closed").mkdir(mode=0o555)
     rights = "-dac_override,-dac_read_search"
     prefix = f"setpriv --bounding-set={rights} --inh-caps={rights} " if os.geteuid() == 0 else ""
-    done = shell(f"{prefix}{COMMAND} infer a --method ls -o b -q", folder)
-    assert (done.returncode, done.stderr) == (3, "splinecli: a/2.png: the file cannot be read (Permission denied).\n")
-    assert not (folder / "b").exists()
     for command in ("infer a --method ls", "integrate out/a", "calibrate a --circle 30,30,20"):
         done = shell(f"{prefix}{COMMAND} {command} -o closed -q", folder)
         assert done.returncode == 5, done.stderr

@@ -70,17 +70,6 @@ def test_the_order_of_the_lights_changes_nothing() -> None:
         torch.testing.assert_close(tuple(other), tuple(found))
 
 
-def test_it_turns_with_the_lights() -> None:
-    _, observations = noisy_pixels(LIGHTS, 0.01)
-    turn = torch.tensor(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), dtype=torch.float64)
-    found, turned = (
-        compare_halves(observations, lights, alternating_signs(lights)) for lights in (LIGHTS, LIGHTS @ turn.T)
-    )
-    torch.testing.assert_close(turned.normals, found.normals @ turn.T)
-    torch.testing.assert_close(turned.change, found.change @ turn.T)
-    torch.testing.assert_close(turned.noise, found.noise)
-
-
 def test_three_lights_and_black_pixels_disagree_about_nothing() -> None:
     found = compare_halves(noisy_pixels(LIGHTS[:3], 0.01)[1], LIGHTS[:3], SIGNS[:3])
     assert found.change.abs().max() < 1e-6

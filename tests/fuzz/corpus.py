@@ -228,122 +228,68 @@ def write_settings(folder: Path) -> None:
     )
 
 
+def each(command: str, words: str) -> tuple[str, ...]:
+    """Return the command with each of the words in the place of {}."""
+    return tuple(command.format(word) for word in words.split())
+
+
 TRAIN = "train set -o out/run -q"
 TARGETS = (
-    Target(
-        "png",
-        png_capture,
-        ("*",),
-        (
-            "infer . --method ls -o out --overwrite --maps albedo",
-            "info . --plot plots/lights.png --overwrite",
-            "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
-            "prepare . -o out/set",
-        ),
-    ),
+    Target("png", png_capture, ("*",), (
+        "infer . --method ls -o out --overwrite --maps albedo",
+        "info . --plot plots/lights.png --overwrite",
+        "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
+        "prepare . -o out/set",
+    )),
     Target("jpeg", jpeg_capture, ("*",), ("infer . --method ls -o out --overwrite", "info .")),
-    Target(
-        "tiff",
-        tiff_capture,
-        ("*",),
-        ("infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite"),
-    ),
-    Target(
-        "lights",
-        light_files,
-        ("*.txt", "*.npy", "*.csv"),
-        (
-            *(
-                f"infer . --method ls --lights {name} -o out --overwrite"
-                for name in ("vectors.npy", "utf16.txt", "commas.txt", "named.csv")
-            ),
-            "infer . --method ls --lights azel.txt --lights-format azel -o out --overwrite",
-            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
-            " --overwrite",
-        ),
-    ),
-    Target(
-        "normals",
-        normal_maps,
-        ("*",),
-        tuple(
-            f"integrate {name} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out --overwrite"
-            for name in ("n.png", "n.tif", "n.npy", "n.mat", "packed.mat")
-        ),
-    ),
-    Target("thin", thin, ("*/*",), tuple(f"infer {name} --method ls -o out --overwrite" for name in ("column", "row"))),
-    Target(
-        "meshes",
-        meshes,
-        ("m.*",),
-        tuple(
-            f"prepare --mesh m.{ending} --size 8 --n-lights 16 -o out/{ending}"
-            for ending in ("ply", "obj", "stl", "stl_ascii", "off")
-        ),
-    ),
-    Target(
-        "ball",
-        mirror_ball,
-        ("*/*", "known.txt"),
-        (
-            "calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",
-            "calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite",
-        ),
-    ),
-    Target(
-        "profiles",
-        profiles,
-        ("*/*.*",),
-        tuple(
-            f"{command} {ending}{options}"
-            for ending in ("png", "tif", "jpg")
-            for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
-        ),
-    ),
-    Target(
-        "set",
-        pixel_set,
-        ("out/set/*", "out/set/*/*"),
-        (
-            "prepare capture second -o out/set",
-            "prepare capture -o out/set --update",
-            "train out/set -o out/run -q --config a.toml",
-        ),
-        earlier=("prepare capture -o out/set",),
-        grows=True,
-    ),
-    Target(
-        "earlier",
-        earlier_results,
-        ("out/*/*.json", "out/*.json", "out/*.jsonl", "out/*/*.npy", "out/*/*.png", "out/index.html"),
-        (
-            "infer capture --method ls -o out",
-            "infer second --method ls -o out --html --surface",
-            "infer capture --method ls -o out --update",
-            "integrate out/capture -o out/capture --overwrite",
-            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite",
-            "prepare capture -o out/set",
-        ),
-        earlier=("evaluate capture --method ls --n-lights 4 --trials 1 -o out", "infer capture --method ls -o out"),
-    ),
-    Target(
-        "weights",
-        weights,
-        ("w.safetensors", "*.ckpt"),
-        (
-            "infer capture --weights w.safetensors -o out --overwrite",
-            "import-weights g.ckpt g.ckpt -o out/w.safetensors --overwrite",
-            "import-weights old.ckpt g.ckpt -o out/w.safetensors --overwrite",
-        ),
-    ),
-    Target(
-        "training",
-        training,
-        ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"),
-        (f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1"),
-        earlier=(f"{TRAIN} --config a.toml",),
-    ),
-)
+    Target("tiff", tiff_capture, ("*",), (
+        "infer . --method ls -o out --overwrite", "evaluate . --method ls --draws draws.txt -o out --overwrite",
+    )),
+    Target("lights", light_files, ("*.txt", "*.npy", "*.csv"), (
+        *each("infer . --method ls --lights {} -o out --overwrite", "vectors.npy utf16.txt commas.txt named.csv"),
+        "infer . --method ls --lights azel.txt --lights-format azel -o out --overwrite",
+        "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt -o out"
+        " --overwrite",
+    )),
+    Target("normals", normal_maps, ("*",), each(
+        "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out --overwrite",
+        "n.png n.tif n.npy n.mat packed.mat",
+    )),
+    Target("thin", thin, ("*/*",), each("infer {} --method ls -o out --overwrite", "column row")),
+    Target("meshes", meshes, ("m.*",), each(
+        "prepare --mesh m.{0} --size 8 --n-lights 16 -o out/{0}", "ply obj stl stl_ascii off",
+    )),
+    Target("ball", mirror_ball, ("*/*", "known.txt"), (
+        "calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",
+        "calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite",
+    )),
+    Target("profiles", profiles, ("*/*.*",), tuple(
+        f"{command} {ending}{options}"
+        for ending in ("png", "tif", "jpg")
+        for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
+    )),
+    Target("set", pixel_set, ("out/set/*", "out/set/*/*"), (
+        "prepare capture second -o out/set",
+        "prepare capture -o out/set --update",
+        "train out/set -o out/run -q --config a.toml",
+    ), earlier=("prepare capture -o out/set",), grows=True),
+    Target("earlier", earlier_results,
+           ("out/*/*.json", "out/*.json", "out/*.jsonl", "out/*/*.npy", "out/*/*.png", "out/index.html"), (
+        "infer capture --method ls -o out",
+        "infer second --method ls -o out --html --surface",
+        "infer capture --method ls -o out --update",
+        "integrate out/capture -o out/capture --overwrite",
+        "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite",
+        "prepare capture -o out/set",
+    ), earlier=("evaluate capture --method ls --n-lights 4 --trials 1 -o out", "infer capture --method ls -o out")),
+    Target("weights", weights, ("w.safetensors", "*.ckpt"), (
+        "infer capture --weights w.safetensors -o out --overwrite",
+        *each("import-weights {} g.ckpt -o out/w.safetensors --overwrite", "g.ckpt old.ckpt"),
+    )),
+    Target("training", training, ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"), (
+        f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1",
+    ), earlier=(f"{TRAIN} --config a.toml",)),
+)  # fmt: skip
 
 
 def write_corpus(

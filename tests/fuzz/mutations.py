@@ -23,16 +23,8 @@ ODD_NUMBERS = (
     "4294967296", "2147483648", "-2147483649", "1e308", "1,5",
 )  # fmt: skip
 ODD_TEXTS = (
-    "",
-    "\x00",
-    "\x1b[2J",
-    "a\nsplinecli: warning: fake",
-    "../../etc/passwd",
-    "/dev/zero",
-    "𝔘\u202e",
-    "%s",
-    "a" * 5000,
-)
+    "", "\x00", "\x1b[2J", "a\nsplinecli: warning: fake", "../../etc/passwd", "/dev/zero", "𝔘\u202e", "%s", "a" * 5000,
+)  # fmt: skip
 ODD_VALUES: tuple[Any, ...] = (
     None, True, False, [], {}, "", -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "a\nb", [[[]]], {"a": 1},
     [1, 2, 3], -(2**63), 2**31,
@@ -268,6 +260,10 @@ def _tag(data: bytes, rng: random.Random) -> bytes:
 
 
 OF_TEXTS = (number, number, number, lines, lines)
+OF_FORMATS = {
+    ".mat": (mat_type,) * 8, ".json": (json_value,) * 15, ".png": (png_header,) * 4, ".npy": (npy_header,) * 8,
+    ".safetensors": (safetensors_header,) * 20,
+}  # fmt: skip
 
 
 def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
@@ -279,18 +275,9 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
         choices += OF_TEXTS * 2 + (long,)
     if path.suffix in (".png", ".tif", ".mat", ".safetensors", ".ckpt"):
         choices.append(lambda _, __: _bomb(path.suffix))
-    if path.suffix == ".mat":
-        choices += [mat_type] * 8
-    if path.suffix == ".json":
-        choices += [json_value] * 15
-    if path.suffix == ".png":
-        choices += [png_header] * 4
-    if path.suffix == ".npy":
-        choices += [npy_header] * 8
+    choices += OF_FORMATS.get(path.suffix, ())
     if path.parent.name == path.suffix[1:]:  # images with profiles
         choices += [profile] * 25
-    if path.suffix == ".safetensors":
-        choices += [safetensors_header] * 20
     change = rng.choice(choices)
     data = path.read_bytes()
     path.unlink()  # it may be a link to the corpus

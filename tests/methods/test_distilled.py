@@ -171,7 +171,6 @@ def test_its_map_is_refined_by_its_teacher() -> None:
     assert refiner_of(distil(teacher, distant(observations), len(observations), SMALL)) is None
     teacher.refiner = NetworkRefiner(RefineNet(), "float32")  # type: ignore[attr-defined]
     refiner = refiner_of(distil(teacher, distant(observations), len(observations), SMALL))
-    assert refiner is not None
     assert refiner is teacher.refiner  # type: ignore[attr-defined]
 
 

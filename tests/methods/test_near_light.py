@@ -60,7 +60,6 @@ def near(kind: str, distance: float, side: int = SIDE) -> Capture:
 
 
 def error_deg(estimate: NormalEstimate) -> float:
-    assert estimate.errors is not None
     return estimate.errors.mean
 
 
@@ -78,7 +77,6 @@ def test_the_surface_is_found_in_the_unit_of_the_positions() -> None:
         capture, lamps=NearLamps.of(500 * capture.lamps.positions, 1000 / SIDE, (SIDE, SIDE), equal=True)
     )
     lamps = find_surface(in_millimetres).lamps
-    assert lamps is not None and lamps.points is not None
     points, _, _ = surface("dome")
     # The rim of the dome is steep: half a pixel is 12 there.
     assert np.abs(lamps.points - 500 * points).mean() < 5
@@ -148,7 +146,6 @@ def test_a_part_of_the_images(kind: str, box: tuple[int, int, int, int] | None, 
     capture = near(kind, 4.0, side=2 * SIDE)
     window = Window(box, 2, capture.mask.shape)
     left, top, *_ = box or (0, 0)
-    assert capture.lamps is not None and capture.ground_truth is not None
     mask = window.of(capture.mask)
     rows = (window.whole(mask) & capture.mask)[capture.mask]
     part = replace(
@@ -167,7 +164,6 @@ def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(near_light, "PIXELS_ON_THE_WAY", 900)
     assert Blocks.over(capture.mask, 900).step == 3
     reduced = find_surface(capture).lamps
-    assert whole is not None and reduced is not None and whole.points is not None
     assert np.abs(reduced.points - whole.points).mean() < 0.01
     assert error_deg(estimate_normals(capture, make_estimator("iw12"))) < 0.2
 

@@ -153,7 +153,6 @@ def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
     alone = estimator(refines=True).estimate(capture.observations, LIGHTS)
     np.testing.assert_array_equal(pixelwise.normal_map[mask], alone)
     assert np.abs(refined.normal_map - pixelwise.normal_map).max() > 1e-3
-    assert refined.confidence_map is not None and pixelwise.confidence_map is not None
     assert np.abs(refined.confidence_map - pixelwise.confidence_map).max() > 1e-3
 
 
@@ -165,6 +164,5 @@ def test_scored_pixels_are_refined_among_all() -> None:
     (result,) = evaluate([folder], [method], protocol).results
     capture = read_capture(folder)
     errors_deg = estimate_normals(capture, method).error_map_deg
-    assert errors_deg is not None
     rows = scored_rows(capture, max_pixels=50, seed=protocol.seed)
     assert result.mae_deg == pytest.approx(errors_deg[capture.mask][rows].mean(), abs=1e-4)

@@ -60,14 +60,12 @@ def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
 
 def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
-    with pytest.raises(
-        ModelError, match=r"'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net"
+    for method, file, message in (
+        ("cnn-ps", weights, "'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net"),
+        ("spline-net", alone, "'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps"),
     ):
-        make_estimator("cnn-ps", MethodOptions(weights=weights))
-    with pytest.raises(
-        ModelError, match=r"'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps"
-    ):
-        make_estimator("spline-net", MethodOptions(weights=alone))
+        with pytest.raises(ModelError, match=message):
+            make_estimator(method, MethodOptions(weights=file))
 
 
 @pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])

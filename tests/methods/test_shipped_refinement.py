@@ -62,7 +62,6 @@ def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, Norma
 
 
 def mean_error_deg(estimate: NormalEstimate) -> float:
-    assert estimate.errors is not None
     return estimate.errors.mean
 
 
@@ -142,7 +141,6 @@ def test_seams_of_tiles_do_not_show() -> None:
     before = unit(normals.reshape(-1, 3) + noise).astype(np.float32)
     errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
     whole = refiner_of(make_estimator("spline-net", MethodOptions(precision="float32")))
-    assert whole is not None
     found = []
     for refiner in (whole, NetworkRefiner(whole.network, "float32", tile=MARGIN)):
         normals, errors = before.copy(), errors_before.copy()

@@ -55,7 +55,6 @@ def test_confidence_on_generated_pixels():
     batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(3000)
     with torch.inference_mode():
         normals, error = resolve_weights("spline-net").network(batch.observations, batch.light_directions, batch.valid)
-    assert error is not None
     error_deg = angle_between_deg(normals.numpy(), batch.truth.normals.numpy())
     confidence = probability_within(error, CONFIDENT_DEG).numpy()
     for fifth in np.array_split(confidence.argsort(), 5):

@@ -20,7 +20,6 @@ def test_round_trip() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"depth": 3}, "unknown network setting 'depth'; known are size, map_size, width"),
         ({"grid": "odd"}, "network grid is 'odd'; expected 'even' or 'cnn-ps'"),
         ({"grid": "cnn-ps"}, "network grid is 'cnn-ps'; it needs the size 'paper'"),
         ({"size": "huge"}, "network size is 'huge'; expected 'paper' or 'compact'"),

@@ -33,6 +33,14 @@ def photographed(truth: Tensor, noise: float, lights: Tensor = LIGHTS, *, seen: 
     return features.T.reshape(CHANNELS, SIDE, SIDE)
 
 
+def photographed_with_noise(truth: Tensor, noise: float, lights: Tensor = LIGHTS) -> Tensor:
+    """The same features where SPLINE-Net has the noise of least squares."""
+    features = photographed(truth, noise, lights)
+    features[:3] += features[channels("plain")]
+    features[channels("plain")] = 0
+    return features
+
+
 def restored(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
     """What restore_detail makes of refined normals and features."""
     normals = features[channels("normal")]
@@ -60,9 +68,7 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
     slope = torch.where(torch.arange(SIDE) < SIDE // 2, 0.4, -0.4).expand(SIDE, SIDE)
     crease = normalize(torch.stack((-slope, torch.zeros_like(slope), torch.ones_like(slope))), dim=0)
     truth = crease if creased else FLAT
-    noisy = photographed(truth, 0.03, lights)
-    noisy[:3] += noisy[channels("plain")]  # SPLINE-Net has the noise of least squares
-    noisy[channels("plain")] = 0
+    noisy = photographed_with_noise(truth, 0.03, lights)
     found = restored(truth, noisy, EVERYWHERE)
     assert (found - truth).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
@@ -70,9 +76,7 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
 @pytest.mark.parametrize(("noise", "least", "most"), [(0.05, 0.85, 1.01), (0.1, 0.1, 0.4), (0.15, -0.01, 0.05)])
 def test_the_more_noise_the_less_comes_back(noise: float, least: float, most: float) -> None:
     """The noise has 9, 27 and 45 % of the energy of what is missing here."""
-    noisy = photographed(GROOVES, noise)
-    noisy[:3] += noisy[channels("plain")]
-    noisy[channels("plain")] = 0
+    noisy = photographed_with_noise(GROOVES, noise)
     found = restored(FLAT, noisy, EVERYWHERE)
     assert least < float((found[0] * GROOVES[0]).mean() / GROOVES[0].square().mean()) < most
 
@@ -81,9 +85,7 @@ def test_black_pixels_change_nothing_beside_them() -> None:
     """Their zero vectors are no detail."""
     black = torch.arange(SIDE) < SIDE // 2
     truth = torch.where(black, 0.0, FLAT)
-    noisy = photographed(truth, 0.03)
-    noisy[:3] += noisy[channels("plain")]
-    noisy[channels("plain")] = 0
+    noisy = photographed_with_noise(truth, 0.03)
     noisy[:, :, black] = 0
     found = restored(FLAT, noisy, EVERYWHERE)
     torch.testing.assert_close(found[..., black], FLAT[..., black])

@@ -19,7 +19,6 @@ from splinecli.networks.li_net import PaperLINet
 from splinecli.networks.ne_net import PaperNENet
 from splinecli.networks.official import import_official
 from splinecli.networks.spline_net import SplineNet
-from splinecli.networks.weights import load_weights, save_weights
 
 SIDE = 32
 
@@ -172,13 +171,6 @@ def test_observations_give_the_normals_that_theirs_give(authors: Authors, import
     assert expected.std(0).max() > 1e-3
 
 
-def test_weight_files_keep_the_grid(imported: SplineNet, tmp_path: Path) -> None:
-    save_weights(imported, tmp_path / "official.safetensors")
-    loaded = load_weights(tmp_path / "official.safetensors").network
-    assert loaded.config == imported.config
-    assert torch.equal(loaded.inside, imported.inside)
-
-
 def test_files_of_old_and_without_statistics(
     authors: Authors, imported: SplineNet, changed: Callable[..., Files], tmp_path: Path
 ) -> None:
@@ -225,11 +217,6 @@ def test_tensors_that_do_not_fit(
 ) -> None:
     with pytest.raises(ModelError, match=message):
         import_official(*changed(changes, of))
-
-
-def test_exchanged_files(files: Files) -> None:
-    with pytest.raises(ModelError, match=r"Give the authors' NUMBER-G\.ckpt first and NUMBER-D\.ckpt second"):
-        import_official(*reversed(files))
 
 
 def deflated(path: Path) -> None:

@@ -1,18 +1,16 @@
 """The options of `info`, and the lines of its report."""
 
+from typing import get_args
+
+from splinecli.capture.restore.white_level import Origin
 from splinecli.pipeline.capture_memory import REFINED_PIXELS
 from splinecli.pipeline.info import ORIGINS
+from splinecli.refinement.refiner import MARGIN, TILE
 
 
 def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
-    from splinecli.refinement.refiner import MARGIN, TILE
-
     assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
 
 
 def test_every_origin_of_a_white_level_has_words() -> None:
-    from typing import get_args
-
-    from splinecli.capture.restore.white_level import Origin
-
     assert ORIGINS.keys() == set(get_args(Origin))

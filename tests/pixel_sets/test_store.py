@@ -10,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 import pytest
 
-from kills import killed_at
+from kills import content, killed_at
 from splinecli.errors import InputError, OutputError
 from splinecli.pictures.contact_sheet import contact_sheet
 from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, PixelSet, open_pixel_set
@@ -24,10 +24,6 @@ MakeSet = Callable[..., PixelSet]
 def read_manifest(folder: Path) -> dict[str, Any]:
     manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text())
     return manifest
-
-
-def everything(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
@@ -64,7 +60,7 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
 ) -> None:
     writer = PixelSetWriter(tmp_path)
     writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    before = everything(tmp_path)
+    before = content(tmp_path)
     save, saved = np.save, []
 
     def full(file: IO[bytes], array: np.ndarray, **kwargs: Any) -> None:
@@ -78,7 +74,7 @@ def test_an_entry_that_cannot_be_written_leaves_nothing(
     with pytest.raises(OutputError, match=r"cannot be written \(No space left on device\)"):
         writer.add("b", "b", "a test", RECIPE, matte_pixels(7, 5))
     assert len(saved) == 3
-    assert everything(tmp_path) == before
+    assert content(tmp_path) == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", MANIFEST]
     assert "b" not in writer
     assert [entry["name"] for entry in read_manifest(tmp_path)["entries"]] == ["a"]
@@ -112,19 +108,6 @@ def test_recipes_are_compared(tmp_path: Path, matte_pixels: Callable[..., Any]) 
     assert writer.difference("a", dict(reversed(RECIPE.items()))) is None
     assert writer.difference("a", {**RECIPE, "seed": 2}) == "seed = 1, not 2"
     assert writer.difference("a", {"seed": 1}) == "scenes = {'lights': 30}, not None"
-
-
-def test_an_entry_is_replaced_as_a_whole(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
-    writer = PixelSetWriter(tmp_path)
-    writer.add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    writer.finish()
-    again = PixelSetWriter(tmp_path)
-    again.add("a", "a", "a test", {"seed": 2}, matte_pixels(9, 4, seed=1))
-    with pytest.raises(InputError, match="not finished"):
-        open_pixel_set(tmp_path)
-    (entry,) = again.finish().entries
-    assert (entry.n_pixels, entry.n_lights, entry.recipe) == (9, 4, {"seed": 2})
-    assert open_pixel_set(tmp_path).entries == (entry,)
 
 
 def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(
@@ -167,7 +150,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("\\begin")
     with pytest.raises(OutputError, match="has files in it but is not a pixel set"):
         PixelSetWriter(tmp_path)
-    assert everything(tmp_path) == {"thesis.tex": b"\\begin"}
+    assert content(tmp_path) == {"thesis.tex": b"\\begin"}
     with pytest.raises(OutputError, match="found a file, expected a folder"):
         PixelSetWriter(tmp_path / "thesis.tex")
 
@@ -184,13 +167,10 @@ def test_other_and_damaged_manifests_are_left_alone(tmp_path: Path, manifest: di
     (tmp_path / MANIFEST).write_text(text)
     with pytest.raises(InputError, match=message):
         PixelSetWriter(tmp_path)
-    assert everything(tmp_path) == {MANIFEST: text.encode()}
+    assert content(tmp_path) == {MANIFEST: text.encode()}
 
 
-def test_an_unfinished_set_is_refused(tmp_path: Path, matte_pixels: Callable[..., Any]) -> None:
-    PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
-    with pytest.raises(InputError, match=r"not finished\. Run the same 'splinecli prepare' again to finish it\."):
-        open_pixel_set(tmp_path)
+def test_a_set_without_entries_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
         PixelSetWriter(tmp_path / "empty").finish()
         open_pixel_set(tmp_path / "empty")
@@ -298,10 +278,3 @@ def test_no_manifest(make_set: MakeSet, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         open_pixel_set(folder)
     assert caught.value.path == folder / MANIFEST
-
-
-def test_no_set_at_all(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"not a pixel set: its manifest\.json cannot be read") as caught:
-        open_pixel_set(tmp_path / "nowhere")
-    assert caught.value.path == tmp_path / "nowhere"
-    assert "splinecli prepare" in str(caught.value)

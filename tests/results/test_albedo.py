@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import write_capture
 from splinecli.calibration.balls import find_ball_files
 from splinecli.calibration.gray import measure_light_intensities
 from splinecli.capture import open_capture
@@ -27,15 +28,12 @@ def scene(tmp_path: Path):
     normals = np.where(inside[..., None], np.stack((nx, ny, nz), axis=-1), 0).astype(np.float32)
     rng = np.random.default_rng(0)
     albedo = np.where(inside[..., None], rng.uniform(0.1, 0.6, (SIZE, SIZE, 3)), 0)
-    for number, (light, intensity) in enumerate(zip(lights, INTENSITIES, strict=True)):
-        image = albedo * (normals @ light).clip(0)[..., None]
+    images = albedo * (normals @ lights.T).clip(0).transpose(2, 0, 1)[..., None]
+    for number, image in enumerate(images):
         image[number::12] *= 0.1  # cast shadow on every twelfth row
         image[:, number::12] += 0.2  # highlights on every twelfth column
-        stored = np.rint((image * intensity).clip(0, 1) * 65535).astype(np.uint16)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), stored[..., ::-1])
-    np.savetxt(tmp_path / "lights.txt", lights)
-    np.savetxt(tmp_path / "light_intensities.txt", INTENSITIES)
-    cv2.imwrite(str(tmp_path / "mask.png"), inside.astype(np.uint8) * 255)
+    stored = np.rint((images * INTENSITIES[:, None, None]).clip(0, 1) * 65535).astype(np.uint16)
+    write_capture(tmp_path, stored, lights, mask=inside, intensities=INTENSITIES, names="{}.png")
     return tmp_path, normals, albedo
 
 

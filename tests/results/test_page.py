@@ -36,7 +36,6 @@ class Page(HtmlPage):
     def picture(self, alternative_text: str) -> NDArray[np.uint8]:
         """RGB of the image with this alternative text."""
         (source,) = (a["src"] for tag, a in self.tags if tag == "img" and a["alt"] == alternative_text)
-        assert source is not None
         png = base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True)
         picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
         if picture.ndim == 2:
@@ -58,7 +57,6 @@ def test_it_stands_alone() -> None:
         r"""(src|href)\s*=\s*["']?(?!["']?data:)|url\(|@import|//\w+\.|https?:|fetch\(|import\(""", html
     )
     policy = next(a["content"] for tag, a in page.tags if tag == "meta" and "http-equiv" in a)
-    assert policy is not None
     assert policy.startswith("default-src 'none'; img-src data:;")
 
 

@@ -38,7 +38,6 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
 
     canvas.scroll_into_view_if_needed()
     box = canvas.bounding_box()
-    assert box is not None
     radius = box["width"] / 2
 
     def at(x: float, y: float) -> tuple[float, float]:
@@ -91,7 +90,6 @@ def test_fingers(open_page: OpenPage) -> None:
     page.evaluate("splinecli.ready")
     page.locator("#view").scroll_into_view_if_needed()
     box = page.locator("#view").bounding_box()
-    assert box is not None
     client = page.context.new_cdp_session(page)
     client.send("Emulation.setTouchEmulationEnabled", {"enabled": True, "maxTouchPoints": 2})
 
@@ -131,7 +129,6 @@ def test_the_ruler_has_the_unit_of_the_surface(
         page.evaluate(f"splinecli.show({zoom}, 64, 64)")
         page.locator("#view").scroll_into_view_if_needed()
         box = page.locator("#view").bounding_box()
-        assert box is not None
         start, end = (box["x"] + (1 + side * share) / 2 * box["width"] for side in (-1, 1))
         before = page.evaluate("splinecli.light")
         page.mouse.move(start + 0.5, box["y"] + 99)

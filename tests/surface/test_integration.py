@@ -151,15 +151,12 @@ def seen(camera: Floats, height: int, width: int) -> Floats:
     return np.stack((x, -down, -np.ones_like(x)), axis=-1)
 
 
-def geometric_mean_1(depth: Floats) -> Floats:
-    return np.asarray(depth / np.exp(np.log(depth).mean()))
-
-
 @pytest.mark.usefixtures("any_scale")
 def test_perspective_plane() -> None:
     rays = seen(CAMERA, 90, 120)
     normal = unit(np.array([0.3, -0.4, 0.8]))
-    depth = geometric_mean_1(-1 / (rays @ normal))
+    depth = -1 / (rays @ normal)
+    depth /= np.exp(np.log(depth).mean())
     found = integrate_normals(np.broadcast_to(normal, rays.shape), np.ones((90, 120), bool), camera_matrix=CAMERA)
     # A step of log(depth) is not quite linear in its slope.
     assert error_share(found, depth, np.ones((90, 120), bool)) < 5e-4
@@ -334,10 +331,6 @@ def test_backward_normals_are_bridged() -> None:
     assert error_share(found, truth, mask) < 5e-3
 
 
-def turned(array: Any, quarters: int) -> Any:
-    return np.ascontiguousarray(np.rot90(array, quarters))
-
-
 @pytest.mark.usefixtures("until_nothing_moves")
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
@@ -345,10 +338,9 @@ def test_turning_the_picture_turns_the_surface(quarters: int) -> None:
     x, y, z = np.moveaxis(normals, -1, 0)
     for _ in range(quarters):
         x, y = -y, x
-    turn = turned(np.stack((x, y, z), axis=-1), 0)
     found = integrate_normals(normals, mask)
-    again = integrate_normals(turned(turn, quarters), turned(mask, quarters))
-    np.testing.assert_allclose(again, turned(found, quarters), atol=5e-3)
+    again = integrate_normals(np.rot90(np.stack((x, y, z), axis=-1), quarters), np.rot90(mask, quarters))
+    np.testing.assert_allclose(again, np.rot90(found, quarters), atol=5e-3)
 
 
 def test_inputs_do_not_change_and_progress_is_reported() -> None:
@@ -386,7 +378,6 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
         ((NORMALS, MASK, np.eye(4)), {}, UsageError, "the camera matrix has shape (4, 4), expected (3, 3)"),
         ((NORMALS, MASK, np.diag([9.0, 0, 1])), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA + 1e308), {}, InputError, "is not a camera matrix"),
-        ((NORMALS, MASK, CAMERA * (1, -1, 1)), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK, CAMERA.T), {}, InputError, "is not a camera matrix"),
         ((NORMALS, MASK), {"stiffness": -1}, UsageError, "the stiffness is -1, expected"),
     ],

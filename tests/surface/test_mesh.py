@@ -91,13 +91,11 @@ def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
     mask[3, 4] = True
     mesh = surface_mesh(50 + wave(), mask, camera, colours, normal_map=normal_map)
     np.testing.assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
-    assert mesh.colours is not None
     np.testing.assert_array_equal(mesh.colours, colours[mask])
     rows, columns = np.nonzero(mask)
     expected = np.stack(((columns + 0.5) / 20, (rows + 0.5) / 15), axis=1)
     np.testing.assert_allclose(mesh.uvs, expected, atol=1e-6)
     # Outside the mask, the texture goes on with the colours of the border.
-    assert mesh.texture is not None
     assert {tuple(colour) for colour in mesh.texture.reshape(-1, 3)} == {tuple(c) for c in colours[mask]}
 
 

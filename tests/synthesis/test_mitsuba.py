@@ -4,9 +4,8 @@ The full comparison is benchmarks/render_accuracy.py; here a small image under t
 wrong lobe, factor, frame or bounce.
 """
 
-import importlib.util
+import importlib
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -28,19 +27,10 @@ CONFIG = SceneConfig(size=SIZE, samples=4, directions=256)
 BLOCK = 4
 
 
-def load_benchmark() -> ModuleType:
-    path = Path(__file__).parents[2] / "benchmarks" / "render_accuracy.py"
-    specification = importlib.util.spec_from_file_location("render_accuracy", path)
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
 def benchmark() -> ModuleType:
     mitsuba.set_variant("scalar_rgb")
-    return load_benchmark()
+    return importlib.import_module("render_accuracy")
 
 
 def bowl_with_ring() -> Mesh:
@@ -55,7 +45,6 @@ def bowl_with_ring() -> Mesh:
         return smooth_union(bowl, ring(points), 0.05)
 
     mesh = triangulate(distance, (1.0, 1.0, 1.0), 0.03)
-    assert mesh is not None
     return fit_to_frame(mesh)
 
 

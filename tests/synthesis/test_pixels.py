@@ -58,20 +58,11 @@ def test_a_seed_says_everything() -> None:
 
 def test_matte_pixels_obey_lambert_s_law() -> None:
     batch = draw(500, NOTHING)
-    scene = replace(
-        batch.truth,
-        material=replace(
-            batch.truth.material,
-            **{
-                name: torch.zeros(500, 1)
-                for name in ("metallic", "specular", "sheen", "clearcoat", "second_share", "retro")
-            },
-            minnaert=torch.ones(500, 1),
-            # What an interface mirrors is much where it is smooth, and a larger share of dark surfaces.
-            base=batch.truth.material.base.clamp(min=0.2),
-            roughness=batch.truth.material.roughness.clamp(min=0.5),
-        ),
-    )
+    drawn, absent = batch.truth.material, ("metallic", "specular", "sheen", "clearcoat", "second_share", "retro")
+    material = replace(drawn, **dict.fromkeys(absent, torch.zeros(500, 1)), minnaert=torch.ones(500, 1))
+    # What an interface mirrors is much where it is smooth, and a larger share of dark surfaces.
+    material = replace(material, base=drawn.base.clamp(min=0.2), roughness=drawn.roughness.clamp(min=0.5))
+    scene = replace(batch.truth, material=material)
     lights = batch.light_directions
     observed = scene.radiance(lights)
     cosine = (scene.normals[:, None] * lights).sum(dim=-1).clamp(min=0)
@@ -83,17 +74,9 @@ def test_matte_pixels_obey_lambert_s_law() -> None:
     assert not observed[cosine == 0].any()
 
 
-@pytest.mark.parametrize("config", [PixelGeneratorConfig(), replace(PixelGeneratorConfig(), mixed_share=1.0)])
-def test_a_scene_turned_by_90_degrees_turns_its_map(config: PixelGeneratorConfig) -> None:
-    scene = draw_scene(300, config, torch.Generator().manual_seed(0))
-    turned = scene.rotate(torch.zeros(300), torch.ones(300))
-    torch.testing.assert_close(
-        turned.dense_truth().values, scene.dense_truth().values.rot90(1, (2, 3)), rtol=2e-3, atol=1e-4
-    )
-
-
-def test_each_pixel_is_turned_by_its_own_angle() -> None:
-    scene = draw_scene(100, PixelGeneratorConfig(), torch.Generator().manual_seed(0))
+@pytest.mark.parametrize("config", [PixelGeneratorConfig(), PixelGeneratorConfig(mixed_share=1.0)])
+def test_each_pixel_is_turned_by_its_own_angle(config: PixelGeneratorConfig) -> None:
+    scene = draw_scene(100, config, torch.Generator().manual_seed(0))
     angle = 2 * torch.pi * torch.rand(100, generator=torch.Generator().manual_seed(1))
     turned = scene.rotate(angle.cos(), angle.sin())
     # Turning scene and lights together changes nothing.
@@ -143,8 +126,6 @@ def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> N
 
 def test_mixed_pixels_lie_between_their_surfaces() -> None:
     scene = draw_scene(400, replace(NOTHING, mixed_share=0.5), torch.Generator().manual_seed(0))
-    assert scene.mixed is not None
-    assert scene.mixed_weight is not None
     assert len(scene.mixed.normals) == len(scene.mixed_weight) == 200
     lights = cell_directions()[0][cell_directions()[1]]
     alone = replace(scene, mixed=None, mixed_weight=None).radiance(lights)

@@ -97,27 +97,14 @@ def test_mitsuba_agrees() -> None:
 
 def _render_with_mitsuba(mi: Any, mesh: Any, position: Floats) -> Floats:
     strength = float(np.pi * np.sum(position**2))  # radiance 1 from matte white at the origin's distance
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "direct"},
-        "sensor": {
-            "type": "orthographic",
-            "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0]),
-            "film": {
-                "type": "hdrfilm",
-                "width": SIZE,
-                "height": SIZE,
-                "rfilter": {"type": "box"},
-                "pixel_format": "rgb",
-                "component_format": "float32",
-            },
-            "sampler": {"type": "independent", "sample_count": 256},
-        },
-        "mesh": mesh,
-        "light": {
-            "type": "point",
-            "position": [float(value) for value in position],
-            "intensity": {"type": "rgb", "value": [strength] * 3},
-        },
-    }
+    film = {
+        "type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"},
+        "pixel_format": "rgb", "component_format": "float32",
+    }  # fmt: skip
+    view = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
+    sampler = {"type": "independent", "sample_count": 256}
+    sensor = {"type": "orthographic", "to_world": view, "film": film, "sampler": sampler}
+    intensity = {"type": "rgb", "value": [strength] * 3}
+    light = {"type": "point", "position": position.tolist(), "intensity": intensity}
+    scene = {"type": "scene", "integrator": {"type": "direct"}, "sensor": sensor, "mesh": mesh, "light": light}
     return np.array(mi.render(mi.load_dict(scene)))[..., :3].mean(axis=-1)

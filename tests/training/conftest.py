@@ -1,9 +1,6 @@
 """Fixtures of a training run that takes a second."""
 
-from collections.abc import Iterator
-
 import pytest
-import torch
 
 from small_pixel_sets import _matte_pixels, make_set
 from splinecli.networks.config import NetworkConfig
@@ -14,15 +11,6 @@ from splinecli.training.run_log import RunLog
 from tiny_networks import TINY
 
 __all__ = ["_matte_pixels", "make_set"]
-
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> Iterator[None]:
-    """Use one thread, because more threads only wait for each other in networks this small."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(autouse=True)

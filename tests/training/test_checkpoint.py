@@ -7,7 +7,7 @@ import torch
 
 from splinecli.errors import ModelError
 from splinecli.networks.weights import save_weights
-from splinecli.training.checkpoint import RunCounters, load_checkpoint, read_checkpoint_config
+from splinecli.training.checkpoint import read_checkpoint_config
 from splinecli.training.config import TrainingConfig
 from splinecli.training.loop import CHECKPOINT, Trainer
 
@@ -21,23 +21,6 @@ def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
     made.step()
     made.save()
     return made
-
-
-def test_everything_comes_back(trainer: Trainer, tiny: TrainingConfig, tmp_path: Path) -> None:
-    assert read_checkpoint_config(tmp_path / CHECKPOINT) == tiny
-    other = Trainer(tiny, tmp_path / "other", CPU)
-    counters = load_checkpoint(tmp_path / CHECKPOINT, other.network, other.average, other.optimizer, {})
-    assert counters == trainer.counters == RunCounters(step=1, pixels=16, seconds=trainer.counters.seconds)
-    for name in ("network", "average"):
-        for key, tensor in getattr(trainer, name).state_dict().items():
-            assert torch.equal(getattr(other, name).state_dict()[key], tensor)
-    states, expected = other.optimizer.state_dict()["state"], trainer.optimizer.state_dict()["state"]
-    assert states.keys() == expected.keys()
-    assert len(expected) == len(list(trainer.network.parameters()))
-    for index, state in expected.items():
-        assert state.keys() == {"step", "exp_avg", "exp_avg_sq"}
-        for key, tensor in state.items():
-            assert torch.equal(states[index][key], tensor)
 
 
 def test_a_weight_file_is_no_checkpoint(trainer: Trainer, tmp_path: Path) -> None:

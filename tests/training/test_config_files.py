@@ -53,9 +53,7 @@ def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("stepz = 5", "unknown training setting 'stepz'"),
         ("batch_size = 7", "'batch_size' is 7; expected a multiple of shards = 2"),
-        ("[sources]\ngenerator = -1", "the weight of source 'generator' is -1"),
         ("steps = ", "is not TOML"),
     ],
 )
@@ -67,17 +65,16 @@ def test_what_is_wrong_in_a_file_names_the_file(tmp_path: Path, text: str, messa
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"none\.toml: the file does not exist"):
-        read_config_file(tmp_path / "none.toml")
     with pytest.raises(ModelError, match="found a folder, expected a text file"):
         read_config_file(tmp_path)
-    with pytest.raises(ModelError, match=r"a\.json: is not JSON"):
-        read_config_file(write(tmp_path / "a.json", "{"))
-    with pytest.raises(ModelError, match=r"a\.json: is not a table of settings"):
-        read_config_file(write(tmp_path / "a.json", "[1]"))
-    (tmp_path / "b.toml").write_bytes(b"preset = '\xff'")
-    with pytest.raises(ModelError, match=r"b\.toml: the file is not UTF-8 text"):
-        read_config_file(tmp_path / "b.toml")
+    for name, content, message in (
+        ("a.json", b"{", r"a\.json: is not JSON"),
+        ("a.json", b"[1]", r"a\.json: is not a table of settings"),
+        ("b.toml", b"preset = '\xff'", r"b\.toml: the file is not UTF-8 text"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ModelError, match=message):
+            read_config_file(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -105,22 +102,11 @@ def test_bad_parameters(text: str) -> None:
     assert repr(text) in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"seed": 1}, "seed = 0, not 1"),
-        ({"network": {"width": 32}}, r"network\.width = 64, not 32"),
-        ({"pixels": {"wall_share": 0.1}}, r"pixels\.wall_share = 0\.45"),
-        ({"sources": {"/data/set": 1.0}}, r"sources\./data/set = None, not 1\.0"),
-    ],
-)
-def test_another_run_is_refused_by_the_name_of_the_setting(
-    tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
-    path = tmp_path / "checkpoint.safetensors"
-    with pytest.raises(ModelError, match=f"the run was started with {message}") as caught:
-        check_resumable(TrainingConfig(), configure(changes=[change], base=TrainingConfig()), path)
-    assert caught.value.path == path
+def test_a_run_on_other_sources_is_refused(tmp_path: Path) -> None:
+    other = configure(changes=[{"sources": {"/data/set": 1.0}}], base=TrainingConfig())
+    with pytest.raises(ModelError, match=r"the run was started with sources\./data/set = None, not 1\.0") as caught:
+        check_resumable(TrainingConfig(), other, tmp_path)
+    assert caught.value.path == tmp_path
 
 
 def test_a_setting_that_is_not_given_stays_as_it_was() -> None:

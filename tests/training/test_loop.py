@@ -152,7 +152,6 @@ def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatc
     assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, "config.json", METRICS, WEIGHTS]
     assert [(progress, metrics.step) for progress, metrics in seen] == [(0.4, 4), (0.8, 8), (1.0, 10)]
     assert seen[-1][1] == last
-    assert last is not None
     header = (tmp_path / METRICS).read_text().splitlines()[0]
     assert header.split(",") == [field.name for field in fields(Metrics)]
     rows = read_metrics(tmp_path / METRICS)
@@ -160,7 +159,6 @@ def test_a_run_writes_its_files(tiny: TrainingConfig, tmp_path: Path, monkeypatc
     assert [row.pixels for row in rows] == [64, 128, 160]
     # Validated when saved: here at the end alone, on the averaged weights in the weight file.
     assert [row.validation_deg is not None for row in rows] == [False, False, True]
-    assert last.validation_deg is not None
     loaded = load_weights(tmp_path / WEIGHTS).network
     again = trainer.task.validation_deg(loaded, bfloat16=False)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
@@ -176,7 +174,6 @@ def test_minutes_bound_a_run(tiny: TrainingConfig, tmp_path: Path, monkeypatch: 
     trainer.counters.seconds = 0.3
     assert trainer.progress == pytest.approx(0.5)
     last = trainer.run()
-    assert last is not None
     assert last.step > 1
     assert trainer.counters.seconds >= 0.6
 

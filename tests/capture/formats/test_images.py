@@ -154,15 +154,10 @@ def test_values_no_photograph_has(tmp_path: Path, stored: list[list[float]], mes
 
 def test_files_that_are_no_such_image(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
-    with pytest.raises(InputError, match="the file does not exist"):
-        read_image(path)
     with pytest.raises(InputError, match="found a folder, expected an image"):
         read_image(tmp_path)
     path.write_bytes(b"")
     with pytest.raises(InputError, match="the file is empty"):
-        read_image(path)
-    path.write_bytes(b"P5 1 1 255\n0")
-    with pytest.raises(InputError, match="found neither PNG, TIFF, JPEG nor BMP"):
         read_image(path)
     path.write_bytes(b"II*\0\x08\0\0\0")
     with pytest.raises(InputError, match="the TIFF is damaged and cannot be read"):

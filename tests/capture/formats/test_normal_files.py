@@ -154,11 +154,6 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
         read_normals(tmp_path / "a.npy", SHAPE, MASK)
 
 
-def test_no_normal_inside_the_mask(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="found no normal inside the mask, expected at least one"):
-        read_normals(write(tmp_path / "a.npy", np.zeros((*SHAPE, 3))), SHAPE, MASK)
-
-
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_photograph_is_no_normal_map(write_image: WriteImage, bits: int) -> None:
     picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")

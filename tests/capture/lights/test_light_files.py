@@ -71,7 +71,6 @@ def test_directions_round_trip(
 
 
 COMMA = "A comma separates columns; write decimals with a point."
-BELOW = "found a light below the horizon"
 
 
 @pytest.mark.parametrize(
@@ -84,11 +83,8 @@ BELOW = "found a light below the horizon"
         ("0.1 0.2 1\n0.1,0.2,0.3,1\n0.1 0.2 1", 2, "found 4 columns, expected 3 as in the other lines"),
         ("# lights\n0 0 1\n0 one 1", 3, 'found "one", expected a number'),
         ("0 0 1\n0 1_0 1", 2, 'found "1_0", expected a number'),
-        ("0 0 1\n0 nan 1", 2, 'found "nan", expected a finite number'),
         ("0 0 1\n0 1e999 1", 2, 'found "1e999", expected a finite number'),
-        ("0 0 1\n0 0 0", 2, "found a zero vector, expected a light direction"),
-        ("0 0 1\n0 1 -0.5", 2, f"{BELOW} (z = -0.5), expected z > 0"),
-        ("0 0 0 1\n0 1 0 0\n1 1 1 0", 3, f"{BELOW} in column 4 (z = 0), expected z > 0"),
+        ("0 0 0 1\n0 1 0 0\n1 1 1 0", 3, "found a light below the horizon in column 4 (z = 0), expected z > 0"),
         ("5\n0 0 1\n0 1 1\n1 0 1\n1 1 1", 1, "the count line says 5, but 4 rows follow"),
         ("0.5\n0 0 1\n0 1 1", 1, "found 1 column, expected 3 columns or a count"),
         ("0 0 1\n0 1 1\n1 0 1", None, "found 3 light directions, expected 5, one for each image"),
@@ -153,30 +149,21 @@ def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
 IMAGES = tuple(Path(f"img{number}.png") for number in (1, 2, 3, 10))
 
 
-@pytest.mark.parametrize(
-    ("text", "encoding"),
-    [
-        ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
-        ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
-        ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
-        ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
-        ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
-        ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
-        ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
-        ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
-    ],
-    ids=[
-        "header",
-        "utf-16",
-        "decimal-commas",
-        "commas-and-semicolons",
-        "counted-from-1",
-        "z-first",
-        "y-first",
-        "counted-from-0",
-    ],
-)
-def test_plain_files(tmp_path: Path, text: str, encoding: str) -> None:
+PLAIN = {
+    "header": ("x y z\n0 0 1\n0.6 0 0.8\n0 -0.6 0.8\n-0.48 0.36 0.8", "utf-8"),
+    "utf-16": ("Lx,Ly,Lz\r\n0,0,1\r\n0.6,0,0.8\r\n0,-0.6,0.8\r\n-0.48,0.36,0.8\r\n", "utf-16"),
+    "decimal-commas": ("0 0 1\n0,6 0 0,8\n0 -0,6 0,8\n-0,48 0,36 0,8", "utf-8"),
+    "commas-and-semicolons": ("4\n0;0;1\n0,6;0;0,8\n0;-0,6;0,8\n-0,48;0,36;0,8", "utf-16-le"),
+    "counted-from-1": ("1 0 0 1\n3 0 -0.6 0.8\n2 0.6 0 0.8\n4 -0.48 0.36 0.8", "utf-8"),
+    "z-first": ("z y x\n1 0 0\n0.8 0 0.6\n0.8 -0.6 0\n0.8 0.36 -0.48", "utf-8"),
+    "y-first": ("light,dir_y,dir_x,dir_z\n1,0,0,1\n2,0,0.6,0.8\n3,-0.6,0,0.8\n4,0.36,-0.48,0.8", "utf-8"),
+    "counted-from-0": ("no x y z\n0 0 0 1\n1 0.6 0 0.8\n2 0 -0.6 0.8\n3 -0.48 0.36 0.8", "utf-8-sig"),
+}
+
+
+@pytest.mark.parametrize("form", PLAIN)
+def test_plain_files(tmp_path: Path, form: str) -> None:
+    text, encoding = PLAIN[form]
     path = write(tmp_path, ("\ufeff" if encoding == "utf-16-le" else "") + text, encoding)
     np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-15)
 

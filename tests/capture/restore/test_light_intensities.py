@@ -41,7 +41,6 @@ def test_unequal_lights_are_estimated(n_lights, shine):
     directions, intensities = lights(n_lights), INTENSITIES[:n_lights]
     observations = (sphere(directions, shine=shine) * intensities).astype(np.float32)
     found = estimate_light_intensities(observations, None, directions)
-    assert found is not None
     assert found.mean() == pytest.approx(1)
     np.testing.assert_allclose(found, intensities / intensities.mean(), rtol=0.02)
 
@@ -80,7 +79,6 @@ def test_flat_objects(widths, tilt):
     shaded = np.einsum("pfc,pc->pf", vectors, normals) * rng.uniform(0.3, 1, (size**2, 1))
     observations = (shaded * INTENSITIES * rng.normal(1, 0.005, shaded.shape)).astype(np.float32)
     found = estimate_light_intensities(observations, None, lambda rows: vectors[rows])
-    assert found is not None
 
     def error_deg(intensities):
         fit = fit_scaled_normals(observations / intensities, np.ones_like(observations), vectors)
@@ -96,7 +94,6 @@ def test_saturated_observations_do_not_count():
     truth = sphere(directions) * INTENSITIES
     stored = np.minimum(truth, 0.6).astype(np.float32)
     found = estimate_light_intensities(stored, truth >= 0.6, directions)
-    assert found is not None
     np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.05)
 
 
@@ -107,7 +104,6 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     source = open_capture(tmp_path)
     plain, restored = source.read(as_stored=True), source.read()
     assert plain.estimated_intensities is None
-    assert restored.estimated_intensities is not None
     low, high = INTENSITIES.min() / INTENSITIES.mean(), INTENSITIES.max() / INTENSITIES.mean()
     (warning,) = (warning for warning in restored.warnings if warning.code == "estimated_intensities")
     stated = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
@@ -134,7 +130,6 @@ def test_real_objects_whose_lights_were_measured(shared_data, name):
         found = estimate_light_intensities(
             (capture.observations[:, order] * measured[order]).astype(np.float32), None, directions
         )
-        assert found is not None
         ratio = np.log(found / measured[order])
         # Taken for equal, they would be off by 0.4 to 0.5.
         assert np.std(ratio) < 0.06

@@ -32,7 +32,6 @@ def test_matte_pixels_determine_lights_up_to_a_rotation(sigma_deg: float, matte_
     _, lights, observations = matte_pixels
     given = rough(lights, sigma_deg)
     found = refine_lights(observations.astype(np.float32), given, error_deg=sigma_deg)
-    assert found is not None
     assert aligned_error_deg(given, lights) > 0.4 * sigma_deg
     assert aligned_error_deg(found.directions, lights) < 0.1
     # The common rotation is that of the mean of 12 errors.
@@ -54,7 +53,6 @@ def test_unknown_intensities_are_refined_too(matte_pixels: Pixels) -> None:
     strengths = np.random.default_rng(3).uniform(0.85, 1.15, 12)
     given = rough(lights, 4.0)
     found = refine_lights((observations * strengths).astype(np.float32), given, intensities_known=False)
-    assert found is not None
     relative = found.intensities / strengths
     # Nine common factors are open, which the prior alone holds.
     assert np.std(relative / relative.mean()) < 0.8 * np.std(strengths)

@@ -1,10 +1,8 @@
 """Overexposed Lambertian pixels come back as bright as they were."""
 
-import cv2
 import numpy as np
 import pytest
 
-from splinecli.capture.reader import open_capture
 from splinecli.capture.restore.saturation import find_saturated, restore_saturated
 
 LIGHTS = np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float)
@@ -56,20 +54,3 @@ def test_fewer_than_three_others_still_bound_them():
 )
 def test_full_scale_is_saturated(pixels, expected):
     assert find_saturated(pixels).tolist() == expected
-
-
-def test_a_capture_is_restored_where_that_is_asked_for(tmp_path):
-    side, truth = 10, matte(100)
-    for index in range(9):
-        picture = np.minimum(truth[:, index] / 0.6, 1) * 65_535
-        cv2.imwrite(str(tmp_path / f"{index}.png"), np.rint(picture).astype(np.uint16).reshape(side, side))
-    np.savetxt(tmp_path / "lights.txt", LIGHTS)
-    source = open_capture(tmp_path)
-    stored, restored = (source.read(as_stored=as_stored).observations for as_stored in (True, False))
-    assert stored.max() == 1
-    known = ((truth < 0.6).sum(axis=1) >= 4) & (truth >= 0.6).any(axis=1)
-    np.testing.assert_allclose(restored[known], truth[known] / 0.6, atol=0.025)
-    # Under some of the lights, those alone tell.
-    some = source.read([0, 2, 4, 6, 8]).observations
-    assert some.shape == (100, 5)
-    assert (some >= stored[:, ::2]).all()
