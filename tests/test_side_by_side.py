@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from splinecli.system.side_by_side import side_by_side
+from splinecli.system.side_by_side import one_thread_each, side_by_side
 
 
 @pytest.fixture(params=[1, 3], autouse=True)

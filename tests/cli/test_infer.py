@@ -144,6 +144,27 @@ def test_a_mask_is_found_where_there_is_none(capture, run):
     assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (3, True, True)
 
 
+def test_photographs_with_a_curve_and_ambient_light(capture, run):
+    light = 9_000 / 65_535
+    for path in capture.glob("image*.png"):
+        linear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 65_535 * 0.8 + light
+        cv2.imwrite(str(path), np.rint(65_535 * linear ** (1 / 2.2)).astype(np.uint16))
+    dark = np.full((24, 24), round(65_535 * light ** (1 / 2.2)), np.uint16)
+    cv2.imwrite("dark.png", dark)
+
+    def mean_deg(*options):
+        run("infer", capture, "--method", "ls", "--overwrite", *options)
+        return read_report(Path("out/sphere"))["angular_error_deg"]["mean"]
+
+    assert mean_deg() > 5
+    assert mean_deg("--transfer", "gamma:2.2", "--ambient", "dark.png") < 0.1
+    cv2.imwrite(str(capture / "ambient.png"), dark)
+    assert mean_deg("--transfer", "gamma:2.2") < 0.1
+    assert read_report(Path("out/sphere"))["warnings"] == [
+        {"code": "ambient_subtracted", "text": "ambient.png was subtracted from all images as ambient light."}
+    ]
+
+
 def test_a_mended_mask_stays(capture, run):
     """A mask that was found, painted over, and given to the next call, which replaces the other results."""
     (capture / "mask.png").unlink()
