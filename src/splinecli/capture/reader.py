@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -177,11 +179,17 @@ def _read_lights(
     path = files.light_directions
     if path is None:
         return files, placeholders(len(files.images)), None, []
-    lights = read_lights(path, len(files.images), frame, form)
-    if not isinstance(lights, NamedLights):
-        return files, lights, None, []
-    images, how = lights.match(files.images)
     warnings = []
+    images, lights = _match_count(files.images, path, frame, form)
+    if len(images) < len(files.images):
+        others = [image.name for image in files.images if image not in images]
+        names = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
+        text = f"{names}: left out, because {path.name} has no light for it, and the other images have another size."
+        warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
+        files = replace(files, images=images)
+    if not isinstance(lights, NamedLights):
+        return files, lights, None, warnings
+    images, how = lights.match(files.images)
     if len(images) < len(files.images):
         text = f"{path.name} names {len(images)} of the {len(files.images)} images; the others are left out."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
@@ -189,6 +197,27 @@ def _read_lights(
         text = f"The lights of {path.name} were matched to the images by {how}."
         warnings.append(CaptureWarning(codes.LIGHTS_MATCHED, text))
     return replace(files, images=images), lights.directions, lights.intensities, warnings
+
+
+def _match_count(
+    images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
+) -> tuple[tuple[Path, ...], NDArray[np.float64] | NamedLights]:
+    """Return the images that a light file is for, and its lights: all images, or else those of the usual size.
+
+    Raises:
+        InputError: what read_lights raises for all images.
+    """
+    try:
+        return images, read_lights(path, len(images), frame, form)
+    except InputError:
+        stated = [read_facts(image).stated_size for image in images]
+        sizes = [None if size is None else size[0][:2] for size in stated]
+        usual = Counter(sizes).most_common(1)[0][0]
+        alike = tuple(image for image, size in zip(images, sizes, strict=True) if size == usual)
+        if len(alike) < len(images):
+            with suppress(InputError):
+                return alike, read_lights(path, len(alike), frame, form)
+        raise
 
 
 def _read_intensities(path: Path, images: Sequence[Path], in_folder: Sequence[Path]) -> NDArray[np.float64]:

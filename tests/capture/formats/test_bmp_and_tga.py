@@ -50,6 +50,19 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
     assert str(found).startswith("owl.mask.bmp and 1 more: left out")
 
 
+def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -> None:
+    folder = write_capture(tmp_path / "owl", np.full((6, 4, 5), 100, np.uint8), ring_lights(6))
+    whole = read_capture(folder)
+    Image.fromarray(RGB[:2]).save(folder / "thumb.png")
+    capture = read_capture(folder)
+    np.testing.assert_array_equal(capture.observations, whole.observations)
+    (found,) = [w for w in capture.warnings if w.code == capture_warnings.IMAGES_LEFT_OUT]
+    assert str(found).startswith("thumb.png: left out, because light_directions.txt has no light for it")
+    Image.fromarray(np.full((4, 5), 100, np.uint8)).save(folder / "seventh.png")
+    with pytest.raises(InputError, match="found 6 light directions, expected 8"):
+        read_capture(folder)
+
+
 def test_photographs_may_have_such_names(tmp_path: Path) -> None:
     """All of them: then these names say nothing."""
     folder = write_capture(
