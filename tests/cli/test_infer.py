@@ -281,8 +281,11 @@ def test_closed_streams_and_ascii_terminals(capture, make_capture):
     ("maps", "scales"), [("relief,curvature,gradient", (1, 0.05)), ("relief:0.5, curvature:0.1,gradient", (0.5, 0.1))]
 )
 def test_scales_of_pictures(capture, run, maps, scales):
-    assert run("infer", capture, "--method", "ls", "--maps", maps).code == 0
+    assert run("infer", capture, "--method", "ls", "--maps", maps, "--format", "npy,tiff").code == 0
     assert np.isfinite(np.load(f"out/{capture.name}/gradient.npy")).sum() == 2 * 448
+    for name in ("gradient", "relief", "curvature"):
+        tiff = tifffile.imread(f"out/{capture.name}/{name}.tiff")
+        np.testing.assert_array_equal(tiff, np.load(f"out/{capture.name}/{name}.npy"))
     for name, scale in zip(("relief", "curvature"), scales, strict=True):
         values = np.atleast_3d(np.load(f"out/{capture.name}/{name}.npy"))[..., 0]
         assert (values.dtype, np.isfinite(values).sum()) == (np.float32, 448)

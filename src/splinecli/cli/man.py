@@ -49,6 +49,7 @@ FILES = {
     " at most 5 degrees.",
     "OUT/NAME/preview.png": "With --maps preview: the surface in matte white under a raking light.",
     "OUT/NAME/gradient.npy": "With --maps gradient: the slopes dz/dx and dz/dy, H x W x 2.",
+    "OUT/NAME/gradient.tiff, curvature.tiff, relief.tiff": "With --format tiff: these maps as float32 TIFF, too.",
     "OUT/NAME/curvature.npy": "With --maps curvature: mean and Gaussian curvature in 1/pixel, H x W x 2.",
     "OUT/NAME/curvature.png": "With --maps curvature: the mean curvature; gray is flat, bumps are brighter.",
     "OUT/NAME/relief.npy": "With --maps relief: heights in pixels without the shape in the large, H x W.",

@@ -186,7 +186,9 @@ def _further_files(
 ) -> list[Iterable[tuple[str, Content]]]:
     """Compute what else the options ask for, put what the report says of the surface into it, and return the files."""
     capture = estimate.capture
-    found: list[Iterable[tuple[str, Content]]] = [files.map_files(estimate, options.maps, options.curvature_scale)]
+    found: list[Iterable[tuple[str, Content]]] = [
+        files.map_files(estimate, options.maps, options.curvature_scale, tiff="tiff" in options.formats)
+    ]
     albedo = colours = None
     clock.begin("pictures")
     if "albedo" in options.maps or options.html:
@@ -196,7 +198,8 @@ def _further_files(
         if "albedo" in options.maps:
             found.append(files.albedo_files(albedo, capture.mask, exr="exr" in options.formats))
     if "relief" in options.maps:
-        found.append(files.relief_files(relief_of_normals(estimate.normal_map, capture.mask), options.relief_scale))
+        relief = relief_of_normals(estimate.normal_map, capture.mask)
+        found.append(files.relief_files(relief, options.relief_scale, tiff="tiff" in options.formats))
     light_plot = None
     if capture.light_errors_deg is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=capture.light_errors_deg)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -51,15 +52,16 @@ LIGHT_FILES = LIGHT_DIRECTIONS, LIGHT_INTENSITIES, LIGHT_PLOT = (
 )
 """What `infer` writes of lights that it found. In a folder that is also the capture's, such files may be the user's."""
 
-GRADIENT, CURVATURE_PICTURE, CURVATURE = "gradient.npy", "curvature.png", "curvature.npy"
-RELIEF_PICTURE, RELIEF = "relief.png", "relief.npy"
+GRADIENT, GRADIENT_TIFF = "gradient.npy", "gradient.tiff"
+CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF = "curvature.png", "curvature.npy", "curvature.tiff"
+RELIEF_PICTURE, RELIEF, RELIEF_TIFF = "relief.png", "relief.npy", "relief.tiff"
 MAPS = {
     "albedo": (ALBEDO_PICTURE, ALBEDO, ALBEDO_EXR),
     "confidence": (CONFIDENCE_PICTURE, CONFIDENCE),
     "preview": (PREVIEW,),
-    "gradient": (GRADIENT,),
-    "curvature": (CURVATURE_PICTURE, CURVATURE),
-    "relief": (RELIEF_PICTURE, RELIEF),
+    "gradient": (GRADIENT, GRADIENT_TIFF),
+    "curvature": (CURVATURE_PICTURE, CURVATURE, CURVATURE_TIFF),
+    "relief": (RELIEF_PICTURE, RELIEF, RELIEF_TIFF),
 }
 """The files of each optional map."""
 
@@ -205,8 +207,8 @@ def albedo_files(albedo: NDArray[np.float32], mask: NDArray[np.bool_], *, exr: b
     yield ALBEDO_PICTURE, encode_png(albedo_picture(albedo, mask))
 
 
-def map_files(estimate: NormalEstimate, maps: Sequence[str], curvature_scale: float) -> Files:
-    """Yield those of the maps that follow from the normals alone: float32 NPY files, and pictures."""
+def map_files(estimate: NormalEstimate, maps: Sequence[str], curvature_scale: float, *, tiff: bool) -> Files:
+    """Yield those of the maps that follow from the normals alone: float32 NPY and TIFF files, and pictures."""
     normal_map, mask = estimate.normal_map, estimate.capture.mask
     if "confidence" in maps and estimate.confidence_map is not None:
         yield CONFIDENCE, estimate.confidence_map
@@ -214,16 +216,33 @@ def map_files(estimate: NormalEstimate, maps: Sequence[str], curvature_scale: fl
     if "preview" in maps:
         yield PREVIEW, encode_png(preview_picture(normal_map, mask))
     if "gradient" in maps:
-        yield GRADIENT, gradient_of_normals(normal_map, mask)
+        gradient = gradient_of_normals(normal_map, mask)
+        yield GRADIENT, gradient
+        if tiff:
+            yield GRADIENT_TIFF, _encode_tiff(gradient, "slopes dz/dx and dz/dy, x right, y up")
     if "curvature" in maps:
         curvature = curvature_of_normals(normal_map, mask)
         words = f"mean curvature, black {-curvature_scale}, gray 0, white {curvature_scale} per pixel"
         yield CURVATURE, curvature
+        if tiff:
+            yield CURVATURE_TIFF, _encode_tiff(curvature, "mean and Gaussian curvature, 1/pixel and 1/pixel^2")
         yield CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], curvature_scale), {"curvature": words})
 
 
-def relief_files(relief: NDArray[np.float32], scale: float) -> Files:
-    """Yield a relief (H, W) as a float32 NPY file and as a gray picture."""
+def relief_files(relief: NDArray[np.float32], scale: float, *, tiff: bool) -> Files:
+    """Yield a relief (H, W) as a float32 NPY file, with tiff as a TIFF file, too, and as a gray picture."""
     words = f"height, black {-scale}, gray 0, white {scale} pixels"
     yield RELIEF, relief
+    if tiff:
+        yield RELIEF_TIFF, _encode_tiff(relief, "heights in pixels")
     yield RELIEF_PICTURE, encode_png(signed_picture(relief, scale), {"relief": words})
+
+
+def _encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
+    """Return a map (H, W) or (H, W, C) as a float32 TIFF file."""
+    import tifffile
+
+    file = BytesIO()
+    layout = "contig" if values.ndim == 3 else None
+    tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
+    return file.getvalue()
