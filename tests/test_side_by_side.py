@@ -4,6 +4,7 @@ import ctypes
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -60,7 +61,22 @@ def test_a_new_thread_begins_with_one_thread_of_its_own(threads: int) -> None:
     assert list(side_by_side(lambda _: openmp.omp_get_max_threads(), range(threads))) == [1] * threads
 
 
-def test_two_callers_at_a_time_restore_the_number_of_threads(threads: int) -> None:
-    with one_thread_each() as first, one_thread_each() as second:
-        assert (first, second) == (threads, threads)
-    assert torch.get_num_threads() == threads
+def test_callers_in_several_threads_restore_the_number_in_each(threads: int) -> None:
+    """The first one ends while the second one is within."""
+    first_in, second_in, first_out = (threading.Event() for _ in range(3))
+
+    def call(begins: threading.Event | None, began: threading.Event, ends: threading.Event) -> tuple[int, int, int]:
+        assert begins is None or begins.wait(60)
+        with one_thread_each() as before:
+            within = torch.get_num_threads()
+            began.set()
+            assert ends.wait(60)
+        return before, within, torch.get_num_threads()
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(call, None, first_in, second_in)
+        second = pool.submit(call, first_in, second_in, first_out)
+        assert first.result() == (threads, 1, threads)
+        first_out.set()
+        assert second.result() == (threads, 1, threads)
+        assert pool.submit(torch.get_num_threads).result() == threads

@@ -184,7 +184,10 @@ def _read_lights(
     if len(images) < len(files.images):
         others = [image.name for image in files.images if image not in images]
         names = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
-        text = f"{names}: left out, because {path.name} has no light for it, and the other images have another size."
+        them = "it" if len(others) == 1 else "them"
+        text = (
+            f"{names}: left out, because {path.name} has no light for {them}, and the other images have another size."
+        )
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
         files = replace(files, images=images)
     if not isinstance(lights, NamedLights):

@@ -110,7 +110,7 @@ class RefineNet(nn.Module):
         corrected = normals + change[:, :3]
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
             corrected = corrected + weight * difference
-        return _unit(corrected) * mask, (error + change[:, 3:5]) * mask
+        return unit_maps(corrected) * mask, (error + change[:, 3:5]) * mask
 
 
 def _type_of_layers(maps: Tensor) -> torch.dtype:
@@ -147,9 +147,9 @@ def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisTyp
     return ..., rows, columns
 
 
-def _unit(vectors: Tensor) -> Tensor:
-    """Scale vectors (B, 3, H, W) to unit length: faster than a norm over the channels. Zero vectors stay zero."""
-    x, y, z = vectors[:, :1], vectors[:, 1:2], vectors[:, 2:]
+def unit_maps(vectors: Tensor) -> Tensor:
+    """Scale vectors (..., 3, H, W) to unit length: faster than a norm over the channels. Zero vectors stay zero."""
+    x, y, z = torch.split(vectors, 1, dim=-3)
     length = (x * x + y * y + z * z).clamp(min=1e-24).sqrt()
     return vectors / length
 
@@ -162,7 +162,7 @@ def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
     weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
     found = []
     for sigma in SIGMAS:
-        found.append(_unit(gaussian_sum(normals * weight, sigma)) * mask)
+        found.append(unit_maps(gaussian_sum(normals * weight, sigma)) * mask)
     return found
 
 

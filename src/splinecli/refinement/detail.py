@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from splinecli.networks.gaussian import gaussian_sum, reach_of
+from splinecli.networks.refine_net import unit_maps
 from splinecli.refinement.halving import enlarge
 
 FINE = 1.5
@@ -75,11 +76,6 @@ def restore_octave(
     detail, missing = ((maps - unit_maps(_without_octave(maps, largest))) * mask for maps in (estimated, least_squares))
     noise = (noise - _without_octave(noise, largest)) * mask
     return unit_maps(enlarged + _real_share(missing * largest, noise * largest) * detail)
-
-
-def unit_maps(maps: Tensor) -> Tensor:
-    """Return maps of vectors (3, H, W) at unit length; zero vectors stay. Many times as fast as torch's normalize."""
-    return maps * maps.square().sum(dim=0, keepdim=True).clamp_(min=_TINY**2).rsqrt_()
 
 
 def _real_share(missing: Tensor, noise: Tensor) -> Tensor:

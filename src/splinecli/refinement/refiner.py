@@ -19,8 +19,8 @@ from splinecli.fits.two_halves import alternating_signs
 from splinecli.light.lamp_light import LIT_AT_ONCE, LampLight, LightOf, Rows
 from splinecli.maths.observation_map import map_scale
 from splinecli.networks.refine_channels import CHANNELS, channels
-from splinecli.networks.refine_net import COARSEST, Part, RefineNet
-from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave, unit_maps
+from splinecli.networks.refine_net import COARSEST, Part, RefineNet, unit_maps
+from splinecli.refinement.detail import FEWEST_LIGHTS, restore_detail, restore_octave
 from splinecli.refinement.detail import REACH as DETAIL_REACH
 from splinecli.refinement.features import Turn, brightness, refine_features, turn_features, turn_maps, two_halves
 from splinecli.refinement.halving import HalfCapture

@@ -217,32 +217,29 @@ def map_files(estimate: NormalEstimate, maps: Sequence[str], curvature_scale: fl
         yield PREVIEW, encode_png(preview_picture(normal_map, mask))
     if "gradient" in maps:
         gradient = gradient_of_normals(normal_map, mask)
-        yield GRADIENT, gradient
-        if tiff:
-            yield GRADIENT_TIFF, _encode_tiff(gradient, "slopes dz/dx and dz/dy, x right, y up")
+        yield from _value_files((GRADIENT, GRADIENT_TIFF), gradient, "slopes dz/dx and dz/dy, x right, y up", tiff=tiff)
     if "curvature" in maps:
         curvature = curvature_of_normals(normal_map, mask)
         words = f"mean curvature, black {-curvature_scale}, gray 0, white {curvature_scale} per pixel"
-        yield CURVATURE, curvature
-        if tiff:
-            yield CURVATURE_TIFF, _encode_tiff(curvature, "mean and Gaussian curvature, 1/pixel and 1/pixel^2")
+        units = "mean and Gaussian curvature, 1/pixel and 1/pixel^2"
+        yield from _value_files((CURVATURE, CURVATURE_TIFF), curvature, units, tiff=tiff)
         yield CURVATURE_PICTURE, encode_png(signed_picture(curvature[..., 0], curvature_scale), {"curvature": words})
 
 
 def relief_files(relief: NDArray[np.float32], scale: float, *, tiff: bool) -> Files:
     """Yield a relief (H, W) as a float32 NPY file, with tiff as a TIFF file, too, and as a gray picture."""
     words = f"height, black {-scale}, gray 0, white {scale} pixels"
-    yield RELIEF, relief
-    if tiff:
-        yield RELIEF_TIFF, _encode_tiff(relief, "heights in pixels")
+    yield from _value_files((RELIEF, RELIEF_TIFF), relief, "heights in pixels", tiff=tiff)
     yield RELIEF_PICTURE, encode_png(signed_picture(relief, scale), {"relief": words})
 
 
-def _encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
-    """Return a map (H, W) or (H, W, C) as a float32 TIFF file."""
-    import tifffile
+def _value_files(names: tuple[str, str], values: NDArray[np.float32], description: str, *, tiff: bool) -> Files:
+    """Yield a map (H, W) or (H, W, C) as a float32 NPY file and, with tiff, as a TIFF file with a description."""
+    yield names[0], values
+    if tiff:
+        import tifffile
 
-    file = BytesIO()
-    layout = "contig" if values.ndim == 3 else None
-    tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
-    return file.getvalue()
+        file = BytesIO()
+        layout = "contig" if values.ndim == 3 else None
+        tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
+        yield names[1], file.getvalue()

@@ -25,19 +25,20 @@ def one_thread_each() -> Iterator[int]:
     import torch
 
     global _users, _threads
+    # Each thread has its own number, and new ones have the number that was set last. So the first of several callers
+    # reads it for all, and each sets it in its own thread.
     with _lock:
         if not _users:
             _threads = torch.get_num_threads()
-            torch.set_num_threads(1)
         _users += 1
         threads = _threads
+        torch.set_num_threads(1)
     try:
         yield threads
     finally:
         with _lock:
             _users -= 1
-            if not _users:
-                torch.set_num_threads(threads)
+            torch.set_num_threads(threads)
 
 
 def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
