@@ -8,8 +8,6 @@ weights are not measured again, and a stopped evaluation goes on in --results. -
 one, as in noise/iw12. "speed" and "sizes" run only if they are named, because they need a quiet machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

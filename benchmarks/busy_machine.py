@@ -11,8 +11,6 @@ turns, so that all of them meet the same conditions. CAPTURE is examples/medalli
 cores; --busy 0 measures the quiet machine alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

@@ -7,8 +7,6 @@ of the object, and draws 8 to 40 lights. Prints for each fault the shares of cap
 captures, draws of 10 and 20 lights and all lights are checked as they are.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -7,8 +7,6 @@ spline-net estimates them. FOLDER keeps each with its true errors in a file. A r
 takes every N-th scene, so that N processes can share the work.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace

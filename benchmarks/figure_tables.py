@@ -6,8 +6,6 @@ A table stands between `<!-- figures: NAME -->` and `<!-- end -->`; TABLES says 
 version and the weights that it was measured with. all_figures.py measures.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence

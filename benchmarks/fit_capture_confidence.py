@@ -8,8 +8,6 @@ and the share of the worst tenth that the least confident tenth holds, before an
 that they are judged with. --write fits to all scenes, and puts the result into the package.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Iterator, Sequence

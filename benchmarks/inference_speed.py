@@ -7,8 +7,6 @@ slower, gets a thirty-second of them. Each figure is the median over --repeats r
 (such as DiLiGenT's catPNG), the whole command is measured too, with ten lights, in processes of its own.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import subprocess

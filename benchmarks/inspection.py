@@ -7,8 +7,6 @@ Each plate is slightly curved, rough, printed in two tones, and has four defects
 defect is found where a map exceeds the largest value on plates without defects, so print and noise do not count.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

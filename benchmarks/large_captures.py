@@ -10,8 +10,6 @@ processor's seconds mean something, and they only beside others of the same run.
 against the size.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -6,8 +6,6 @@ Each material gives a sphere under ten of the lights (seed 0), without shadows, 
 the mean angular error over all materials and pixels, and the materials with the largest errors.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence

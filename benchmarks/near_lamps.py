@@ -8,8 +8,6 @@ distance that of lights taken as distant ("no"), of near lamps at their true dis
 is wrong by these factors. For the plane, also the range of its heights in percent of its width.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

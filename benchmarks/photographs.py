@@ -8,8 +8,6 @@ The captures need ground truth. Each is measured under draws of ten lights (seed
 2. the estimated light intensities, if the measured ones are withheld.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

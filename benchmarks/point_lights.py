@@ -1,7 +1,5 @@
 """Radiance under points of light at finite distances: direct light with cast shadows, and no indirect light."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -10,8 +10,6 @@ two halves of samples, is part of what is printed.
 Mitsuba takes one specular reflectance for a whole shape, so it is rounded to a few levels here, in both.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import time

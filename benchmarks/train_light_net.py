@@ -8,8 +8,6 @@ of 22,000 and 11,000 steps: about 300,000 captures. The second leg began from th
 twice the scenes.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

@@ -6,8 +6,6 @@ The pixels come from the pixel set SET, or from the online generator. Each figur
 --warm-up steps that are not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time

@@ -7,8 +7,6 @@ every wrong way. Scenes that no default seed uses are rendered in all classes of
 Markdown: how many are named / how many get the right mend, of how many.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence

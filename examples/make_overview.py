@@ -5,8 +5,6 @@
 The script runs `splinecli infer` on the medallion and draws the files that the command writes.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

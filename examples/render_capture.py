@@ -11,8 +11,6 @@ The mirror ball is for `splinecli calibrate`, which computes the light direction
 in a dim room, photographed under each of the ten lamps.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ A pixel cannot tell wrong lights or values from an unusual reflectance. Many pix
 the lights, the place in the image, or the brightness in the same way everywhere.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The errors that splinecli raises on purpose. Each has an exit code, and a hint that says what to do."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any

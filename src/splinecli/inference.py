@@ -6,8 +6,6 @@ The pixels are processed in tiles. The working memory of a method is that of one
 capture.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext

@@ -1,7 +1,5 @@
 """The relief of waves, whose heights are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Points of light against Lambert's law on a plane, and against Mitsuba 3."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Light directions from folders of images of mirror balls."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

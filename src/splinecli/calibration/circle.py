@@ -3,8 +3,6 @@
 Coordinates are in pixels of the image: x right, y down, whole numbers at pixel centres, (0, 0) the top left pixel.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any

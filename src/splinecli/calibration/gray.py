@@ -1,7 +1,5 @@
 """Light intensities, relative to each other, from images of a matte gray target."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

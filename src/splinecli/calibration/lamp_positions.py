@@ -4,8 +4,6 @@ Each ball gives a ray: from the highlight on its surface in the direction of the
 size of their outlines tells, lie near a plane z = const, which the object's mean plane should be.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

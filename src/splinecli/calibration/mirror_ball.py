@@ -5,8 +5,6 @@ so l = 2 (n.v) n - v. A common mistake is to use n itself as the light direction
 unit of length is the radius of the ball. x is right, y up, z towards the camera.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

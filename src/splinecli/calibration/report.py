@@ -1,7 +1,5 @@
 """The report of a calibration: calibration.json, its warnings, and its summary for people."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The camera of a calibration: its matrix, where it is known from, and how uncertain it is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A capture from arrays that are already in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Warnings about a capture: a stable code for programs, a sentence for people."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is at a path. The system may refuse to answer: names that are too long, loops of links, no permission."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

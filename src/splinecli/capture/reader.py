@@ -1,7 +1,5 @@
 """Open a capture: find its files and read its lights."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress

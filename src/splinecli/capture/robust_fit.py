@@ -1,7 +1,5 @@
 """Robust Lambertian fits by weighted least squares, from which lights and saturated values are judged and estimated."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

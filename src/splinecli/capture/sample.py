@@ -1,7 +1,5 @@
 """A sample of a capture's pixels on a grid, small enough for checks that see neighbours."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Summary of a capture without normals: sizes, exposure and lights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

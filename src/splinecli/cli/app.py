@@ -1,7 +1,5 @@
 """The Typer app and its commands. Importing it must stay cheap: no torch, no OpenCV."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Annotated
 

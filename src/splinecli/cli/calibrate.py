@@ -1,7 +1,5 @@
 """`splinecli calibrate`: light directions from images of mirror balls, intensities from a gray target."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from typer import Argument, Option

@@ -1,7 +1,5 @@
 """What all commands share: help in panels, `~` in every path, and a JSON document also where a command fails."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

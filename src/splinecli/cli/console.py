@@ -1,7 +1,5 @@
 """Printing: the reports of the commands on stdout; messages, warnings, tables and progress on stderr."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -4,8 +4,6 @@ Typer and click name the errors of their parser, such as an unknown option or a 
 from version to version. Only attributes of these errors are relied on. One without a known attribute keeps its text.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import textwrap

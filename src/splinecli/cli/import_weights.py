@@ -1,7 +1,5 @@
 """`splinecli import-weights`: turn the authors' checkpoints into a weight file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from typer import Argument, Option

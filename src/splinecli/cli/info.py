@@ -1,7 +1,5 @@
 """`splinecli info`: what `infer` would read from a capture, and what to expect."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from typer import Argument, Option

@@ -1,7 +1,5 @@
 """`splinecli integrate`: a normal map -> depth map and mesh."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from typer import Argument, Option

@@ -1,7 +1,5 @@
 """Entry point: run the app, and turn every error into one message and an exit code."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

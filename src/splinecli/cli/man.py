@@ -1,7 +1,5 @@
 """Make the man pages, an overview and one page per command, from the commands: `python -m splinecli.cli.man man`."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import shlex

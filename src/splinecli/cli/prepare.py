@@ -1,7 +1,5 @@
 """`splinecli prepare`: make a pixel set from captures with ground truth, CyclesPS trees and rendered scenes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Options that several commands have. A command declares its other options in its signature."""
 
-from __future__ import annotations
-
 from typer import Option
 
 from splinecli.cli.values import Device, LightForm, Precision, complete_curves, complete_list, complete_weights

@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM, which job schedulers send, end the process with exit code 130; SIGTERM within two seconds."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

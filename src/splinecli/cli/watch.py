@@ -1,7 +1,5 @@
 """`splinecli watch`: run `infer` on each capture that arrives in a folder."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The checks of a capture's lights and images against each other, which `infer` and `info` make, in their order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ were chosen on rendered captures with and without these faults (benchmarks/captu
 materials.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

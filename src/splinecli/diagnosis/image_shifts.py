@@ -5,8 +5,6 @@ predicted from the others whatever its light, and its fine detail lies where the
 elsewhere, the image is shifted: the peak of the normalised cross-correlation tells by how much.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

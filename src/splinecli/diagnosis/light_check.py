@@ -5,8 +5,6 @@ classes of materials, 6 to 48 lights, with and without errors of their direction
 figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

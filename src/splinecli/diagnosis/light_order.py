@@ -7,8 +7,6 @@ flat objects, however, free intensities explain any order.
 The thresholds were chosen on the same captures as those of light_check.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

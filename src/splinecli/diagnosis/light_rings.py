@@ -4,8 +4,6 @@ A wrong order or frame of all lights is found by light_order.py and light_check.
 begin at another lamp, or run the other way round.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ The thresholds were chosen on the same captures as those of light_check.py, in w
 half in shadow, or one light was moved by 40 degrees.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

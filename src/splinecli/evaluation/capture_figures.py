@@ -1,7 +1,5 @@
 """Figures of single captures: the maps of every method for the first draw, and observation maps of some pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 All functions take one evaluation, or several of the same methods that differ in n_lights, light_noise_deg or both.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

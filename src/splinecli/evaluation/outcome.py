@@ -1,7 +1,5 @@
 """The outcome of an evaluation: a result for each method and capture, and the captures that have none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

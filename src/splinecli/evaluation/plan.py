@@ -1,7 +1,5 @@
 """The trials of an evaluation, planned before any image is read."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """How an evaluation is done: the lights, trials, noise and pixels, and how captures are read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An evaluation as one HTML file that needs no other file: to mail, to print, or to keep."""
 
-from __future__ import annotations
-
 import base64
 import struct
 from collections.abc import Sequence

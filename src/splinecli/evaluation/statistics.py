@@ -6,8 +6,6 @@ pairs of methods on one capture (Holm, Scandinavian Journal of Statistics 1979).
 only. A significant difference applies to other lights on this capture, not to other captures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -1,7 +1,5 @@
 """A capture read for its trials, and what a trial sees of it: the scored pixels under its lights, restored."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

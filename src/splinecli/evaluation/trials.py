@@ -1,7 +1,5 @@
 """Trials and their scores. Scores are stored as they come, so that an interrupted evaluation can go on."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

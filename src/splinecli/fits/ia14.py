@@ -4,8 +4,6 @@ Ikehata and Aizawa, Photometric stereo using constrained bivariate regression fo
 2014.
 """
 
-from __future__ import annotations
-
 from math import comb
 
 import torch

@@ -4,8 +4,6 @@ S. Ikehata, D. Wipf, Y. Matsushita, K. Aizawa, "Robust photometric stereo using 
 section 3.2, with lambda = 0, as in the authors' own comparisons.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ Iteratively reweighted least squares of I = l . b with two weights. Observations
 largest are treated as shadows and get a tiny weight. Large residuals get smaller weights, which approximates an L1 fit.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

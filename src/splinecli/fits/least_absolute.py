@@ -1,7 +1,5 @@
 """L1: minimise the sum of absolute residuals, which shadows and highlights affect less than the sum of squares."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Detection of shadows. IW12, ST14, IA14 and trimmed LS use the same rule, each with its own threshold."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Trimmed LS: least squares without shadows and without the darkest and brightest observations."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from splinecli.fits.shadows import lit_observations

@@ -4,8 +4,6 @@ Random errors differ from light to light, so the halves disagree about them. Wha
 or wrong in the same way for all pixels of a neighbourhood.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Least squares with a weight for each observation, pixel by pixel: one step of every robust method."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -9,8 +9,6 @@ Two things are unknown: the exposure, that is which observation an albedo of 1 g
 enough. Attached shadows show both. Under a light behind its tangent plane, a pixel shows indirect light alone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 

@@ -4,8 +4,6 @@ Where a smooth surface turns away from the camera, its normals are perpendicular
 that were turned together turn all normals with them, also those at the outline.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

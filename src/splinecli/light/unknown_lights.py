@@ -7,8 +7,6 @@ surface leave a generalised bas-relief ambiguity (Belhumeur, Kriegman and Yuille
 and the outline of the object where it is clear.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

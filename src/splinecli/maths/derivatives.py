@@ -5,8 +5,6 @@ For a surface z(x, y) with unit normals n = (-p, -q, 1) / sqrt(1 + p^2 + q^2), l
 (Gauss), and half its trace is the mean curvature (do Carmo, Differential Geometry of Curves and Surfaces, 1976, 3-3).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Angular errors of normals, in degrees."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

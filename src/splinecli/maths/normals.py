@@ -3,8 +3,6 @@
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
-from __future__ import annotations
-
 from typing import Literal, TypeVar
 
 import numpy as np

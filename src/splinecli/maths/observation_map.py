@@ -10,8 +10,6 @@ is a single point. It differs from ours by half a cell on average, nearly two de
 such maps need the same grid: "cnn-ps".
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Literal, NamedTuple
 

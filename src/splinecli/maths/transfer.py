@@ -1,7 +1,5 @@
 """Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves and tables."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

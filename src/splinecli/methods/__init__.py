@@ -3,8 +3,6 @@
 The file is imported when the method is used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

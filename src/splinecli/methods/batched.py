@@ -1,7 +1,5 @@
 """Estimators made of one torch function: they split the pixels into batches and scale each pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ at some 80 times the speed. What the perceptron does not follow is mostly the ne
 Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 R. J. Woodham, "Photometric method for determining surface orientation from multiple images", 1980.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ inverse-square falloff that the lamps have there. The surface begins as the obje
 CNN based approach for the point-light photometric stereo problem", arXiv 2210.04655, alternate alike.)
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

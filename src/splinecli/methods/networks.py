@@ -1,7 +1,5 @@
 """SPLINE-Net and CNN-PS as estimators. They average the normals of several rotations of each pixel's lights."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

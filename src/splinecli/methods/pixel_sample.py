@@ -1,7 +1,5 @@
 """A sample of pixels that is spread over their appearance, so that it contains rare materials and highlights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

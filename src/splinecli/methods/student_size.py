@@ -1,7 +1,5 @@
 """How much a distilled estimator learns, by the size of the capture. This file is imported without PyTorch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 FEWEST_PIXELS = 64

@@ -1,7 +1,5 @@
 """The capture head: changes distributions of errors by what a capture as a whole says."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """The error head: estimates the distribution of the angular error of NE-Net's normals, which gives confidence."""
 
-from __future__ import annotations
-
 import math
 
 import torch

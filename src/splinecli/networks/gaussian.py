@@ -1,7 +1,5 @@
 """Gaussian filters of maps on any device: faster than convolutions of so few channels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

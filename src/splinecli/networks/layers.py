@@ -1,7 +1,5 @@
 """Layers that the compact LI-Net and NE-Net share."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import torch

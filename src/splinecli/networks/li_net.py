@@ -1,7 +1,5 @@
 """LI-Net, the lighting interpolation network: sparse observation map -> dense observation map."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

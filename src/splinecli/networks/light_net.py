@@ -1,7 +1,5 @@
 """The light network: reads the direction and the relative intensity of the light of each image of a capture."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """NE-Net, the normal estimation network: sparse and dense observation map -> normal."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -12,8 +12,6 @@ size "paper" has the same layers but other conventions. The import changes the w
 Their normals are assumed to be in our frame: x right, y up, z to the camera.
 """
 
-from __future__ import annotations
-
 import pickletools
 import warnings
 import zipfile

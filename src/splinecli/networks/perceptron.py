@@ -1,7 +1,5 @@
 """A small perceptron that learns the normals and the errors of another estimator on the pixels of one capture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """The channels of the features that the refinement net reads; refinement/features.py computes them."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 WIDTHS = {

@@ -1,7 +1,5 @@
 """The refinement net: corrects a map of normals and of their errors by what lies around each pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from types import EllipsisType

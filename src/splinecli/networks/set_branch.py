@@ -1,7 +1,5 @@
 """The set branch: attention over a pixel's observations as they are, without rounding their lights to cells."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

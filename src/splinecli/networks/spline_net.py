@@ -5,8 +5,6 @@ observation. Values above 1 are cut off, so that a highlight under some other li
 other values.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

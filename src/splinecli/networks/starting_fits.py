@@ -1,7 +1,5 @@
 """The fits whose normals NE-Net weighs and corrects, beside the robust Lambertian fit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

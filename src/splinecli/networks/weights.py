@@ -1,7 +1,5 @@
 """Weight files: safetensors with the configuration of the network and a checksum. Nothing is unpickled."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import dataclass

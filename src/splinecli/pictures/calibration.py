@@ -1,7 +1,5 @@
 """The picture that shows whether a calibration is right: each ball with its outline, highlight and light direction."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """A picture of the scenes in a pixel set: the normals of each scene, and each of its entries under two lights."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Pictures of angular error maps."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

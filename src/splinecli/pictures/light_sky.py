@@ -1,7 +1,5 @@
 """A plot of the light directions of a capture as the camera sees them, on the disc of observation maps."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Pictures of the maps of one capture: albedo, confidence, and a preview of the surface."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

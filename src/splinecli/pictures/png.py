@@ -1,7 +1,5 @@
 """PNG files of pictures."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Mapping

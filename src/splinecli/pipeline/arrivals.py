@@ -1,7 +1,5 @@
 """Captures that arrive in a folder one after the other, each when it is complete."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Run `infer` on many captures, in this process or on others, and go on past a capture that fails."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence

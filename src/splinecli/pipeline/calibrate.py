@@ -1,7 +1,5 @@
 """What `calibrate` does: images of balls and of a gray target in, light files and a report out."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

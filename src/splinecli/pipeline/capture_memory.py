@@ -1,7 +1,5 @@
 """The memory that `infer` takes for a capture, known before its images are read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

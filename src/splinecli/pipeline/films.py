@@ -1,7 +1,5 @@
 """Unpack a film into a folder of images, which is then read like any capture."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Estimate the normals of one capture: read it, run the method, write the results."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial

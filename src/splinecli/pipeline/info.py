@@ -1,7 +1,5 @@
 """What `info` does: a capture in, a report out of what `infer` would read and need."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,5 @@
 """What `integrate` does: a normal map in, a depth map, meshes and a report out."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -1,7 +1,5 @@
 """One capture of a batch of `infer`: skip it if its results are up to date, and keep its error if it fails."""
 
-from __future__ import annotations
-
 import errno
 import traceback
 from collections.abc import Callable

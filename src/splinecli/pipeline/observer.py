@@ -1,7 +1,5 @@
 """What the pipeline reports while it works. The command line turns it into lines and progress bars."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol

@@ -1,7 +1,5 @@
 """What `prepare` does: captures with ground truth and rendered scenes become a pixel set."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """How a capture is read, as one frozen record that `infer` and `info` share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

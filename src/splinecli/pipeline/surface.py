@@ -1,7 +1,5 @@
 """The surface of a normal map: integrated, as a mesh, in its unit, with its report. `integrate` and `infer` make it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Rendered scenes as entries of a pixel set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property

@@ -9,8 +9,6 @@
 This module reads sets, writer.py writes them. Training refuses an unfinished set.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

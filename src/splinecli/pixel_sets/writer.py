@@ -1,7 +1,5 @@
 """Writing of pixel sets, entry by entry, so that an interrupted command can continue."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

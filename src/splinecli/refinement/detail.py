@@ -4,8 +4,6 @@ The net judges by the errors that SPLINE-Net expects. Many of these are the same
 light intensities, and say nothing about detail. Real detail agrees between two halves of the lights; noise does not.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d

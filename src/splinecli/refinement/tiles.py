@@ -1,7 +1,5 @@
 """A map in tiles that overlap, so that memory does not grow with the map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The albedo map: the share of the light that each pixel reflects, in colour, computed from the normal map."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

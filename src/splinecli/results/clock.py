@@ -1,7 +1,5 @@
 """The seconds that `infer` spends on each stage of a capture."""
 
-from __future__ import annotations
-
 import time
 
 STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")

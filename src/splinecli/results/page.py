@@ -1,7 +1,5 @@
 """The results of one capture as one HTML file: a view under a movable light, pictures of the maps, figures."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The report that `infer` writes for a capture, report.json."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The templates of the HTML pages, in `assets`. Every page extends base.html; parts.html has shared parts."""
 
-from __future__ import annotations
-
 from splinecli import __version__
 
 

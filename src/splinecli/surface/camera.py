@@ -5,8 +5,6 @@ A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns coun
 z to the camera.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

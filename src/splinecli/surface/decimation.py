@@ -6,8 +6,6 @@ up in the image. A texel (x, y, z) then stands for the normal x T + y B + z N, a
 (glTF 2.0, section 3.9.3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 Conjugate gradients with an algebraic multigrid preconditioner.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ pixels and the origin is the centre of the image. For a pinhole camera, they are
 origin is the camera.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Batches of training pixels from any source: what a capture would show of them, and the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 

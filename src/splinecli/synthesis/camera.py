@@ -4,8 +4,6 @@ A pixel is the mean of k x k samples on a regular grid. One sample at the centre
 radiance is off by a tenth.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

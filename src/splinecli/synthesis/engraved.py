@@ -3,8 +3,6 @@
 Rendered scenes have few bends of a pixel's size. These pieces have, but no cast shadows or interreflection.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

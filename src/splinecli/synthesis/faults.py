@@ -4,8 +4,6 @@ They change the sparse observations alone; the dense map is the truth. Each func
 draws from. Observations are linear, and 1 is the sensor's full scale.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

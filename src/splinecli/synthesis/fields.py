@@ -6,8 +6,6 @@ Smooth union: Quilez, "Smooth minimum" (https://iquilezles.org/articles/smin). S
 2003); the vertices are then moved onto the zero of the field, and its gradient gives their normals.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

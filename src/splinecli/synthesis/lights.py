@@ -1,7 +1,5 @@
 """Random light rigs: the number of lights of a pixel and their directions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

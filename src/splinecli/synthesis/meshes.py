@@ -1,7 +1,5 @@
 """Triangle meshes in the frame of the camera: x right, y up, z to the camera. It sees the square [-1, 1]^2."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Random numbers of a range, from a generator, and the seeds of generators."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -5,8 +5,6 @@ One mixture is used for all materials: a cosine lobe for matte ones, and two lob
 of the whole mixture (the balance heuristic, Veach 1997), so materials need no sampling function of their own.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ A scene has one shape, three classes of materials that vary over its surface, an
 upper hemisphere. It depends only on (seed, index), so an interrupted set can be continued.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A rendered scene as one capture shows it: with what lies behind the object, and with faults that all pixels share."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """OpenEXR files of maps, for renderers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,5 @@
 """Import of optional packages, which pip installs as extras of splinecli."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from types import ModuleType

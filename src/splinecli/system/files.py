@@ -1,7 +1,5 @@
 """Output files that appear complete or not at all, and checks of output folders."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Locks of folders: one process at a time writes into a folder. A lock ends with its process, however that ends."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import stat

@@ -1,7 +1,5 @@
 """The memory that a process may still use, and the images that it reads into it."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """How a long computation tells its progress."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 Progress = Callable[[int], object]

@@ -6,8 +6,6 @@ report is whole. One without is unfinished, and its work is done again. Nothing 
 anything, and no link in it is followed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path

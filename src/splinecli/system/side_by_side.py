@@ -1,7 +1,5 @@
 """Parts of a computation on all cores, each in a thread of its own."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -4,8 +4,6 @@ A checkpoint contains no state of a random generator. The draws of a step follow
 alone. A run of the refinement net photographs its newest captures again, and goes on without the earlier ones.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training configurations from a preset, a file and single settings."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Names and intervals of training that the command line shows before it loads PyTorch."""
 
-from __future__ import annotations
-
 PRESET_NAMES = ("compact", "refine", "paper", "cnn-ps")
 DEFAULT_PRESET = "compact"
 DEFAULT_STEPS = 40_000

@@ -5,8 +5,6 @@ Every process then computes the same update of the same weights. They exchange n
 the first process.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -4,8 +4,6 @@ Every loss is the mean of one number for each pixel. The loss of a batch is ther
 parts of it. The paper does not say whether |.| sums or averages the cells of a map; here the argument `norm` does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal, NamedTuple

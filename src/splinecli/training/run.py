@@ -1,7 +1,5 @@
 """Start or continue a run in a folder, alone or with the other processes of torchrun."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The log of a run: metrics.csv, curves.png, maps.png and, on request, TensorBoard's event files."""
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """The sources of training and validation pixels: the pixel generator, pixel sets, and mixtures of them."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What a run trains on: pixels for LI-Net, NE-Net and the error head, or whole scenes for the refinement net."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The transfer curve of an ICC profile (ISO 15076-1), from its tone reproduction curves (TRC)."""
 
-from __future__ import annotations
-
 import struct
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Decoders of files: what they raise for damaged ones, as errors that name the file, and what C libraries print."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

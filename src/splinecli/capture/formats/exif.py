@@ -1,7 +1,5 @@
 """What EXIF tags say of the images of a capture: orientation and exposure, which must be those of all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ from what their header says.
 A few kilobytes may claim gigabytes of pixels, by mistake or by intent.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

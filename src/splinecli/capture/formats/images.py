@@ -4,8 +4,6 @@ Damaged files are refused. OpenCV fills the missing part of a truncated file wit
 container is checked before it is decoded, and the messages of the C libraries are caught and searched.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import zlib

@@ -3,8 +3,6 @@
 A reader of its own, for arrays of real numbers alone: SciPy's ends the process at types that it does not know.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

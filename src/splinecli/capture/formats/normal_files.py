@@ -12,8 +12,6 @@ Vectors are scaled to unit length. Zero and non-finite vectors are no normals. D
 and OpenEXR files.
 """
 
-from __future__ import annotations
-
 import io
 from contextlib import redirect_stdout
 from pathlib import Path

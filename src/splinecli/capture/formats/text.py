@@ -1,7 +1,5 @@
 """Rows of numbers in text files, with any separator, byte order marks, comments and blank lines."""
 
-from __future__ import annotations
-
 import codecs
 import re
 from collections.abc import Sequence

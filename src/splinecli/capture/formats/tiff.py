@@ -1,7 +1,5 @@
 """Pixels of TIFF files: 8 and 16 bits and floating point, gray or RGB."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

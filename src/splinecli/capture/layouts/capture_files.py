@@ -1,7 +1,5 @@
 """The files of one capture, and the names by which they are recognised."""
 
-from __future__ import annotations
-
 import os.path
 import re
 import stat

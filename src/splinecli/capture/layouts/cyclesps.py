@@ -4,8 +4,6 @@ As published, PRPS/<object> contains images_specular and images_metallic, PRPS_D
 each with one image for each line of the object's light.txt: 00000.tif and so on. A capture is one such folder.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in turn."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 A file may have several matrices. The lights are the only one N x 3 or 3 x N that fits the images.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Draws of lights: the lights of a capture that a trial uses, drawn by a seed or read from a file."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

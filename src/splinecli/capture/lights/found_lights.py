@@ -1,7 +1,5 @@
 """Lights that are found from the images of the object, where no file gives them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

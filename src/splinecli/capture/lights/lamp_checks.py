@@ -1,7 +1,5 @@
 """Checks of near lamps: whether they can be where their positions say, and whether they may count as distant."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The files and options that say where near lamps are, and how large a pixel is."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 Frame: x right, y up, z to the camera; a direction points from the object to the light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

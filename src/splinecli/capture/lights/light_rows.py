@@ -1,7 +1,5 @@
 """Rows of light files as text, with or without a header, and with a column that tells the image."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ The names often come from another machine, with folders that do not exist here, 
 the folder are matched to them by base name, then by name without suffix, then by order.
 """
 
-from __future__ import annotations
-
 import json
 import reprlib
 import sys

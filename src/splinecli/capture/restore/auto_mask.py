@@ -1,7 +1,5 @@
 """A mask made from the images: the largest area that is brighter than the background."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ D. Cho, Y. Matsushita, Y.-W. Tai, I. S. Kweon, "Semi-calibrated photometric ster
 (normals, then intensities) is robust: it uses least absolute deviations and medians.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

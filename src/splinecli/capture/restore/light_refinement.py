@@ -7,8 +7,6 @@ intensities are known, nothing else is open. If not, a prior on them holds the g
 (Belhumeur, Kriegman and Yuille, IJCV 1999).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Saturated observations: find them, and replace them by estimates from the pixel's other observations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
