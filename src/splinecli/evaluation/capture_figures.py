@@ -21,9 +21,7 @@ SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
 
 MAPS = "_observation_maps"
-
-MOST_LISTED = 16
-"""Largest number of lights that a title lists."""
+MOST_LISTED = 16  # largest number of lights that a title lists
 
 
 class CaptureFigure(NamedTuple):

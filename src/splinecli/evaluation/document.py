@@ -21,9 +21,7 @@ from splinecli.evaluation.statistics import compare
 from splinecli.evaluation.tables import latex, markdown
 from splinecli.system.publishing import new_files
 
-SCHEMA = 1
-"""Schema version of results.json. It rises when a field changes its meaning."""
-
+SCHEMA = 1  # Schema version of results.json. It rises when a field changes its meaning.
 _DIGITS = 4  # behind the point, of degrees and seconds
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
@@ -31,9 +29,7 @@ _FORMULA = ("=", "+", "-", "@")
 
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
-
-Plots = Mapping[str, tuple[str, bytes]]
-"""A caption and a PNG by the name of the file."""
+Plots = Mapping[str, tuple[str, bytes]]  # a caption and a PNG by the name of the file
 
 
 def make_plots(evaluations: Sequence[Evaluation]) -> Plots:

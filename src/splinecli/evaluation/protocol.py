@@ -7,11 +7,8 @@ from pathlib import Path
 from splinecli.capture.lights.draws import check_draw_settings
 from splinecli.errors import UsageError
 
-EVERY_CAPTURE = "*"
-"""Key of `skip_first` for all captures that have no key of their own."""
-
-LARGEST_SIGMA_DEG = 30.0
-"""Largest standard deviation of the light noise that an evaluation accepts."""
+EVERY_CAPTURE = "*"  # key of `skip_first` for all captures that have no key of their own
+LARGEST_SIGMA_DEG = 30.0  # largest standard deviation of the light noise that an evaluation accepts
 
 
 @dataclass(frozen=True)

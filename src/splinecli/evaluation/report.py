@@ -39,8 +39,7 @@ class Cell(NamedTuple):
     mark: Mark = ""
 
 
-Table = list[list[Cell]]
-"""A header row, then rows whose first cell is a header."""
+Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 
 
 def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]) -> str:

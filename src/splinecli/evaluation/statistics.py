@@ -15,11 +15,8 @@ from numpy.typing import NDArray
 
 from splinecli.evaluation.outcome import Evaluation
 
-AVERAGE = "average"
-"""Name that stands for the average over all captures, in place of a capture's name."""
-
-SIGNIFICANCE = 0.05
-"""p-value below which two methods differ."""
+AVERAGE = "average"  # name that stands for the average over all captures, in place of a capture's name
+SIGNIFICANCE = 0.05  # p-value below which two methods differ
 
 # Error maps are float32: MAEs closer than this are equal.
 _SAME_DEG = 1e-6

@@ -32,13 +32,8 @@ from splinecli.system.progress import Progress
 
 _RETILTS = 100
 _LARGEST_TILT_DEG = 89.0
-
-OnImage = Callable[[int, int], object]
-"""Called with the number of images read so far and their total."""
-
-Notes = list[tuple[str, ...]]
-"""Sentences about a capture, for each protocol."""
-
+OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
+Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
 DAMAGED_IMAGES = {"bearPNG": 20}
 """The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
 

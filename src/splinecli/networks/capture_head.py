@@ -5,10 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20
-_BEND_TURN = 11
-"""Numbers of features of confidence.py, and the place of CaptureFeatures.bend_turn."""
-
+PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features of confidence.py
+_BEND_TURN = 11  # the place of CaptureFeatures.bend_turn
 _HIDDEN = 24
 _MOST = 4.0  # standard deviations of a feature from its mean
 _INPUTS = 2 + PIXEL_FEATURES + CAPTURE_FEATURES

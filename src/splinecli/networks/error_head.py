@@ -26,8 +26,7 @@ class ErrorHead(nn.Module):
         return error.float()
 
 
-_MORE_DEG = 0.1
-"""Added to all errors. Without it, the logarithm would weigh differences between tiny errors."""
+_MORE_DEG = 0.1  # Added to all errors. Without it, the logarithm would weigh differences between tiny errors.
 
 
 def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:

@@ -5,9 +5,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-PATCH = 4
-"""Side in cells of the patches that an encoder joins into one position."""
-
+PATCH = 4  # side in cells of the patches that an encoder joins into one position
 Layer = TypeVar("Layer", nn.Conv2d, nn.Linear)
 
 

@@ -6,9 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, softplus
 
-SIDE = 48
-"""Height and width of the images that the network sees."""
-
+SIDE = 48  # height and width of the images that the network sees
 INPUTS = 4
 _WIDTHS = 24, 48, 96, 128
 _JOINED = 64

@@ -12,30 +12,17 @@ from splinecli.networks.gaussian import gaussian_sum
 from splinecli.networks.layers import zeroed
 from splinecli.networks.refine_channels import READ, split_features
 
-WIDTHS = (32, 64, 96, 64)
-"""Channels at the full resolution, and at a half, a quarter and an eighth of it."""
-
-ENCODING_BLOCKS = (1, 2, 3, 2)
-DECODING_BLOCKS = (1, 1, 0)
-"""Residual blocks of each scale on the way down, and on the way up."""
-
-SIGMAS = (0.7, 1.5, 3.0)
-"""Widths in pixels of the smoothed normals that the net weighs against the estimated one."""
+WIDTHS = (32, 64, 96, 64)  # channels at the full resolution, and at a half, a quarter and an eighth of it
+ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks of each scale on the way down
+DECODING_BLOCKS = (1, 1, 0)  # and on the way up
+SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of the smoothed normals that the net weighs against the estimated one
 
 # Logarithms of errors in radians, for the weights of the smoothing.
 _LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
-
-COARSEST = 2 ** (len(WIDTHS) - 1)
-"""Side of the coarsest scale's pixels. The origins of tiles are multiples of it."""
-
-REACH = 96
-"""No pixel further away than this changes a result."""
-
-_DECODED = 4
-"""Pixels of each scale that the decoder needs around a part of the map, at least."""
-
-Part = tuple[slice, slice]
-"""Rows and columns of a map."""
+COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of the coarsest scale's pixels. The origins of tiles are multiples of it.
+REACH = 96  # no pixel further away than this changes a result
+_DECODED = 4  # pixels of each scale that the decoder needs around a part of the map, at least
+Part = tuple[slice, slice]  # rows and columns of a map
 
 
 class RefineNet(nn.Module):

@@ -7,12 +7,8 @@ from splinecli.fits.weighted_least_squares import weighted_sum
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 from splinecli.networks.layers import zeroed
 
-HEAD_WIDTH = 16
-"""Channels of an attention head."""
-
-DARKEST = 1e-3
-"""Added to observations before their logarithm is taken."""
-
+HEAD_WIDTH = 16  # channels of an attention head
+DARKEST = 1e-3  # added to observations before their logarithm is taken
 _PRIOR = 1e-4  # keeps the weighted least squares solvable where the weights leave fewer than three lights
 
 

@@ -18,8 +18,7 @@ from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 from splinecli.system.extras import import_extra
 from splinecli.system.files import file_sha256, replacing
 
-RENDERER = 3
-"""Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both."""
+RENDERER = 3  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
 
 # Meshes have random numbers of their own, so that a mesh changes no other scene.
 _FIRST_MESH_INDEX = 1_000_000

@@ -19,9 +19,7 @@ from splinecli.synthesis.lights import draw_light_counts, rank_in_cone
 _MAPPED_BYTES = 128 << 20
 # The operating system reads this much around the first byte of a page.
 _READ_AHEAD_BYTES = 64 << 10
-
-FILL_ROUNDS = 3
-"""Each round fills gaps one cell further from the cells with a light."""
+FILL_ROUNDS = 3  # each round fills gaps one cell further from the cells with a light
 
 
 @dataclass(frozen=True)

@@ -65,9 +65,7 @@ MAPS = {
 }
 """The files of each optional map."""
 
-SCALED_MAPS = ("curvature", "relief")
-"""Maps whose picture has a fixed scale, which the user may choose."""
-
+SCALED_MAPS = ("curvature", "relief")  # maps whose picture has a fixed scale, which the user may choose
 OWN_FILES = (
     *NORMALS.values(),
     ERROR_MAP,

@@ -32,12 +32,8 @@ from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int32]
-
-STIFFNESS = 2.0
-"""How easily the surface tears, as in the paper."""
-
-CONTRADICTION = 0.3
-"""Residual that contradicts a normal: that of a frontal one which is off by 17 degrees."""
+STIFFNESS = 2.0  # how easily the surface tears, as in the paper
+CONTRADICTION = 0.3  # residual that contradicts a normal: that of a frontal one which is off by 17 degrees
 
 # The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
 # the normal says nothing reliable about the height. The equations of the neighbours fix the height of such pixels, and

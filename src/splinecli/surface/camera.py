@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError, UsageError
 
 Floats = NDArray[np.float64]
-
-_LARGEST = 1e6
-"""Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular."""
+_LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
 
 
 def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> Floats:

@@ -25,12 +25,8 @@ from splinecli.surface.mesh import (
 )
 from splinecli.system.extras import import_extra
 
-TRIANGLES_LEFT = 4
-"""Triangles before decimation, over those after it, at least."""
-
-LARGE_MAP = 500_000
-"""Pixels from which the triangles of a map are so many that those of blocks are decimated."""
-
+TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
+LARGE_MAP = 500_000  # pixels from which the triangles of a map are so many that those of blocks are decimated
 _TRIANGLES = 50_000  # at a time
 _OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
 _FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing

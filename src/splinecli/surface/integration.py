@@ -41,8 +41,7 @@ _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the b
 RELIEF_WIDTH = 64.0
 """Waves of this width in pixels keep half of their height; the normals' small errors over wider ones do not count."""
 
-Progress = Callable[[float], object]
-"""Called with the share of the work that was just done."""
+Progress = Callable[[float], object]  # called with the share of the work that was just done
 
 
 def integrate_normals(

@@ -28,16 +28,11 @@ SURFACE_FILES = {
 }
 """The file names of each format; mesh.png is the texture of an OBJ file, if there are colours."""
 
-SURFACE_REPORT = "surface.json"
-"""The report that `integrate` writes beside them."""
-
+SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 DEFAULT_MESHES = ("glb", "ply")
 DEPTH_FORMATS = ("npy", "tiff", "png")
 DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
-
-GRAY = 204
-"""Colour of a mesh without a texture, of 255."""
-
+GRAY = 204  # colour of a mesh without a texture, of 255
 _WHITE = 65535  # of 16 bits
 _FLOAT = 5126  # of glTF
 

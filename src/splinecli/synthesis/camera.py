@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.ray_tracing import Hits, Tracer
 
-MIN_NORMAL_Z = 0.05
-"""Pixels that are seen at a more grazing angle are left out."""
+MIN_NORMAL_Z = 0.05  # pixels that are seen at a more grazing angle are left out
 
 
 @dataclass(frozen=True)

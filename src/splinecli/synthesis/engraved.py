@@ -13,8 +13,7 @@ from torch import Tensor
 from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.random_numbers import draw_number
 
-_SMOOTH_SHARE = 1 / 3
-"""A share of the pieces has no detail: smooth things must stay smooth, whatever they are made of."""
+_SMOOTH_SHARE = 1 / 3  # a share of the pieces has no detail: smooth things must stay smooth, whatever they are made of
 
 
 def draw_engraved(

@@ -17,8 +17,7 @@ from splinecli.synthesis.random_numbers import draw_uniform
 DARK_SHARE = 0.4
 """Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""
 
-BITS = (10, 12, 14, 16)
-"""Depths of the pixels that do not have 8 bits, equally often."""
+BITS = (10, 12, 14, 16)  # depths of the pixels that do not have 8 bits, equally often
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:

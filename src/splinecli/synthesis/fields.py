@@ -141,8 +141,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
-COARSE = 4
-"""Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely."""
+COARSE = 4  # Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely.
 
 
 def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:

@@ -13,10 +13,7 @@ from splinecli.errors import InputError
 from splinecli.system.memory import is_out_of_memory
 
 Floats = NDArray[np.floating]
-
-REACH = 0.94
-"""Half-width of the object in the camera's square."""
-
+REACH = 0.94  # half-width of the object in the camera's square
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
 """Bytes of a file of each format. A byte of the first three may give a triangle, of 110 bytes in memory."""

@@ -17,8 +17,7 @@ OFFSET = 1e-4
 """Distance from the surface at which rays start. The frame has half-width 1, so rounding in float32 displaces hits by
 about 1e-7, and one of 128 pixels is 0.016 wide."""
 
-TRACED_ROWS = 16_384
-"""Number of points whose shadows are traced together."""
+TRACED_ROWS = 16_384  # number of points whose shadows are traced together
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,7 @@ from splinecli.synthesis.principled import PrincipledMaterial
 from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer
 from splinecli.synthesis.sampling import LOBES, draw_directions
 
-SOFTEST = 0.3
-"""Lowest roughness of surfaces that light other surfaces."""
-
+SOFTEST = 0.3  # lowest roughness of surfaces that light other surfaces
 MOST_WEIGHT = 8.0
 MOST_RADIANCE = 8.0
 """Limits on the contribution of one path, relative to its expected share. Larger values are only noise."""

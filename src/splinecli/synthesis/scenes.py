@@ -18,8 +18,7 @@ from splinecli.synthesis.ray_tracing import Tracer
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
-MIN_LIGHT_Z = 0.03
-"""Lowest z of a light, the cosine of its angle to the viewing direction."""
+MIN_LIGHT_Z = 0.03  # lowest z of a light, the cosine of its angle to the viewing direction
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
 SPACING = 0.0125
 """Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156 apart."""
 
-FEWEST_FACES = 5_000
-"""Meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces."""
+FEWEST_FACES = 5_000  # meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces
 
 
 def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[str, Mesh]:

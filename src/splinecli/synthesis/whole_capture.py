@@ -19,23 +19,15 @@ from splinecli.synthesis.faults import (
 )
 from splinecli.synthesis.random_numbers import draw_number
 
-_BRIGHT_SHARE = 1e-3
-"""Share of the observations that may be brighter than the one from which the exposure is chosen."""
-
+_BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one from which the exposure is chosen
 _GRAINY_SHARE = 2 / 3
-
-_MOST_SATURATED = 0.03
-"""Largest share of clipped observations in an overexposed capture."""
-
+_MOST_SATURATED = 0.03  # largest share of clipped observations in an overexposed capture
 _UNMEASURED_SHARE = 0.3
 _MOST_UNMEASURED = 0.5
 """Of the captures with errors of the intensities, this share has large ones, with a sigma of up to so many stops."""
 
-_MARGIN = 16
-"""Most pixels that are added at each side of the object."""
-
-_WIDEST_RIM = 12
-"""Most pixels by which a careless mask is too wide."""
+_MARGIN = 16  # most pixels that are added at each side of the object
+_WIDEST_RIM = 12  # most pixels by which a careless mask is too wide
 
 
 def photograph_scene(

@@ -14,8 +14,7 @@ from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
 GENERATOR = "generator"
 """The name among the sources of the online pixel generator; every other is the path of a pixel set."""
 
-Norm = Literal["mean", "sum"]
-"""Whether the values of a map's cells are averaged or summed."""
+Norm = Literal["mean", "sum"]  # whether the values of a map's cells are averaged or summed
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from splinecli.training.defaults import DEFAULT_PRESET
 CHANGEABLE = ("steps", "minutes", "learning_rate", "gradient_limit")
 """The settings that may change when a run continues."""
 
-Settings = dict[str, Any]
-"""Nested settings, as in TrainingConfig.to_dict; only some of them may be given."""
+Settings = dict[str, Any]  # nested settings, as in TrainingConfig.to_dict; only some of them may be given
 
 
 def read_config_file(path: Path) -> Settings:
