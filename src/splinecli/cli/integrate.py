@@ -35,10 +35,7 @@ def integrate(
         " [default: albedo.png beside NORMALS, if NORMALS is a folder]",
     ),
     stiffness: float | None = Option(
-        None,
-        metavar="K",
-        min=0,
-        help=f"{shared.STIFFNESS} [default: as in report.json beside the normal map, or 2]",
+        None, metavar="K", min=0, help=f"{shared.STIFFNESS} [default: as in report.json beside the normal map, or 2]"
     ),
     prior: Path | None = Option(
         None,

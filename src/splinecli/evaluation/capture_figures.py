@@ -131,10 +131,7 @@ def _observation_maps(
         rows, columns = rows[chosen], columns[chosen]
     place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
     sparse, dense, truth = estimator.maps(
-        capture.observations[place],
-        capture.light_directions,
-        whole.observations[place],
-        whole.light_directions,
+        capture.observations[place], capture.light_directions, whole.observations[place], whole.light_directions
     )
     return observation_map_figure(
         sparse,

@@ -31,12 +31,7 @@ _MOST_ACROSS = 3
 _DPI = 200
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
-_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = (
-    (0, ()),
-    (0, (4, 2)),
-    (0, (1, 1.5)),
-    (0, (5, 1.5, 1, 1.5)),
-)
+_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
 _NEAREST_TICKS = 0.045  # share of the axis: labels that are closer would overlap
 
 

@@ -97,11 +97,7 @@ def _read_ne_net(path: Path, ne_net: nn.Module) -> dict[str, Tensor]:
 
 
 def _rename(
-    path: Path,
-    state: dict[str, Tensor],
-    network: nn.Module,
-    names: dict[str, str],
-    dropped: dict[str, torch.Size],
+    path: Path, state: dict[str, Tensor], network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
 ) -> dict[str, Tensor]:
     """Return their tensors under our names, float32; `names` gives theirs by ours, `dropped` the shapes not needed."""
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"

@@ -12,13 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.fits.lambertian import fit_lambertian
-from splinecli.maths.observation_map import (
-    cell_directions,
-    map_scale,
-    rotate_about_view_axis,
-    sparse_map,
-    unit_disc,
-)
+from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map, unit_disc
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_net import CompactLINet, PaperLINet
 from splinecli.networks.ne_net import CompactNENet, PaperNENet

@@ -76,9 +76,7 @@ class ScenePlan:
                 difference = writer.difference(name, recipe) if name in writer else None
                 if difference is not None:
                     raise OutputError(
-                        f"the entry {name} was made with {difference}",
-                        path=writer.folder,
-                        hint="Choose another -o",
+                        f"the entry {name} was made with {difference}", path=writer.folder, hint="Choose another -o"
                     )
 
 

@@ -85,11 +85,7 @@ class PixelSetSource:
     """
 
     def __init__(
-        self,
-        pixel_set: PixelSet,
-        entries: Sequence[Entry],
-        config: CaptureConfig,
-        generator: torch.Generator,
+        self, pixel_set: PixelSet, entries: Sequence[Entry], config: CaptureConfig, generator: torch.Generator
     ) -> None:
         self.pixel_set = pixel_set
         self.entries = tuple(entries)

@@ -96,9 +96,7 @@ def open_pixel_set(folder: Path) -> PixelSet:
     manifest = read_manifest(folder)
     if manifest.get("complete") is not True:
         raise InputError(
-            "the pixel set is not finished",
-            path=folder,
-            hint="Run the same 'splinecli prepare' again to finish it",
+            "the pixel set is not finished", path=folder, hint="Run the same 'splinecli prepare' again to finish it"
         )
     pixel_set = PixelSet(folder, tuple(parse_entries(manifest, folder)))
     if not pixel_set.entries:

@@ -58,10 +58,7 @@ class BilateralEquations:
 
     @classmethod
     def from_normals(
-        cls,
-        normal_map: NDArray[np.floating],
-        mask: NDArray[np.bool_],
-        camera_matrix: NDArray[np.floating] | None,
+        cls, normal_map: NDArray[np.floating], mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None
     ) -> BilateralEquations:
         """Return the equations of a normal map (H, W, 3) at the pixels of a mask (H, W)."""
         normals = unit(normal_map[mask].astype(np.float64))

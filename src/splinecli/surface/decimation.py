@@ -16,13 +16,7 @@ from splinecli.errors import InputError
 from splinecli.maths.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length, image_points, ray_basis
-from splinecli.surface.mesh import (
-    SurfaceMesh,
-    fill_outside,
-    surface_mesh,
-    texture_coordinates,
-    vertex_normals,
-)
+from splinecli.surface.mesh import SurfaceMesh, fill_outside, surface_mesh, texture_coordinates, vertex_normals
 from splinecli.system.extras import import_extra
 
 TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
@@ -142,11 +136,7 @@ def _tangents(
 
 
 def _normal_texture(
-    points: Floats,
-    triangles: NDArray[np.integer],
-    normals: Floats,
-    tangents: Floats,
-    normal_map: NDArray[np.floating],
+    points: Floats, triangles: NDArray[np.integer], normals: Floats, tangents: Floats, normal_map: NDArray[np.floating]
 ) -> NDArray[np.uint8]:
     """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
 

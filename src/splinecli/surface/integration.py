@@ -153,11 +153,7 @@ def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Float
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
-        of_blocks[blocks.mask] = _integrate(
-            coarse,
-            stiffness,
-            lambda share: progress((1 - own_share) * share),
-        )
+        of_blocks[blocks.mask] = _integrate(coarse, stiffness, lambda share: progress((1 - own_share) * share))
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights

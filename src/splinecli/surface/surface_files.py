@@ -192,11 +192,7 @@ def _trimesh(mesh: SurfaceMesh, visual: Any = None, scale: float = 1) -> Any:
     import trimesh
 
     return trimesh.Trimesh(
-        mesh.vertices * np.float32(scale),
-        mesh.triangles,
-        vertex_normals=mesh.normals,
-        visual=visual,
-        process=False,
+        mesh.vertices * np.float32(scale), mesh.triangles, vertex_normals=mesh.normals, visual=visual, process=False
     )
 
 

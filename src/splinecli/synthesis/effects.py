@@ -85,12 +85,7 @@ class Wall:
 
 
 def draw_wall(
-    normals: Tensor,
-    share: float,
-    generator: torch.Generator,
-    *,
-    shadows: bool = True,
-    interreflections: bool = True,
+    normals: Tensor, share: float, generator: torch.Generator, *, shadows: bool = True, interreflections: bool = True
 ) -> Wall:
     """Draw walls for a share of the pixels with these normals (P, 3).
 

@@ -68,11 +68,7 @@ def read_checkpoint_config(path: Path) -> TrainingConfig:
 
 
 def load_checkpoint(
-    path: Path,
-    network: SplineNet,
-    average: SplineNet,
-    optimizer: torch.optim.Optimizer,
-    sets: dict[str, str],
+    path: Path, network: SplineNet, average: SplineNet, optimizer: torch.optim.Optimizer, sets: dict[str, str]
 ) -> RunCounters:
     """Restore networks and optimiser from a checkpoint, in place, and return the counters of the run.
 

@@ -133,10 +133,7 @@ class TrainingConfig:
             if not _is_number(weight) or not 0 <= weight < math.inf:
                 raise ModelError(f"the weight of source {name!r} is {weight!r}; expected a number from 0")
         return cls(
-            network=NetworkConfig.from_dict(network),
-            pixels=PixelGeneratorConfig(**pixels),
-            sources=sources,
-            **values,
+            network=NetworkConfig.from_dict(network), pixels=PixelGeneratorConfig(**pixels), sources=sources, **values
         )
 
 

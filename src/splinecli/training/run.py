@@ -24,12 +24,7 @@ def resumes(folder: Path, *, resume: bool) -> bool:
 
 
 def configure_run(
-    folder: Path,
-    preset_name: str | None,
-    file: Path | None,
-    changes: Sequence[Settings],
-    *,
-    resume: bool,
+    folder: Path, preset_name: str | None, file: Path | None, changes: Sequence[Settings], *, resume: bool
 ) -> TrainingConfig:
     """Return the configuration of a run that starts or continues. Raises ModelError, UsageError.
 

@@ -16,13 +16,7 @@ from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.objective import Losses, angles, compute_losses, dense_truth_in_frame, fixed, part_of_step
-from splinecli.training.refinement import (
-    FIRST_EXAMPLES,
-    STEPS_PER_EXAMPLE,
-    ScenePool,
-    refinement_losses,
-    stack_maps,
-)
+from splinecli.training.refinement import FIRST_EXAMPLES, STEPS_PER_EXAMPLE, ScenePool, refinement_losses, stack_maps
 from splinecli.training.sources import Scenes, open_sets, pixel_source
 
 VALIDATION_PIXELS = 2048
