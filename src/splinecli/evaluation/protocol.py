@@ -15,6 +15,8 @@ LARGEST_SIGMA_DEG = 30.0  # largest standard deviation of the light noise that a
 class Protocol:
     """Settings of an evaluation. Two methods are comparable only under the same protocol.
 
+    Raises UsageError if a value is out of its range.
+
     Args:
         n_lights: in each draw. None means all lights of a capture. A draws file replaces it, and trials.
         trials: the number of random draws. Without light noise, all lights need one trial only.
@@ -29,9 +31,6 @@ class Protocol:
         light_error_deg: usual error of light directions, with which each trial refines its directions (see
             refine_capture). None refines none.
         finds_lights: whether each trial finds its lights from its images, as `infer --lights estimate` does.
-
-    Raises:
-        UsageError: a value is out of its range.
     """
 
     n_lights: int | None = None

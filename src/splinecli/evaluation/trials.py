@@ -90,14 +90,12 @@ _FIELDS = [field.name for field in fields(Score)]
 class TrialStore:
     """Scores by trial, in memory and, where a path is given, in a file of JSON lines.
 
-    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed.
+    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed. Raises
+    OutputError if the file cannot be read or written.
 
     Args:
         path: the file, which the first score creates; None keeps the scores in memory only.
         fresh: whether to delete the scores of an earlier evaluation.
-
-    Raises:
-        OutputError: the file cannot be read or written.
     """
 
     def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:

@@ -52,8 +52,7 @@ class Arrivals:
     def take(self) -> list[Path]:
         """Return the captures that became complete since the last call, in natural order of their names.
 
-        Raises:
-            InputError: the folder cannot be read.
+        Raises InputError if the folder cannot be read.
         """
         found = {path: _stamp(path) for path in self._subfolders()}
         self._seen = {path: seen for path, seen in self._seen.items() if path in found}

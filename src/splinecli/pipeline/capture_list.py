@@ -52,9 +52,8 @@ class Member:
 def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[Member]:
     """Return the captures in the order given. A folder that is given twice counts once.
 
-    Raises:
-        UsageError: two captures have the same name, or a "folder" that does not exist is the name of a map, format or
-            method.
+    Raises UsageError if two captures have the same name, or a "folder" that does not exist is the name of a map, format
+    or method.
     """
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
     chosen = set(folders)

@@ -30,12 +30,11 @@ def distil_for(
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
+    Raises UsageError if it is wanted, but the method gives no confidence, or the capture is too small.
+
     Args:
         capture: under near lamps, with the points of its surface.
         wanted: whether to distil; None for the faster way.
-
-    Raises:
-        UsageError: it is wanted, but the method gives no confidence, or the capture is too small.
     """
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []

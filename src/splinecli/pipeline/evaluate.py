@@ -42,6 +42,8 @@ DEFAULT_LIGHTS = 10
 class EvaluateOptions:
     """The options of `evaluate`, as its help describes them.
 
+    Raises UsageError if a value is out of its range, or two options contradict each other.
+
     Args:
         methods: a name that comes twice counts once.
         n_lights: None in it stands for all lights; one evaluation for each. Empty for DEFAULT_LIGHTS, or for the
@@ -50,9 +52,6 @@ class EvaluateOptions:
         trials: None for DEFAULT_TRIALS. jobs: None for the cores, or for 1 on a GPU.
         pixels: (row, column) of each.
         cluster: the processes or machines that score trials; None for this process.
-
-    Raises:
-        UsageError: a value is out of its range, or two options contradict each other.
     """
 
     methods: tuple[str, ...] = (DEFAULT_METHOD,)

@@ -27,16 +27,14 @@ Precision = Literal["auto", "float32", "bfloat16"]
 class InferOptions(Reading):
     """The options of `infer`, as its help describes them.
 
-    Two records are equal if they give the same results. `output` and `device` do not count.
+    Two records are equal if they give the same results. `output` and `device` do not count. Raises UsageError if a
+    value is unknown, or two options contradict each other.
 
     Args:
         n_lights: None for all. light_indices: counted from 0.
         distil: False for the method on every pixel, None for the faster way.
         formats, maps: names of `splinecli.results.files.NORMALS` and MAPS.
         curvature_scale, relief_scale: the value that is white in the picture; see `splinecli.pictures.maps`.
-
-    Raises:
-        UsageError: a value is unknown, or two options contradict each other.
     """
 
     refine_lights: bool = False

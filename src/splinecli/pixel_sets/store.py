@@ -90,8 +90,7 @@ class PixelSet:
 def open_pixel_set(folder: Path) -> PixelSet:
     """Open a set after comparing every file with the checksums in its manifest.
 
-    Raises:
-        InputError: the set is unfinished or empty, or a file is missing or changed. The error names the file.
+    Raises InputError if the set is unfinished or empty, or a file is missing or changed. The error names the file.
     """
     manifest = read_manifest(folder)
     if manifest.get("complete") is not True:

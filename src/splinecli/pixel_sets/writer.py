@@ -73,8 +73,7 @@ class PixelSetWriter:
     def add(self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels) -> None:
         """Write an entry of at least one pixel, in place of an earlier entry of that name.
 
-        Raises:
-            OutputError: it cannot be written. The other entries are then as they were before.
+        Raises OutputError if it cannot be written. The other entries are then as they were before.
         """
         n_pixels, n_lights = pixels.observations.shape
         checksums = {}

@@ -93,7 +93,8 @@ def write_estimate(
 ) -> dict[str, Any]:
     """Write the results of a capture into `folder` and return the finished report.
 
-    The files replace those of an earlier run in the folder (see new_files). The caller holds the folder.
+    The files replace those of an earlier run in the folder (see new_files). The caller holds the folder. Raises
+    OutputError if a file cannot be written.
 
     Args:
         report: what report_of returned.
@@ -101,9 +102,6 @@ def write_estimate(
         convention: whether green is y up or y down in pictures of normals.
         clock: tells the seconds of all stages, of which writing is the last.
         more: names and contents of further files of OWN_FILES.
-
-    Raises:
-        OutputError: a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)

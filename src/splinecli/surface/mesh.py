@@ -61,7 +61,7 @@ def surface_mesh(
     """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by row.
 
     Four pixels of the mask in a square make two triangles, split along the diagonal whose ends differ less in height.
-    Three make one triangle.
+    Three make one triangle. Raises UsageError if the largest step is negative.
 
     Args:
         depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix, as
@@ -73,9 +73,6 @@ def surface_mesh(
         largest_step: leaves out triangles whose corners differ by more than this in height, in pixels (for a pinhole
             camera, in pixels at the depth of the triangle). They are the walls where the surface is torn. None keeps
             all triangles.
-
-    Raises:
-        UsageError: the largest step is negative.
     """
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")

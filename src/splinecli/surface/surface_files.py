@@ -62,8 +62,7 @@ def file_names(formats: Sequence[str]) -> tuple[str, ...]:
 def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, bytes]]:
     """Yield the name and the content of each file of a surface, in formats that are keys of SURFACE_FILES.
 
-    Raises:
-        InputError: a mesh without triangles cannot be written as GLB.
+    Raises InputError if a mesh without triangles cannot be written as GLB.
     """
     for form in formats:
         if form == "obj":

@@ -37,10 +37,8 @@ def read_mesh(path: str | Path) -> Mesh:
     """Read a mesh file (PLY, OBJ, STL or OFF) and fit it into the frame.
 
     The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces around it, weighted by
-    angle. Long edges are split, so that every part of the surface has vertices and can have its own material.
-
-    Raises:
-        InputError: the file is missing, too long, not a mesh, or has no faces.
+    angle. Long edges are split, so that every part of the surface has vertices and can have its own material. Raises
+    InputError if the file is missing, too long, not a mesh, or has no faces.
     """
     import trimesh
 

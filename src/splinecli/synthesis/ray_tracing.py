@@ -48,8 +48,7 @@ class Hits:
 class Tracer:
     """A mesh that is prepared for ray tracing. All arrays of origins and directions are (N, 3).
 
-    Raises:
-        UsageError: embreex is not installed.
+    Raises UsageError if embreex is not installed.
     """
 
     def __init__(self, mesh: Mesh) -> None:

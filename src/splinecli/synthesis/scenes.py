@@ -78,13 +78,11 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
     """Draw scene number `index` of the set with this seed.
 
     The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %. In half of the
-    scenes the patches differ in their base alone, as on a painted or printed object of one gloss.
+    scenes the patches differ in their base alone, as on a painted or printed object of one gloss. Raises UsageError if
+    the extra `render` is not installed.
 
     Args:
         mesh: the shape. None draws one at random.
-
-    Raises:
-        UsageError: the extra `render` is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
@@ -108,8 +106,7 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
 def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
     """Render the scene in all its materials. `progress` is called with the finished share, from 0 to 1.
 
-    Raises:
-        UsageError: the extra `render` is not installed.
+    Raises UsageError if the extra `render` is not installed.
     """
     report = progress or (lambda _: None)
     tracer = Tracer(scene.mesh)

@@ -34,14 +34,12 @@ def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[st
     """Draw a random shape, fitted into the camera's frame, and return the name of its kind and its mesh.
 
     40 % are carved (warped unions of solids with pieces cut out), 20 % rough (spheres with noise), 15 % relief (folded
-    slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera).
+    slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera). Raises
+    UsageError if the extra `render` is not installed.
 
     Args:
         place: determines the kind, from 0 to 1. Evenly spread values give a set the right share of each kind.
             None draws it at random.
-
-    Raises:
-        UsageError: the extra `render` is not installed.
     """
     place = rng.random() if place is None else place
     name = list(KINDS)[int(np.searchsorted(np.cumsum((0.4, 0.2, 0.15)), place, side="right"))]

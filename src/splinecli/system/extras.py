@@ -27,13 +27,12 @@ def import_extra(
 ) -> ModuleType:
     """Import a module of an extra when it is used for the first time.
 
+    Raises UsageError or `error` if the module is not installed. The message names the command that installs it.
+
     Args:
         extra: a key of _PROBLEMS.
         path: the file that cannot be read without the module, for the message.
         otherwise: another way out, for the message.
-
-    Raises:
-        UsageError, or `error`: the module is not installed. The message names the command that installs it.
     """
     try:
         return importlib.import_module(module)

@@ -116,15 +116,12 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     """Yield a collector of new files. After the block, they replace the earlier ones.
 
     The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as they are. A process
-    that ends during the replacement leaves a folder without a report.
+    that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
 
     Args:
         report: the name of the file that describes the others: removed first, written last. None where the caller takes
             care that no report names a file that changes.
         stale: names of earlier files that are removed if no new file replaces them.
-
-    Raises:
-        OutputError: a file cannot be written.
     """
     new = NewFiles(folder)
     try:

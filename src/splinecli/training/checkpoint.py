@@ -72,8 +72,7 @@ def load_checkpoint(
 ) -> RunCounters:
     """Restore networks and optimiser from a checkpoint, in place, and return the counters of the run.
 
-    Raises:
-        ModelError: the file is missing, damaged or from another network, or a pixel set has changed.
+    Raises ModelError if the file is missing, damaged or from another network, or a pixel set has changed.
     """
     tensors, metadata = _read(path)
     for name, sha256 in read_json_entry(metadata, "sets", path).items():

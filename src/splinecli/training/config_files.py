@@ -38,10 +38,8 @@ def read_config_file(path: Path) -> Settings:
 def parse_parameter(text: str) -> Settings:
     """Parse one setting: "a.b=value" gives {"a": {"b": value}}.
 
-    The value is read as TOML. A value that is not TOML is taken as text.
-
-    Raises:
-        UsageError: there is no name or no "=".
+    The value is read as TOML. A value that is not TOML is taken as text. Raises UsageError if there is no name or no
+    "=".
     """
     name, equals, value = text.partition("=")
     keys = [key.strip() for key in name.split(".")]
@@ -60,10 +58,8 @@ def parse_parameter(text: str) -> Settings:
 def parse_light_counts(text: str) -> dict[str, int]:
     """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
 
-    The usual number of lights is 10, as published, or the nearest number in the range.
-
-    Raises:
-        UsageError: the text is no such range, or a pixel would have fewer than 3 lights.
+    The usual number of lights is 10, as published, or the nearest number in the range. Raises UsageError if the text is
+    no such range, or a pixel would have fewer than 3 lights.
     """
     low, dash, high = text.partition("-")
     try:

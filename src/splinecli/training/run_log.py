@@ -58,8 +58,7 @@ class RunLog:
     def __init__(self, folder: Path, step: int, *, tensorboard: bool = False) -> None:
         """Open the log at a step and drop the lines of later steps, which the run is about to repeat.
 
-        Raises:
-            UsageError: `tensorboard` is set and the package is not installed.
+        Raises UsageError if `tensorboard` is set and the package is not installed.
         """
         self.folder = folder
         self.set_aside = _drop_lines_after(step, folder / METRICS)

@@ -76,9 +76,8 @@ class OpenSets:
 def open_sets(config: TrainingConfig) -> OpenSets:
     """Open the pixel sets of a configuration.
 
-    Raises:
-        InputError: a pixel set is missing, unfinished or does not match its manifest, or has no scene left for
-            training.
+    Raises InputError if a pixel set is missing, unfinished or does not match its manifest, or has no scene left for
+    training.
     """
     names = [name for name, weight in config.sources.items() if weight > 0 and name != GENERATOR]
     sets = {name: open_pixel_set(Path(name)) for name in names}
