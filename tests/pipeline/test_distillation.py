@@ -15,7 +15,7 @@ from splinecli.methods import distilled
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.methods.student_size import StudentSize
 from splinecli.pipeline import distillation
-from splinecli.pipeline.distillation import AUTOMATIC_FROM, distil_for
+from splinecli.pipeline.estimate import AUTOMATIC_FROM, distil_for
 
 LIGHTS = spiral_lights(6, 40)
 

@@ -24,7 +24,7 @@ from splinecli.errors import InputError
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
 
 if TYPE_CHECKING:
-    from splinecli.evaluation.outcome import Evaluation
+    from splinecli.evaluation.protocol import Evaluation
 
 
 def evaluate(

@@ -146,8 +146,8 @@ def infer(
     given = locals()
 
     from splinecli.pipeline.batch import infer_batch
-    from splinecli.pipeline.capture_list import Shard
     from splinecli.pipeline.infer_options import InferOptions
+    from splinecli.pipeline.member import Shard
 
     with printed_documents(as_list=as_json, as_lines=as_json_lines) as document:
         if as_json and as_json_lines:

@@ -53,8 +53,8 @@ def info(
     """
     given = locals()
 
+    from splinecli.pipeline.infer_options import Reading
     from splinecli.pipeline.info import describe_capture, summary_lines
-    from splinecli.pipeline.reading import Reading
 
     messages = Messages(quiet=quiet)
     report = describe_capture(

@@ -14,8 +14,7 @@ from splinecli import __version__
 from splinecli.errors import printable
 from splinecli.evaluation.capture_figures import CaptureFigure
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
-from splinecli.evaluation.outcome import Evaluation, all_skipped
-from splinecli.evaluation.protocol import Protocol, lights_value
+from splinecli.evaluation.protocol import Evaluation, Protocol, all_skipped, lights_value
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.statistics import compare
 from splinecli.evaluation.tables import latex, markdown

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splinecli.errors import printable
-from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.protocol import lights_in_words
+from splinecli.evaluation.protocol import Evaluation, lights_in_words
 from splinecli.evaluation.statistics import AVERAGE, trial_averages
 from splinecli.pictures.plotting import method_styles, png_bytes
 

@@ -13,8 +13,7 @@ from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
 from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.outcome import Evaluation, Result, Skipped
-from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.trials import Trial, TrialStore

@@ -9,8 +9,7 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import printable
-from splinecli.evaluation.outcome import Evaluation, all_captures, all_skipped
-from splinecli.evaluation.protocol import EVERY_CAPTURE, heading, lights_in_words
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, all_captures, all_skipped, heading, lights_in_words
 from splinecli.evaluation.statistics import (
     AVERAGE,
     SIGNIFICANCE,

@@ -12,7 +12,6 @@ from threading import Lock
 from typing import NamedTuple
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import (
     CaptureJob,
     ProtocolTrials,
@@ -21,7 +20,7 @@ from splinecli.evaluation.plan import (
     plan_capture,
     read_draws_file,
 )
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw
 from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.methods import Estimator

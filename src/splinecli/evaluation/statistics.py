@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.evaluation.outcome import Evaluation
+from splinecli.evaluation.protocol import Evaluation
 
 AVERAGE = "average"  # name that stands for the average over all captures, in place of a capture's name
 SIGNIFICANCE = 0.05  # p-value below which two methods differ

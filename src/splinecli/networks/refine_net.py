@@ -1,5 +1,6 @@
 """The refinement net: corrects a map of normals and of their errors by what lies around each pixel."""
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from types import EllipsisType
@@ -8,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
-from splinecli.networks.gaussian import gaussian_sum
 from splinecli.networks.layers import zeroed
 from splinecli.networks.refine_channels import READ, split_features
 
@@ -163,3 +163,25 @@ class _MaskedBlock(nn.Module):
         hidden = self.first(torch.relu(x)).mul_(mask).relu_()
         change: Tensor = self.second(hidden).mul_(mask)
         return change.add_(x) if change.dtype == x.dtype else x + change
+
+
+def reach_of(sigma: float) -> int:
+    """Return how many pixels to either side a filter of this width sees."""
+    return math.ceil(3 * sigma)
+
+
+def gaussian_sum(maps: Tensor, sigma: float) -> Tensor:
+    """Return sums of maps (..., H, W) with Gaussian weights, of which the largest is 1. Outside, maps count as zero."""
+    reach = reach_of(sigma)
+    kernel = [math.exp(-0.5 * (place / sigma) ** 2) for place in range(-reach, reach + 1)]
+    return _filtered(_filtered(maps, kernel, -1), kernel, -2)
+
+
+def _filtered(maps: Tensor, kernel: Sequence[float], axis: int) -> Tensor:
+    # Faster than convolutions of so few channels.
+    reach, size = len(kernel) // 2, maps.shape[axis]
+    padded = pad(maps, (reach, reach) if axis == -1 else (0, 0, reach, reach))
+    found = kernel[0] * padded.narrow(axis, 0, size)
+    for start, weight in enumerate(kernel[1:], 1):
+        found.add_(padded.narrow(axis, start, size), alpha=weight)
+    return found

@@ -14,8 +14,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
-from splinecli.networks.capture_head import CaptureHead
 from splinecli.networks.config import NetworkConfig
+from splinecli.networks.error_head import CaptureHead
 from splinecli.networks.light_net import LightNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.system.files import file_sha256, is_special, parse_json, write_bytes

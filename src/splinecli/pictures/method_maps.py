@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import encode_picture
-from splinecli.pictures.error_map import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
+from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 from splinecli.pictures.plotting import png_bytes
 from splinecli.pictures.png import Picture
 

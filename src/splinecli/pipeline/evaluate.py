@@ -18,9 +18,8 @@ from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
 from splinecli.evaluation.document import TRIALS, make_plots, write_results
-from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import distinct_names
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw, TrialSource, open_to_score
 from splinecli.evaluation.trials import TrialStore

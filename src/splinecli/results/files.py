@@ -15,8 +15,13 @@ from splinecli.capture import Capture
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
 from splinecli.maths.normals import Convention, describe, encode_picture
-from splinecli.pictures.error_map import error_map_picture
-from splinecli.pictures.maps import albedo_picture, confidence_picture, preview_picture, signed_picture
+from splinecli.pictures.maps import (
+    albedo_picture,
+    confidence_picture,
+    error_map_picture,
+    preview_picture,
+    signed_picture,
+)
 from splinecli.pictures.png import encode_png
 from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.system.exr import encode_exr
@@ -25,7 +30,7 @@ from splinecli.system.publishing import Content, is_plain, new_files
 
 if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
-    from splinecli.results.clock import Clock
+    from splinecli.results.report import Clock
 
 NORMALS = {
     "png": "normals.png",

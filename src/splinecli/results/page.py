@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import unit
-from splinecli.pictures.error_map import TICKS, TOP_DEG, colour_errors
-from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture
+from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, albedo_picture, colour_errors, confidence_picture
 from splinecli.pictures.png import Picture, encode_png
 from splinecli.results.templates import render
 

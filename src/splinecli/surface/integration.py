@@ -3,7 +3,7 @@
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes: the surface tears only
 where it contradicts the normals, and large maps are integrated from coarse to fine. A coarse surface from elsewhere may
 give what is wider than some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and
-normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations, `laplacian` the linear solver.
+normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the linear solver.
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
-from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations
+from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations, LaplacianSolver
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length
-from splinecli.surface.laplacian import LaplacianSolver
 
 Floats = NDArray[np.float64]
 

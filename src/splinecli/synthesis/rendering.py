@@ -22,10 +22,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.synthesis.camera import VisibleSurface
 from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer
+from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer, VisibleSurface
 from splinecli.synthesis.sampling import LOBES, draw_directions
 
 SOFTEST = 0.3  # lowest roughness of surfaces that light other surfaces

@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
