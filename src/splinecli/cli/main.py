@@ -14,7 +14,7 @@ import typer
 
 from splinecli.cli.app import app
 from splinecli.cli.console import print_lines
-from splinecli.cli.failures import explain, is_defect
+from splinecli.cli.failures import DEFECT, explain
 from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.errors import printable
 
@@ -38,9 +38,10 @@ def _run_command(args: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         result = INTERRUPTED
     except Exception as error:
-        if is_defect(error):
+        message, exit_code = explain(error)
+        if message == DEFECT:
             print_lines(traceback.format_exc())
-        return fail(*explain(error))
+        return fail(message, exit_code)
     if result == INTERRUPTED:
         TOLD.set()
         return fail("interrupted.", INTERRUPTED)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
-from splinecli.networks.layers import zeroed
+from splinecli.networks.layers import ResidualBlock, zeroed
 from splinecli.networks.refine_channels import READ, split_features
 
 WIDTHS = (32, 64, 96, 64)  # channels at the full resolution, and at a half, a quarter and an eighth of it
@@ -40,11 +40,11 @@ class RefineNet(nn.Module):
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
-            nn.ModuleList(_MaskedBlock(width) for _ in range(count))
+            nn.ModuleList(ResidualBlock(width) for _ in range(count))
             for width, count in zip(WIDTHS, ENCODING_BLOCKS, strict=True)
         )
         self.decode = nn.ModuleList(
-            nn.ModuleList(_MaskedBlock(width) for _ in range(count))
+            nn.ModuleList(ResidualBlock(width) for _ in range(count))
             for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
         )
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
@@ -140,29 +140,10 @@ def unit_maps(vectors: Tensor) -> Tensor:
 
 
 def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
-    """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask.
-
-    Normals weigh as much as they are certain: by one over the median of their errors, whose logarithm is given.
-    """
+    """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask."""
+    # Normals weigh as much as they are certain: by one over the median of their errors, whose logarithm is given.
     weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
-    found = []
-    for sigma in SIGMAS:
-        found.append(unit_maps(gaussian_sum(normals * weight, sigma)) * mask)
-    return found
-
-
-class _MaskedBlock(nn.Module):
-    """x + conv3x3(relu(conv3x3(relu(x)))), zero outside the mask. It starts as the identity."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = zeroed(nn.Conv2d(width, width, 3, padding=1))
-
-    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        hidden = self.first(torch.relu(x)).mul_(mask).relu_()
-        change: Tensor = self.second(hidden).mul_(mask)
-        return change.add_(x) if change.dtype == x.dtype else x + change
+    return [unit_maps(gaussian_sum(normals * weight, sigma)) * mask for sigma in SIGMAS]
 
 
 def reach_of(sigma: float) -> int:

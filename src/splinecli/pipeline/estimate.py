@@ -142,15 +142,11 @@ def estimate_capture(
 
         advance = stages.enter_context(stage("estimating"))
         estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
-    warnings += [*found, *_untrained_lights(estimator, capture), *check_confidence(estimate.expected_under_5)]
+    if estimator.weights is not None:
+        from splinecli.networks.weights import untrained_warning
+
+        texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
+        found = [*found, *(CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts)]
+    warnings += [*found, *check_confidence(estimate.expected_under_5)]
     refuse_if_strict(warnings, capture.name, strict=strict)
     return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled
-
-
-def _untrained_lights(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:
-    if estimator.weights is None:
-        return []
-    from splinecli.networks.weights import untrained_warning
-
-    warnings = untrained_warning(estimator.weights["sha256"], capture.n_lights)
-    return [CaptureWarning(UNTRAINED_LIGHTS, text) for text in warnings]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ from splinecli.pictures.maps import (
     signed_picture,
 )
 from splinecli.pictures.png import encode_png
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_tiff, file_names
 from splinecli.system.exr import encode_exr
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
@@ -233,9 +232,4 @@ def _value_files(names: tuple[str, str], values: NDArray[np.float32], descriptio
     """Yield a map (H, W) or (H, W, C) as a float32 NPY file and, with tiff, as a TIFF file with a description."""
     yield names[0], values
     if tiff:
-        import tifffile
-
-        file = BytesIO()
-        layout = "contig" if values.ndim == 3 else None
-        tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
-        yield names[1], file.getvalue()
+        yield names[1], encode_tiff(values, description)

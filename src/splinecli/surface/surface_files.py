@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splinecli.surface.mesh import SurfaceMesh
+    from splinecli.system.publishing import Content
 
 SURFACE_FILES = {
     "glb": ("mesh.glb",),
@@ -59,8 +60,8 @@ def file_names(formats: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for form in formats for name in SURFACE_FILES[form])
 
 
-def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, bytes]]:
-    """Yield the name and the content of each file of a surface, in formats that are keys of SURFACE_FILES.
+def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, Content]]:
+    """Yield the name and the content (see NewFiles.write) of each file of a surface; formats are keys of SURFACE_FILES.
 
     Raises InputError if a mesh without triangles cannot be written as GLB.
     """
@@ -132,19 +133,13 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
     return {"mesh.obj": text.encode(), **files}
 
 
-def _encode_npy(surface: Surface) -> bytes:
-    import numpy as np
-
-    file = io.BytesIO()
-    np.save(file, surface.depth.astype(np.float32), allow_pickle=False)
-    return file.getvalue()
-
-
-def _encode_tiff(surface: Surface) -> bytes:
+def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
+    """Return the TIFF file of a map (H, W) or (H, W, C)."""
     import tifffile
 
     file = io.BytesIO()
-    tifffile.imwrite(file, surface.depth.astype("f4"), description=f"unit: {surface.unit}")
+    layout = "contig" if values.ndim == 3 else None
+    tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
     return file.getvalue()
 
 
@@ -175,12 +170,12 @@ def _encode_png(surface: Surface) -> bytes:
     return file.getvalue()
 
 
-_ENCODERS: dict[str, Callable[[Surface], bytes]] = {
+_ENCODERS: dict[str, Callable[[Surface], Content]] = {
     "glb": _encode_glb,
     "ply": _encode_ply,
     "stl": _encode_stl,
-    "npy": _encode_npy,
-    "tiff": _encode_tiff,
+    "npy": lambda surface: surface.depth.astype("f4"),
+    "tiff": lambda surface: encode_tiff(surface.depth.astype("f4"), f"unit: {surface.unit}"),
     "png": _encode_png,
     "exr": _encode_exr,
 }

@@ -15,27 +15,20 @@ from splinecli.training.distributed import join_workers, leave_workers, restarts
 from splinecli.training.loop import Trainer
 
 
-def resumes(folder: Path, *, resume: bool) -> bool:
-    """Return whether a run continues: on request, or after torchrun has started its processes again.
-
-    With torchrun's --max-restarts, one command both starts a run and continues it.
-    """
-    return resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())
-
-
 def configure_run(
     folder: Path, preset_name: str | None, file: Path | None, changes: Sequence[Settings], *, resume: bool
-) -> TrainingConfig:
-    """Return the configuration of a run that starts or continues. Raises ModelError, UsageError.
+) -> tuple[TrainingConfig, bool]:
+    """Return the configuration of a run, and whether it continues. Raises ModelError, UsageError.
 
-    Of a run that continues without a preset, every setting that is not given stays as it was.
+    It continues on request, or after torchrun has started its processes again: with --max-restarts, one command both
+    starts a run and continues it. Without a preset, settings of such a run that are not given stay.
     """
-    if not resume:
-        return configure(preset_name, file, changes)
+    if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
+        return configure(preset_name, file, changes), False
     started = read_checkpoint_config(folder / CHECKPOINT)
     asked = configure(preset_name, file, changes, base=started)
     check_resumable(started, asked, folder / CHECKPOINT)
-    return asked
+    return asked, True
 
 
 @contextmanager

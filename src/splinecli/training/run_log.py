@@ -8,7 +8,8 @@ from typing import Any
 
 from splinecli.errors import OutputError
 from splinecli.pictures.observation_maps import observation_map_figure
-from splinecli.pictures.training_curves import training_curves
+from splinecli.pictures.plotting import png_bytes
+from splinecli.pictures.training_curves import training_figure
 from splinecli.system.extras import import_extra
 from splinecli.system.files import refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.publishing import refuse_link
@@ -87,7 +88,7 @@ class RunLog:
         """Write curves.png anew, and maps.png where there are maps."""
         rows = read_metrics(self.folder / METRICS)
         columns = {field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)}
-        write_bytes(self.folder / CURVES, training_curves(columns))
+        write_bytes(self.folder / CURVES, png_bytes(training_figure(columns), dpi=110))
         if maps is None:
             return
         figure = observation_map_figure(
