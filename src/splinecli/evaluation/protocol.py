@@ -99,21 +99,14 @@ def protocol_in_words(protocol: Protocol) -> str:
 
 @dataclass(frozen=True)
 class Result:
-    """The errors of one method on one capture.
-
-    Args:
-        capture: name of the capture in the tables.
-        n_lights: number of lights in each draw.
-        maes_deg: mean angular error (MAE) over the scored pixels, in degrees, of each trial.
-        seconds: mean time to estimate the normals of a trial.
-        found_light_error_deg: mean error of the light directions that the trials estimated; None where they did not.
-    """
+    """The errors of one method on one capture."""
 
     method: str
-    capture: str
-    n_lights: int
-    maes_deg: tuple[float, ...]
-    seconds: float
+    capture: str  # name of the capture in the tables
+    n_lights: int  # number of lights in each draw
+    maes_deg: tuple[float, ...]  # mean angular error (MAE) over the scored pixels, in degrees, of each trial
+    seconds: float  # mean time to estimate the normals of a trial
+    # mean error of the light directions that the trials estimated; None where they did not
     found_light_error_deg: float | None = None
 
     @property
@@ -142,20 +135,13 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The outcome of one protocol.
+    """The outcome of one protocol."""
 
-    Args:
-        protocol: the protocol; n_lights and trials are those of the draws file where there is one.
-        results: one for each capture and method, captures in the order given, then methods.
-        skipped: the captures that could not be scored.
-        notes: sentences about the captures and how the evaluation treated them.
-        settings: {"weights", "device", "precision", "fingerprint"} of each method by name; see Estimator.
-    """
-
-    protocol: Protocol
-    results: tuple[Result, ...]
-    skipped: tuple[Skipped, ...] = ()
-    notes: tuple[str, ...] = ()
+    protocol: Protocol  # the protocol; n_lights and trials are those of the draws file where there is one
+    results: tuple[Result, ...]  # one for each capture and method, captures in the order given, then methods
+    skipped: tuple[Skipped, ...] = ()  # the captures that could not be scored
+    notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
+    # {"weights", "device", "precision", "fingerprint"} of each method by name; see Estimator
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property

@@ -18,20 +18,14 @@ _LONGEST_LINE = 1 << 16  # characters
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one capture under one draw of lights, with everything that decides its score.
+    """One method on one capture under one draw of lights, with everything that decides its score."""
 
-    Args:
-        capture: name of the capture in the tables.
-        number: of the trial, from 0.
-        made_of: digest of the capture's files and of the method's settings.
-    """
-
-    capture: str
+    capture: str  # name of the capture in the tables
     method: str
-    number: int
+    number: int  # of the trial, from 0
     lights: Draw
     protocol: Protocol
-    made_of: str
+    made_of: str  # digest of the capture's files and of the method's settings
 
     @property
     def record(self) -> dict[str, Any]:
@@ -69,18 +63,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Score:
-    """The score of a trial.
+    """The score of a trial."""
 
-    Args:
-        mae_deg: mean angular error over the scored pixels.
-        seconds: time spent on estimating their normals.
-        estimated_intensities: whether the light intensities were estimated from the images.
-        found_light_error_deg: mean error of light directions that were estimated from the images; None where none were.
-    """
-
-    mae_deg: float
-    seconds: float
-    estimated_intensities: bool
+    mae_deg: float  # mean angular error over the scored pixels
+    seconds: float  # time spent on estimating their normals
+    estimated_intensities: bool  # whether the light intensities were estimated from the images
+    # mean error of light directions that were estimated from the images; None where none were
     found_light_error_deg: float | None = None
 
 

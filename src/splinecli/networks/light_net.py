@@ -15,17 +15,11 @@ _LEAST_SHARPNESS, _LARGEST_SHARPNESS = -2.0, 8.5  # logarithms; errors of 90 deg
 
 
 class LightGuess(NamedTuple):
-    """What the network reads off the F images of each of B captures.
+    """What the network reads off the F images of each of B captures."""
 
-    Attributes:
-        directions: (B, F, 3), unit; the modes of von Mises-Fisher distributions.
-        sharpness: (B, F), the logarithms of the concentrations of these distributions.
-        log_intensities: (B, F), the logarithms of the intensities; their mean over each capture is zero.
-    """
-
-    directions: Tensor
-    sharpness: Tensor
-    log_intensities: Tensor
+    directions: Tensor  # (B, F, 3), unit; the modes of von Mises-Fisher distributions
+    sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
+    log_intensities: Tensor  # (B, F), the logarithms of the intensities; their mean over each capture is zero
 
 
 class LightNet(nn.Module):

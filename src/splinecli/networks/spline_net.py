@@ -24,14 +24,10 @@ RESIDUAL_LIMIT = 3.0
 
 
 class Rotation(NamedTuple):
-    """A turn of the lights about the view axis, and a reflection.
+    """A turn of the lights about the view axis, and a reflection."""
 
-    Attributes:
-        turn_deg: angle in degrees, a number or (P,).
-        mirror: whether y is flipped after the turn. An isotropic pixel looks the same under its mirrored lights.
-    """
-
-    turn_deg: float | Tensor = 0.0
+    turn_deg: float | Tensor = 0.0  # angle in degrees, a number or (P,)
+    # whether y is flipped after the turn. An isotropic pixel looks the same under its mirrored lights.
     mirror: bool = False
 
 
@@ -39,34 +35,25 @@ NO_ROTATION = Rotation()
 
 
 class PixelMaps(NamedTuple):
-    """Observation maps of P pixels and what belongs to them, in each pixel's own frame.
+    """Observation maps of P pixels and what belongs to them, in each pixel's own frame."""
 
-    Attributes:
-        sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation.
-        lambertian_normals: (P, 3), unit.
-        scale: (P, 1), the largest observation, which is 1 in the maps.
-        fitted_normals: (P, K, 3), of the further fits in the configuration.
-        cosine, sine: (P,), of the turn from the capture's frame to the pixel's.
-        mirrored: whether y is flipped after the turn.
-        observed, residuals: (P, F), the scaled observations and their residuals.
-        lights: (P, F, 3), in the pixels' frames.
-        valid: (P, F) bool, or None for all.
-    """
-
+    # sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation
     sparse: Tensor
     occupied: Tensor
     residual: Tensor
     lambertian_map: Tensor
-    lambertian_normals: Tensor
-    scale: Tensor
-    fitted_normals: Tensor
+    lambertian_normals: Tensor  # (P, 3), unit
+    scale: Tensor  # (P, 1), the largest observation, which is 1 in the maps
+    fitted_normals: Tensor  # (P, K, 3), of the further fits in the configuration
+    # cosine, sine: (P,), of the turn from the capture's frame to the pixel's
     cosine: Tensor
     sine: Tensor
-    mirrored: bool
+    mirrored: bool  # whether y is flipped after the turn
+    # observed, residuals: (P, F), the scaled observations and their residuals
     observed: Tensor
     residuals: Tensor
-    lights: Tensor
-    valid: Tensor | None
+    lights: Tensor  # (P, F, 3), in the pixels' frames
+    valid: Tensor | None  # (P, F) bool, or None for all
 
 
 class Estimate(NamedTuple):

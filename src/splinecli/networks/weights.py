@@ -35,16 +35,11 @@ SHIPPED = resources.files("splinecli") / "assets"
 
 @dataclass(frozen=True)
 class LoadedNetwork:
-    """A network that is ready to estimate normals (float32, evaluation mode).
-
-    Attributes:
-        name: the shipped name, or the file name without its suffix.
-        sha256: SHA-256 of the weight file.
-    """
+    """A network that is ready to estimate normals (float32, evaluation mode)."""
 
     network: SplineNet
-    name: str
-    sha256: str
+    name: str  # the shipped name, or the file name without its suffix
+    sha256: str  # SHA-256 of the weight file
 
 
 def tensors_sha256(tensors: dict[str, Tensor]) -> str:

@@ -122,19 +122,14 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one capture.
+    """Outcome of one capture."""
 
-    Args:
-        status: done, skipped (results are up to date), changed (results are out of date and were kept), missing
-            (there is no such folder) or failed.
-        report: the report of the results, or the document {capture, error, exit_code}.
-        trace: the Python traceback of an error that splinecli did not expect.
-    """
-
+    # done, skipped (results are up to date), changed (results are out of date and were kept), missing (there is no such
+    # folder) or failed
     status: Status
-    report: dict[str, Any]
+    report: dict[str, Any]  # the report of the results, or the document {capture, error, exit_code}
     exit_code: int = 0
-    trace: str = ""
+    trace: str = ""  # the Python traceback of an error that splinecli did not expect
 
 
 def run_member(

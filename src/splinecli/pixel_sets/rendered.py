@@ -79,40 +79,40 @@ class ScenePlan:
                         f"the entry {name} was made with {difference}", path=writer.folder, hint="Choose another -o"
                     )
 
+    def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
+        """Render a scene; return its shape in words, and the pixels by class of material.
 
-def add_scene(
-    writer: PixelSetWriter, plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None
-) -> list[str]:
-    """Render scene number `position` of the plan, unless the set has it, and return the names of its entries.
+        `progress` is called with the finished share, 0 to 1.
 
-    The set has passed `plan.check_set`. `progress` is called with the finished share of the rendering, 0 to 1.
+        Raises:
+            InputError: the mesh cannot be used, or the camera sees nothing.
+            UsageError: the packages of the extra `render` are not installed.
+        """
+        mesh_file = self.meshes[position] if position < len(self.meshes) else None
+        mesh = None if mesh_file is None else read_mesh(mesh_file)
+        index = position - len(self.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
+        scene = draw_scene(self.seed, index, self.config, mesh)
+        rendered = render_scene(scene, self.config, progress)
+        if not rendered.mask.any():
+            raise InputError(
+                "the camera sees nothing of the mesh",
+                path=mesh_file or self.names[position],
+                hint="The camera looks along -z. A face is visible if its corners run anticlockwise towards the camera",
+            )
+        normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
+        # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
+        observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
+        return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}
 
-    Raises:
-        InputError: the mesh cannot be used, or the camera sees nothing.
-        OutputError: an entry cannot be written.
-        UsageError: the packages of the extra `render` are not installed.
-    """
-    if not has_scene(writer, plan, position):
-        add_rendered(writer, plan, position, *render_planned(plan, position, progress))
-    return list(plan.entry_names(position).values())
-
-
-def has_scene(writer: PixelSetWriter, plan: ScenePlan, position: int) -> bool:
-    """Return whether the set has all entries of a scene."""
-    return all(name in writer for name in plan.entry_names(position).values())
-
-
-def add_rendered(
-    writer: PixelSetWriter, plan: ScenePlan, position: int, shape: str, pixels: Mapping[str, Pixels]
-) -> None:
-    """Add the entries of a scene, with the results of render_planned. Raises OutputError."""
-    recipe = plan.recipe(position)
-    for kind, name in plan.entry_names(position).items():
-        writer.add(name, plan.names[position], f"rendered: {shape}", recipe, pixels[kind])
+    def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
+        """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
+        recipe = self.recipe(position)
+        for kind, name in self.entry_names(position).items():
+            writer.add(name, self.names[position], f"rendered: {shape}", recipe, pixels[kind])
 
 
 def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
-    """Write what render_planned returned to a file, for load_rendered. Raises OutputError."""
+    """Write the pixels of a scene to a file, for load_rendered. Raises OutputError."""
     arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in CLASSES for name in ARRAYS}
     with replacing(path) as file:
         np.savez(file, **arrays)
@@ -122,24 +122,3 @@ def load_rendered(path: Path) -> dict[str, Pixels]:
     """Return the pixels in a file that save_rendered wrote. Raises OSError."""
     with np.load(path, allow_pickle=False) as arrays:
         return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in CLASSES}
-
-
-def render_planned(
-    plan: ScenePlan, position: int, progress: Callable[[float], None] | None = None
-) -> tuple[str, dict[str, Pixels]]:
-    """Render a scene; return its shape in words, and the pixels by class of material. Raises what add_scene raises."""
-    mesh_file = plan.meshes[position] if position < len(plan.meshes) else None
-    mesh = None if mesh_file is None else read_mesh(mesh_file)
-    index = position - len(plan.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
-    scene = draw_scene(plan.seed, index, plan.config, mesh)
-    rendered = render_scene(scene, plan.config, progress)
-    if not rendered.mask.any():
-        raise InputError(
-            "the camera sees nothing of the mesh",
-            path=mesh_file or plan.names[position],
-            hint="The camera looks along -z. A face is visible if its corners run anticlockwise towards the camera",
-        )
-    normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
-    # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
-    observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
-    return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}

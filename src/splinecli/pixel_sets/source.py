@@ -24,19 +24,12 @@ FILL_ROUNDS = 3  # each round fills gaps one cell further from the cells with a 
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """The truth behind P pixels of a pixel set, under up to F lights each.
+    """The truth behind P pixels of a pixel set, under up to F lights each."""
 
-    Attributes:
-        normals: (P, 3) unit normals.
-        radiance: (P, F).
-        light_directions: (P, F, 3) unit vectors towards the lights.
-        known: (P, F), False for the padding of pixels with fewer lights.
-    """
-
-    normals: Tensor
-    radiance: Tensor
-    light_directions: Tensor
-    known: Tensor
+    normals: Tensor  # (P, 3) unit normals
+    radiance: Tensor  # (P, F)
+    light_directions: Tensor  # (P, F, 3) unit vectors towards the lights
+    known: Tensor  # (P, F), False for the padding of pixels with fewer lights
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> SampledPixels:
         """Rotate each pixel about the view axis by its own angle, given as cosine (P,) and sine (P,)."""

@@ -44,17 +44,12 @@ SMALLEST_COSINE = 0.05
 
 @dataclass(frozen=True)
 class BilateralEquations:
-    """The equations of P pixels.
+    """The equations of P pixels."""
 
-    Args:
-        facing: (P,), zero where the normal is not usable.
-        slants: (P,) along the rows and (P,) along the columns, zero where the normal is not usable.
-        pairs: the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the
-            left or above, and (E,) pixel numbers on the right or below.
-    """
-
-    facing: Floats
-    slants: tuple[Floats, Floats]
+    facing: Floats  # (P,), zero where the normal is not usable
+    slants: tuple[Floats, Floats]  # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
+    # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the left or
+    # above, and (E,) pixel numbers on the right or below.
     pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
 
     @classmethod

@@ -40,19 +40,12 @@ _FLOAT = 5126  # of glTF
 
 @dataclass(frozen=True)
 class Surface:
-    """A depth map and its mesh.
+    """A depth map and its mesh."""
 
-    Args:
-        depth: (H, W), NaN outside the object.
-        mesh: the mesh of the same surface.
-        unit: the name of the unit of both.
-        millimetres: the length of this unit in a file of glTF.
-    """
-
-    depth: NDArray[np.floating]
-    mesh: SurfaceMesh
-    unit: str
-    millimetres: float
+    depth: NDArray[np.floating]  # (H, W), NaN outside the object
+    mesh: SurfaceMesh  # the mesh of the same surface
+    unit: str  # the name of the unit of both
+    millimetres: float  # the length of this unit in a file of glTF
 
 
 def file_names(formats: Sequence[str]) -> tuple[str, ...]:

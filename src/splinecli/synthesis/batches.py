@@ -45,17 +45,11 @@ class CaptureConfig:
 
 
 class DenseMap(NamedTuple):
-    """True dense maps.
+    """True dense maps."""
 
-    Attributes:
-        values: (P, 1, w, w), zero where nothing is known, such as outside the unit disc.
-        known: of the same shape, 1 where values are measured.
-        filled: of the same shape, 1 where values are measured or interpolated from measured neighbours.
-    """
-
-    values: Tensor
-    known: Tensor
-    filled: Tensor
+    values: Tensor  # (P, 1, w, w), zero where nothing is known, such as outside the unit disc
+    known: Tensor  # of the same shape, 1 where values are measured
+    filled: Tensor  # of the same shape, 1 where values are measured or interpolated from measured neighbours
 
 
 class PixelTruth(Protocol):
@@ -77,21 +71,13 @@ class PixelTruth(Protocol):
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """P pixels as a capture shows them, and their truth.
+    """P pixels as a capture shows them, and their truth."""
 
-    Attributes:
-        observations: (P, F), linear, divided by the light intensities.
-        light_directions: (P, F, 3), unit, as calibrated.
-        valid: (P, F) bool; false for padding.
-        truth: the normals and dense maps.
-        exposure: (P, 1), the factor from the radiance of the truth to the observations.
-    """
-
-    observations: Tensor
-    light_directions: Tensor
-    valid: Tensor
-    truth: PixelTruth
-    exposure: Tensor
+    observations: Tensor  # (P, F), linear, divided by the light intensities
+    light_directions: Tensor  # (P, F, 3), unit, as calibrated
+    valid: Tensor  # (P, F) bool; false for padding
+    truth: PixelTruth  # the normals and dense maps
+    exposure: Tensor  # (P, 1), the factor from the radiance of the truth to the observations
 
 
 def photograph(

@@ -21,16 +21,11 @@ _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 +
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    vertices: (V, 3) float32.
-    faces: (T, 3) int32, rows of vertices, anticlockwise as seen from outside.
-    vertex_normals: (V, 3) float32, unit, outward; shading interpolates them.
-    """
-
-    vertices: Floats
-    faces: NDArray[np.int32]
-    vertex_normals: Floats
+    vertices: Floats  # (V, 3) float32
+    faces: NDArray[np.int32]  # (T, 3) int32, rows of vertices, anticlockwise as seen from outside
+    vertex_normals: Floats  # (V, 3) float32, unit, outward; shading interpolates them
 
 
 def read_mesh(path: str | Path) -> Mesh:

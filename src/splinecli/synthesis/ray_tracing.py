@@ -24,17 +24,12 @@ TRACED_ROWS = 16_384  # number of points whose shadows are traced together
 
 @dataclass(frozen=True)
 class Hits:
-    """The first surface points that N rays hit.
+    """The first surface points that N rays hit."""
 
-    triangle: (N,) int, row of the mesh's faces.
-    weights: (N, 3), barycentric weights of the corners.
-    position: (N, 3), on the triangle.
-    normal, facet_normal: (N, 3), unit, interpolated and that of the triangle.
-    """
-
-    triangle: NDArray[np.int64]
-    weights: Floats
-    position: Floats
+    triangle: NDArray[np.int64]  # (N,) int, row of the mesh's faces
+    weights: Floats  # (N, 3), barycentric weights of the corners
+    position: Floats  # (N, 3), on the triangle
+    # normal, facet_normal: (N, 3), unit, interpolated and that of the triangle
     normal: Floats
     facet_normal: Floats
 
@@ -141,18 +136,12 @@ MIN_NORMAL_Z = 0.05  # pixels that are seen at a more grazing angle are left out
 
 @dataclass(frozen=True)
 class VisibleSurface:
-    """The surface points that the camera sees in P pixels, with S samples each.
+    """The surface points that the camera sees in P pixels, with S samples each."""
 
-    mask: (H, W), the pixels that are seen.
-    normals: (P, 3), unit, the mean of the samples' normals; pixels row-major.
-    samples: P * S surface points; those of one pixel follow each other.
-    samples_per_pixel: S.
-    """
-
-    mask: NDArray[np.bool_]
-    normals: Floats
-    samples: Hits
-    samples_per_pixel: int
+    mask: NDArray[np.bool_]  # (H, W), the pixels that are seen
+    normals: Floats  # (P, 3), unit, the mean of the samples' normals; pixels row-major
+    samples: Hits  # P * S surface points; those of one pixel follow each other
+    samples_per_pixel: int  # S
 
     def samples_of(self, pixels: NDArray[np.int64]) -> Hits:
         """Return all samples of some pixels."""

@@ -22,55 +22,34 @@ MIN_LIGHT_Z = 0.03  # lowest z of a light, the cosine of its angle to the viewin
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Settings for drawing and rendering scenes.
+    """Settings for drawing and rendering scenes."""
 
-    Args:
-        size: width and height in pixels.
-        lights: F, the number of lights.
-        samples: k of the k x k samples per pixel.
-        directions: number of paths per pixel for indirect light.
-        bounces: largest number of reflections before the visible surface; 0 for direct light only.
-    """
-
-    size: int = 128
-    lights: int = 500
-    samples: int = 4
-    directions: int = 256
-    bounces: int = 4
+    size: int = 128  # width and height in pixels
+    lights: int = 500  # F, the number of lights
+    samples: int = 4  # k of the k x k samples per pixel
+    directions: int = 256  # number of paths per pixel for indirect light
+    bounces: int = 4  # largest number of reflections before the visible surface; 0 for direct light only
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene before rendering.
+    """A scene before rendering."""
 
-    shape: kind of the shape.
-    mesh: the shape.
-    lights: (F, 3), unit directions towards the lights.
-    materials: by class, with one row per patch of the surface.
-    patch_of_face: (T,), the patch of each face.
-    seed: seed of the paths of indirect light.
-    """
-
-    shape: str
-    mesh: Mesh
-    lights: Floats
-    materials: dict[str, PrincipledMaterial]
-    patch_of_face: NDArray[np.int64]
-    seed: int
+    shape: str  # kind of the shape
+    mesh: Mesh  # the shape
+    lights: Floats  # (F, 3), unit directions towards the lights
+    materials: dict[str, PrincipledMaterial]  # by class, with one row per patch of the surface
+    patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
+    seed: int  # seed of the paths of indirect light
 
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """The images of a scene.
+    """The images of a scene."""
 
-    mask: (H, W).
-    normals: (P, 3), unit; pixels row-major.
-    observations: by class, (P, F) float32; 1 is a matte white surface that faces the light.
-    """
-
-    mask: NDArray[np.bool_]
-    normals: Floats
-    observations: dict[str, Floats]
+    mask: NDArray[np.bool_]  # (H, W)
+    normals: Floats  # (P, 3), unit; pixels row-major
+    observations: dict[str, Floats]  # by class, (P, F) float32; 1 is a matte white surface that faces the light
 
 
 def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None) -> Scene:

@@ -26,18 +26,14 @@ AXIS_LENGTH = 0.01
 
 
 class Losses(NamedTuple):
-    """The total loss and its unweighted terms. Each is a scalar, NaN where it was not computed.
-
-    Attributes:
-        angle: in radians.
-        on_map, masked: means over cells.
-        symmetric, asymmetric: the terms of LI-Net and of NE-Net added, each in its norm.
-    """
+    """The total loss and its unweighted terms. Each is a scalar, NaN where it was not computed."""
 
     total: Tensor
-    angle: Tensor
+    angle: Tensor  # in radians
+    # on_map, masked: means over cells
     on_map: Tensor
     masked: Tensor
+    # symmetric, asymmetric: the terms of LI-Net and of NE-Net added, each in its norm
     symmetric: Tensor
     asymmetric: Tensor
 

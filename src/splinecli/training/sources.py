@@ -56,16 +56,12 @@ Scenes = dict[str, tuple[PixelSet, list[Entry]]]
 
 @dataclass(frozen=True)
 class OpenSets:
-    """The pixel sets of a run.
+    """The pixel sets of a run."""
 
-    Attributes:
-        training, validation: the scenes for either. A set with a single scene is validated on its training pixels.
-        single_scene_sets: these sets.
-    """
-
+    # training, validation: the scenes for either. A set with a single scene is validated on its training pixels.
     training: Scenes
     validation: Scenes
-    single_scene_sets: tuple[str, ...]
+    single_scene_sets: tuple[str, ...]  # these sets
 
     @property
     def sha256(self) -> dict[str, str]:

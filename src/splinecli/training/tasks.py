@@ -30,19 +30,12 @@ _BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 +
 
 
 class SampleMaps(NamedTuple):
-    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals.
+    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals."""
 
-    Attributes:
-        sparse: the sparse maps, (N, w, w).
-        dense: LI-Net's dense maps, (N, w, w); None without a LI-Net.
-        truth: the true maps with gaps filled, (N, w, w).
-        error_deg: (N,).
-    """
-
-    sparse: NDArray[np.float32]
-    dense: NDArray[np.float32] | None
-    truth: NDArray[np.float32]
-    error_deg: NDArray[np.float32]
+    sparse: NDArray[np.float32]  # the sparse maps, (N, w, w)
+    dense: NDArray[np.float32] | None  # LI-Net's dense maps, (N, w, w); None without a LI-Net
+    truth: NDArray[np.float32]  # the true maps with gaps filled, (N, w, w)
+    error_deg: NDArray[np.float32]  # (N,)
 
 
 class PixelTask:
