@@ -55,12 +55,9 @@ def fail(message: str, exit_code: int) -> int:
 
 
 class UntilClosed:
-    """A text stream that drops all output once its pipe is closed.
+    """A text stream that drops all output once its pipe is closed. All other attributes are the stream's.
 
     With a plain stream, the next line that a command prints would raise an error and end the command's work.
-
-    Args:
-        stream: the stream to write to. All other attributes are this stream's.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -136,15 +136,10 @@ def parse_light_count(text: str) -> int | None:
 
 
 def record_from(record: type[Record], arguments: Mapping[str, Any], **values: Any) -> Record:
-    """Build a record of options from the arguments of a command that have the names of its fields.
+    """Build a frozen dataclass of options from the arguments of a command that have the names of its fields.
 
-    Raises UsageError if the record refuses a value.
-
-    Args:
-        record: a frozen dataclass.
-        arguments: of the command, such as its `locals()`. A choice becomes its value, a list a tuple, and a path text
-            if the field holds no path.
-        values: of fields that need more than this, in place of the arguments.
+    A choice becomes its value, a list a tuple, and a path text if the field holds no path. `values` are those of fields
+    that need more than this. Raises UsageError if the record refuses a value.
     """
     given = {
         field.name: _of_field(arguments[field.name], str(field.type))

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError, printable
-from splinecli.evaluation.plan import first_trial
+from splinecli.evaluation.plan import draws_for, read_draws_file
 from splinecli.evaluation.protocol import Protocol, heading
 from splinecli.evaluation.trial_capture import TrialSource
+from splinecli.evaluation.trials import Trial
 from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 from splinecli.pictures.method_maps import method_maps
 from splinecli.pictures.observation_maps import observation_map_figure
+from splinecli.system.files import free_name
 
 SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
@@ -57,7 +59,8 @@ def capture_figures(
         UsageError: a pixel has no ground truth.
     """
     source = open_capture(folder, white_level=protocol.white_level)
-    trial = first_trial(source, name, protocol)
+    read, draws_file = read_draws_file(protocol)
+    trial = Trial(name, "", 0, draws_for(source, name, read, draws_file)[0], read, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)
     advance = on_progress or (lambda share: None)
     steps = 1 + len(estimators)
@@ -95,12 +98,8 @@ def file_stems(names: Sequence[str]) -> list[str]:
     """Return a different stem of a file name for each capture, also where names have slashes."""
     stems: list[str] = []
     for name in names:
-        plain = stem = name.replace("/", "_")
-        number = 2
-        while {stem, f"{stem}{MAPS}"} & {*stems, *(f"{taken}{MAPS}" for taken in stems)}:
-            stem = f"{plain}_{number}"
-            number += 1
-        stems.append(stem)
+        taken = {*stems, *(f"{stem}{MAPS}" for stem in stems)}
+        stems.append(free_name(name.replace("/", "_"), lambda stem: bool({stem, f"{stem}{MAPS}"} & taken), "_"))  # noqa: B023
     return stems
 
 

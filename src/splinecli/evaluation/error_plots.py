@@ -78,13 +78,8 @@ def _curves(
     """Return the panels side by side as PNG, with one curve for each method and series, and one legend for all.
 
     A curve has a band of one standard deviation to either side. Its colour and marker show the method, its dashes the
-    series. The legend names the series where there are several.
-
-    Args:
-        x: the place of an evaluation on a capture's x axis.
-        tick: the label at this place.
-        series: the name of the curves that the evaluation belongs to.
-        label: of the x axes.
+    series. `x` gives an evaluation's place on a capture's x axis, `tick` the label there, `series` the name of its
+    curves.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

@@ -128,13 +128,6 @@ def plan_capture(
     return CaptureJob(source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing)
 
 
-def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
-    """Return the first trial of a capture, without a method. Raises what evaluate_all raises."""
-    protocol, draws_file = read_draws_file(protocol)
-    draw = draws_for(source, name, protocol, draws_file)[0]
-    return Trial(name, "", 0, draw, protocol, "")
-
-
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     """Return the protocol with the numbers of lights and trials of its draws file, and its draws. Raises InputError."""
     if protocol.draws_file is None:

@@ -20,34 +20,26 @@ class Protocol:
     """Settings of an evaluation. Two methods are comparable only under the same protocol.
 
     Raises UsageError if a value is out of its range.
-
-    Args:
-        n_lights: in each draw. None means all lights of a capture. A draws file replaces it, and trials.
-        trials: the number of random draws. Without light noise, all lights need one trial only.
-        seed: of the draws, of the light noise and of the choice of pixels.
-        draws_file: file that gives the draws instead; see read_draws.
-        light_noise_deg: standard deviation of the angle by which each trial tilts the light directions.
-        max_pixels: number of pixels to score in each capture, chosen at random. None scores all pixels that have
-            ground truth.
-        skip_first: number of first images to leave out, by the name of the capture; EVERY_CAPTURE for all others.
-        as_stored: score the stored values alone, as the published tables do. By default, saturated observations are
-            restored and unknown light intensities are estimated, as `infer` does.
-        light_error_deg: usual error of light directions, with which each trial refines its directions (see
-            refine_capture). None refines none.
-        finds_lights: whether each trial finds its lights from its images, as `infer --lights estimate` does.
     """
 
+    # in each draw. None means all lights of a capture. A draws file replaces it, and trials.
     n_lights: int | None = None
-    trials: int = 1
-    seed: int = 0
-    draws_file: Path | None = None
-    light_noise_deg: float = 0.0
+    trials: int = 1  # the number of random draws. Without light noise, all lights need one trial only.
+    seed: int = 0  # of the draws, of the light noise and of the choice of pixels
+    draws_file: Path | None = None  # file that gives the draws instead; see read_draws
+    light_noise_deg: float = 0.0  # standard deviation of the angle by which each trial tilts the light directions
+    # number of pixels to score in each capture, chosen at random. None scores all pixels that have ground truth.
     max_pixels: int | None = None
+    # number of first images to leave out, by the name of the capture; EVERY_CAPTURE for all others
     skip_first: Mapping[str, int] = field(default_factory=dict)
+    # score the stored values alone, as the published tables do. By default, saturated observations are restored and
+    # unknown light intensities are estimated, as `infer` does.
     as_stored: bool = False
     white_level: float | None = None
+    # usual error of light directions, with which each trial refines its directions (see refine_capture). None refines
+    # none.
     light_error_deg: float | None = None
-    finds_lights: bool = False
+    finds_lights: bool = False  # whether each trial finds its lights from its images, as `infer --lights estimate` does
 
     def __post_init__(self) -> None:
         check_draw_settings(self.n_lights, self.trials, self.seed)

@@ -44,9 +44,8 @@ Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]) -> str:
     """Return the report of one evaluation, or of several that differ in the lights or the light noise.
 
-    Args:
-        figures: pairs of a caption, which is also the alternative text, and a PNG.
-        notes: sentences about the captures.
+    `figures` are pairs of a caption, which is also the alternative text, and a PNG; `notes` sentences about the
+    captures.
     """
     first = evaluations[0]
     return render(

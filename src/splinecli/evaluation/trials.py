@@ -76,14 +76,10 @@ _FIELDS = [field.name for field in fields(Score)]
 
 
 class TrialStore:
-    """Scores by trial, in memory and, where a path is given, in a file of JSON lines.
+    """Scores by trial, in memory and, where a path is given, in a file of JSON lines, which the first score creates.
 
-    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed. Raises
-    OutputError if the file cannot be read or written.
-
-    Args:
-        path: the file, which the first score creates; None keeps the scores in memory only.
-        fresh: whether to delete the scores of an earlier evaluation.
+    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed. `fresh`
+    deletes the scores of an earlier evaluation. Raises OutputError if the file cannot be read or written.
     """
 
     def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:

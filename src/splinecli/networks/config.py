@@ -16,37 +16,26 @@ _RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The layers of a SPLINE-Net or a CNN-PS.
+    """The layers of a SPLINE-Net or a CNN-PS."""
 
-    Attributes:
-        size: "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
-        map_size: cells along a side of the observation map.
-        grid: how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
-        fits: the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact
-            size only.
-        interpolates: whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
-        error_head: whether NE-Net also estimates its own error. Compact size only.
-        refines: whether a refinement net corrects the map of normals afterwards. Needs an error head.
-        width: channels of the compact size.
-        li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size.
-        head_width: hidden features of NE-Net's head in the compact size.
-        set_width: channels of the set branch, 0 for none. Compact size only.
-        set_layers: attention layers of the set branch.
-    """
-
+    # "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
     size: Literal["paper", "compact"] = "compact"
-    map_size: int = MAP_SIZE
-    width: int = 64
+    map_size: int = MAP_SIZE  # cells along a side of the observation map
+    width: int = 64  # channels of the compact size
+    # li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size
     li_blocks: int = 2
     ne_blocks: int = 3
-    head_width: int = 256
-    grid: Grid = "even"
+    head_width: int = 256  # hidden features of NE-Net's head in the compact size
+    grid: Grid = "even"  # how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
+    # the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact size
+    # only.
     fits: tuple[str, ...] = ()
+    # whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
     interpolates: bool = True
-    error_head: bool = False
-    refines: bool = False
-    set_width: int = 0
-    set_layers: int = 3
+    error_head: bool = False  # whether NE-Net also estimates its own error. Compact size only.
+    refines: bool = False  # whether a refinement net corrects the map of normals afterwards. Needs an error head.
+    set_width: int = 0  # channels of the set branch, 0 for none. Compact size only.
+    set_layers: int = 3  # attention layers of the set branch
 
     @property
     def is_canonical(self) -> bool:

@@ -45,14 +45,11 @@ _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
-    """Return the authors' network, float32, in evaluation mode.
+    """Return the authors' network, float32, in evaluation mode, from two files of state dictionaries.
 
-    Dropout is off in evaluation mode, while the authors' test code leaves it on. Raises ModelError if a file cannot be
-    read or is not a state dictionary, or a tensor is missing, unknown, of another shape or not finite.
-
-    Args:
-        li_net_file: state dictionary of their generator (G), which is LI-Net.
-        ne_net_file: state dictionary of their discriminator (D), which is NE-Net.
+    Their generator (G) is LI-Net, their discriminator (D) NE-Net. Dropout is off in evaluation mode, while the authors'
+    test code leaves it on. Raises ModelError if a file cannot be read or is not a state dictionary, or a tensor is
+    missing, unknown, of another shape or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates

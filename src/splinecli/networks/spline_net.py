@@ -98,9 +98,8 @@ class SplineNet(nn.Module):
     ) -> PixelMaps:
         """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
 
-        Args:
-            valid: (P, F) bool, all by default; the others are left out.
-            rotation: a further rotation of the lights, after that to the canonical azimuth.
+        Those that are not valid (P, F) are left out. The rotation of the lights comes after that to the canonical
+        azimuth.
         """
         scale = map_scale(observations, valid)
         observed = observations / scale

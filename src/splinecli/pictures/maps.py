@@ -24,11 +24,9 @@ _BACKGROUND, _INK = 255, 0
 
 
 def albedo_picture(albedo: NDArray[np.float32], mask: NDArray[np.bool_]) -> Picture:
-    """Return an albedo map as an sRGB picture (H, W, 3), scaled so that the brightest 1 % of the pixels are white.
+    """Return a linear albedo map (H, W, 3) as an sRGB picture, in which the brightest 1 % of the pixels are white.
 
-    Args:
-        albedo: (H, W, 3), linear.
-        mask: (H, W), not empty; the scale depends on these pixels alone.
+    The scale depends on the pixels of the mask (H, W) alone, which is not empty.
     """
     white = max(float(np.quantile(albedo[mask].max(axis=1), WHITE_QUANTILE)), 1e-12)
     return encode_srgb(albedo / white)

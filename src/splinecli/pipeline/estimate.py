@@ -39,11 +39,8 @@ def distil_for(
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
 
-    Raises UsageError if it is wanted, but the method gives no confidence, or the capture is too small.
-
-    Args:
-        capture: under near lamps, with the points of its surface.
-        wanted: whether to distil; None for the faster way.
+    A capture under near lamps has the points of its surface. `wanted` is None for the faster way. Raises UsageError if
+    it is wanted, but the method gives no confidence, or the capture is too small.
     """
     if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
         return None, []
@@ -109,16 +106,10 @@ def estimate_capture(
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
     """Return the normals of a capture, which then has all warnings, and the distilled estimator if there was one.
 
-    Args:
-        capture: with the warnings from reading it.
-        estimator: the method.
-        check: returns the warnings about the capture's lights and images; see diagnosis/checks.py.
-        refine_lights: returns the capture with refined lights.
-        distil: see distil_for.
-        strict: raise InputError where a warning says that an input is probably wrong.
-        observer: receives the progress.
-        progress: called with the number of pixels that were just estimated, in place of the observer.
-        clock: is told of the stages.
+    The capture has the warnings from reading it. `check` returns those about its lights and images
+    (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
+    is called with the number of pixels that were just estimated, in place of the observer. With `strict`, a warning
+    that an input is probably wrong is an InputError.
     """
     clock = clock or Clock()
     clock.begin("check")

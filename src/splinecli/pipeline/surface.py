@@ -81,11 +81,8 @@ def view_of_report(
 ) -> tuple[NDArray[np.float64] | None, float | None]:
     """Return camera matrix and pixel size in millimetres of the normal map that a report of `infer` describes.
 
-    Raises KeyError, TypeError, ValueError or UsageError if it is no report of this version of `infer`.
-
-    Args:
-        report: see report_of.
-        camera_matrix, pixel_size_mm: of the photographs, in place of those of the report.
+    `camera_matrix` and `pixel_size_mm` are those of the photographs, in place of those of the report. Raises KeyError,
+    TypeError, ValueError or UsageError if it is no report of this version of `infer`.
     """
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from splinecli.capture.stored import name_reading
 from splinecli.errors import InputError, OutputError
 from splinecli.pixel_sets.store import Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.system.files import free_name
 
 if TYPE_CHECKING:
     from splinecli.capture import Capture, CaptureSource
@@ -40,12 +40,6 @@ def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, 
 
         captures[free_name(capture_name(folder), is_taken)] = folder
     return captures
-
-
-def free_name(name: str, is_taken: Callable[[str], bool]) -> str:
-    """Return the name, or the name with the lowest number from 2 that is not taken."""
-    numbered = (f"{name}-{count}" for count in itertools.count(2))
-    return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
 
 
 def add_capture(

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from splinecli.errors import InputError, OutputError
-from splinecli.pixel_sets.captures import free_name
 from splinecli.pixel_sets.store import ARRAYS, Pixels
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.synthesis.meshes import read_mesh
 from splinecli.synthesis.principled import CLASSES
 from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
 from splinecli.system.extras import import_extra
-from splinecli.system.files import file_sha256, replacing
+from splinecli.system.files import file_sha256, free_name, replacing
 
 RENDERER = 3  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
 

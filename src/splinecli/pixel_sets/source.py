@@ -44,18 +44,11 @@ class SampledPixels:
 
 
 def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
-    """Interpolate the cells that lie between cells with a value.
+    """Interpolate the cells between cells with a value: these are `known` in the result, and all usable ones `filled`.
 
-    A cell without a value gets the weighted mean of its eight neighbours in each of FILL_ROUNDS rounds. A cell
-    whose neighbours all lie on one side of it stays empty.
-
-    Args:
-        values: (P, 1, w, w) observations.
-        known: (P, 1, w, w), 1 in cells with an observation, else 0.
-        inside: (w, w), 1 in the unit disc. Cells outside stay empty.
-
-    Returns:
-        The filled maps, with the given cells as `known` and all usable cells as `filled`.
+    A cell without a value gets the weighted mean of its eight neighbours in each of FILL_ROUNDS rounds. A cell whose
+    neighbours all lie on one side of it stays empty. Values and `known`, 1 in cells with an observation, else 0, are
+    (P, 1, w, w); `inside` (w, w) is 1 in the unit disc, outside of which cells stay empty.
     """
     near = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 0.0, 2.0], [1.0, 2.0, 1.0]])
     across = near * values.new_tensor([-1.0, 0.0, 1.0])

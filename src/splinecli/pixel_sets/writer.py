@@ -54,11 +54,7 @@ class PixelSetWriter:
         return self._entries[name].recipe
 
     def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
-        """Compare the recipe of an entry of the set with the one asked for.
-
-        Returns:
-            The first setting that differs and its two values, in words. None if the recipes are equal.
-        """
+        """Return the first setting in which the recipe of an entry differs from another and both values, or None."""
         asked, found = _plain(recipe), self._entries[name].recipe
         for key in [*asked, *found]:
             if asked.get(key) != found.get(key):

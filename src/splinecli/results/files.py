@@ -95,17 +95,11 @@ def write_estimate(
     clock: Clock,
     more: Iterable[tuple[str, Content]] = (),
 ) -> dict[str, Any]:
-    """Write the results of a capture into `folder` and return the finished report.
+    """Write the results of a capture into `folder` and return the report of report_of, finished.
 
-    The files replace those of an earlier run in the folder (see new_files). The caller holds the folder. Raises
-    OutputError if a file cannot be written.
-
-    Args:
-        report: what report_of returned.
-        formats: keys of NORMALS.
-        convention: whether green is y up or y down in pictures of normals.
-        clock: tells the seconds of all stages, of which writing is the last.
-        more: names and contents of further files of OWN_FILES.
+    The files replace those of an earlier run in the folder (see new_files), which the caller holds. The formats are
+    keys of NORMALS; `more` are names and contents of further files of OWN_FILES. Writing is the last stage of the
+    clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)

@@ -52,14 +52,9 @@ def report_of(
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
-    write_estimate adds `seconds`, `folder` and `files`.
-
-    Args:
-        options: the options of the run, ready for JSON.
-        inputs: a digest that changes when an input file changes.
-        light_file: the file that gave the lights; None where they were found from the images.
-        as_stored: whether the capture was read without any restoration.
-        distillation: what DistilledEstimator.report returns; None where the method estimated every pixel.
+    write_estimate adds `seconds`, `folder` and `files`. The options are ready for JSON. `inputs` is a digest that
+    changes when an input file changes. `light_file` is None where the lights were found from the images, and
+    `distillation`, what DistilledEstimator.report returns, where the method estimated every pixel.
     """
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5

@@ -29,12 +29,9 @@ def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> 
 def image_points(
     points: NDArray[np.floating], shape: tuple[int, ...], camera_matrix: NDArray[np.floating] | None
 ) -> Floats:
-    """Return the columns and rows (P, 2) at which a camera sees points (P, 3).
+    """Return the columns and rows (P, 2) at which a camera (3, 3), or an orthographic one for None, sees points (P, 3).
 
-    Args:
-        points: from the camera, or, without a camera matrix, in pixels from the centre of the image.
-        shape: height and width of the image.
-        camera_matrix: (3, 3), or None for an orthographic camera.
+    The points are from the camera, or for None in pixels from the centre of the image of `shape`, height and width.
     """
     if camera_matrix is None:
         return np.asarray(points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64)

@@ -22,26 +22,18 @@ class CaptureConfig:
     """How pixels are photographed, and the share of the pixels whose capture has each fault.
 
     A share of 0 switches a fault off.
-
-    Attributes:
-        min_lights, max_lights, usual_lights: see draw_light_counts.
-        light_direction_error_share: pixels with errors of the light directions.
-        light_intensity_error_share: pixels with errors of the light intensities.
-        unequal_lights_share: pixels whose lights differ in intensity, which is divided out.
-        saturated_share: pixels that are clipped. Half of them are restored as `infer` does.
-        sensor_noise: whether there are noise and quantisation.
-        eight_bit_share: pixels with 8 bits; the others have 10 to 16.
     """
 
+    # min_lights, max_lights, usual_lights: see draw_light_counts
     min_lights: int = 4
     max_lights: int = 96
     usual_lights: int = 10
-    light_direction_error_share: float = 0.5
-    light_intensity_error_share: float = 0.5
-    unequal_lights_share: float = 0.5
-    saturated_share: float = 0.1
-    sensor_noise: bool = True
-    eight_bit_share: float = 0.3
+    light_direction_error_share: float = 0.5  # pixels with errors of the light directions
+    light_intensity_error_share: float = 0.5  # pixels with errors of the light intensities
+    unequal_lights_share: float = 0.5  # pixels whose lights differ in intensity, which is divided out
+    saturated_share: float = 0.1  # pixels that are clipped. Half of them are restored as `infer` does.
+    sensor_noise: bool = True  # whether there are noise and quantisation
+    eight_bit_share: float = 0.3  # pixels with 8 bits; the others have 10 to 16
 
 
 class DenseMap(NamedTuple):

@@ -102,9 +102,7 @@ def render_indirect(
 ) -> dict[str, Tensor]:
     """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times before.
 
-    Args:
-        patch_of_face: (T,), row of the materials of each face.
-        directions: number of paths per pixel.
+    `patch_of_face` (T,) is the row of the materials of each face, `directions` the number of paths per pixel.
     """
     pixels = len(visible.normals)
     soft = {name: soften(material) for name, material in materials.items()}

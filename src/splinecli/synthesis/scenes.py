@@ -53,14 +53,11 @@ class RenderedScene:
 
 
 def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None) -> Scene:
-    """Draw scene number `index` of the set with this seed.
+    """Draw scene number `index` of the set with this seed, of a given mesh or, for None, of a random shape.
 
     The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %. In half of the
     scenes the patches differ in their base alone, as on a painted or printed object of one gloss. Raises UsageError if
     the extra `render` is not installed.
-
-    Args:
-        mesh: the shape. None draws one at random.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)

@@ -47,7 +47,6 @@ def photograph_scene(
         radiance: (P, F).
         directions: (F, 3), unit.
     """
-
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
@@ -92,7 +91,6 @@ def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.
     Returns:
         The maps have zero for normals that are not known: in darkness, and where the light is uneven.
     """
-
     uniform = partial(draw_number, generator)
     sides = [int(uniform(0, _MARGIN + 1)) for _ in range(4)]
     maps, mask = pad(maps * mask, sides), pad(mask, sides)

@@ -11,7 +11,7 @@ from splinecli.pictures.observation_maps import observation_map_figure
 from splinecli.pictures.plotting import png_bytes
 from splinecli.pictures.training_curves import training_figure
 from splinecli.system.extras import import_extra
-from splinecli.system.files import refusals_as_output_errors, write_bytes, write_text
+from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.publishing import refuse_link
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.tasks import SampleMaps
@@ -22,30 +22,20 @@ class Metrics:
     """One line of metrics.csv: means over the steps since the previous line.
 
     A value that was not computed is None.
-
-    Attributes:
-        step: number of updates so far.
-        pixels: number of training pixels drawn so far.
-        minutes: training time so far.
-        learning_rate: the rate of the last update.
-        loss: the weighted sum of all terms. Where LI-Net and NE-Net are updated in turn, the sum of both losses.
-        angle_deg: mean angular error of the training pixels, in degrees.
-        map_error: mean absolute error of LI-Net's dense map. None without a LI-Net.
-        masked_map_error: the same over the cells of the sparse map.
-        symmetric, asymmetric: Ls and La, unweighted. None where their weights are 0.
-        validation_deg: mean angular error of the validation pixels, in degrees. None between checkpoints.
     """
 
-    step: int
-    pixels: int
-    minutes: float
-    learning_rate: float
-    loss: float
-    angle_deg: float
-    map_error: float | None
-    masked_map_error: float | None
+    step: int  # number of updates so far
+    pixels: int  # number of training pixels drawn so far
+    minutes: float  # training time so far
+    learning_rate: float  # the rate of the last update
+    loss: float  # the weighted sum of all terms. Where LI-Net and NE-Net are updated in turn, the sum of both losses.
+    angle_deg: float  # mean angular error of the training pixels, in degrees
+    map_error: float | None  # mean absolute error of LI-Net's dense map. None without a LI-Net.
+    masked_map_error: float | None  # the same over the cells of the sparse map
+    # symmetric, asymmetric: Ls and La, unweighted. None where their weights are 0.
     symmetric: float | None = None
     asymmetric: float | None = None
+    # mean angular error of the validation pixels, in degrees. None between checkpoints.
     validation_deg: float | None = None
 
 
@@ -122,11 +112,8 @@ def _drop_lines_after(step: int, path: Path) -> Path | None:
     try:
         kept = _lines_until(step, path)
     except ValueError:
-        aside = path.with_suffix(".damaged.csv")
-        number = 1
-        while aside.exists():
-            number += 1
-            aside = path.with_suffix(f".damaged-{number}.csv")
+        ending = free_name(".damaged", lambda name: path.with_suffix(f"{name}.csv").exists())
+        aside = path.with_suffix(f"{ending}.csv")
         with refusals_as_output_errors(aside):
             path.replace(aside)
         return aside

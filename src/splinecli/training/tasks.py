@@ -39,12 +39,7 @@ class SampleMaps(NamedTuple):
 
 
 class PixelTask:
-    """Batches of pixels from the sources of a run.
-
-    Attributes:
-        source: draws training pixels.
-        validation: batches of validation pixels.
-    """
+    """Batches of pixels from the sources of a run: its `source` for training, and those for `validation`."""
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
         self.config = config
@@ -66,8 +61,7 @@ class PixelTask:
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
 
-        Returns:
-            Each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
+        Returns each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
         """
         config = self.config
         canonical = config.network.is_canonical
