@@ -46,17 +46,13 @@ def capture_figures(
     """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
 
     Under near lamps, there is none of pixels. All pixels in the mask are estimated, also where the protocol has
-    max_pixels.
+    max_pixels. Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
 
     Args:
         name: name of the capture in the tables.
         stem: stem of the figures' file names.
         pixels: (row, column) of the pixels whose observation maps are shown; by default those at SHOWN_PERCENTILES.
         on_progress: called with the share of the work that was just done.
-
-    Raises:
-        InputError: the capture cannot be read or scored.
-        UsageError: a pixel has no ground truth.
     """
     source = open_capture(folder, white_level=protocol.white_level)
     read, draws_file = read_draws_file(protocol)

@@ -81,11 +81,8 @@ class ScenePlan:
     def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
         """Render a scene; return its shape in words, and the pixels by class of material.
 
-        `progress` is called with the finished share, 0 to 1.
-
-        Raises:
-            InputError: the mesh cannot be used, or the camera sees nothing.
-            UsageError: the packages of the extra `render` are not installed.
+        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or the
+        camera sees nothing; UsageError if the packages of the extra `render` are not installed.
         """
         mesh_file = self.meshes[position] if position < len(self.meshes) else None
         mesh = None if mesh_file is None else read_mesh(mesh_file)

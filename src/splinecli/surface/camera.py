@@ -17,9 +17,7 @@ _LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of int
 def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> Floats:
     """Return the points (P, 3) at depth 1, z = -1, that a camera at the origin sees in the pixels of a mask (H, W).
 
-    Raises:
-        UsageError: the camera matrix is not 3 x 3.
-        InputError: the numbers are not those of a camera matrix.
+    Raises UsageError if the camera matrix is not 3 x 3, or InputError if the numbers are not those of a camera matrix.
     """
     rows, columns = np.nonzero(mask)
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)

@@ -72,9 +72,7 @@ def read_mesh(path: str | Path) -> Mesh:
 def _read_known(path: Path) -> tuple[str, bytes]:
     """Return the format of a mesh file, by its content, and its content.
 
-    Raises:
-        InputError: it is of another format or too long.
-        OSError: it cannot be read.
+    Raises InputError if it is of another format or too long, or OSError if it cannot be read.
     """
     with path.open("rb") as file:
         content = file.read(max(_LONGEST.values()) + 1)

@@ -34,15 +34,12 @@ UNDONE = "an interrupted run left unfinished files, which are removed"
 def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False) -> Iterator[None]:
     """Make a folder, lock it, and remove the unfinished files that a killed process left directly in it.
 
-    A folder that was made here and is empty at the end is removed, as are its parents.
+    A folder that was made here and is empty at the end is removed, as are its parents. Raises BusyError if another
+    process has locked the folder, or OutputError if the folder cannot be made or written.
 
     Args:
         warn: receives a sentence about what a killed process had left.
         wait: wait for another process that has locked the folder, instead of raising BusyError.
-
-    Raises:
-        BusyError: another process has locked the folder.
-        OutputError: the folder cannot be made or written.
     """
     check_writable(folder)
     with ExitStack() as stack:

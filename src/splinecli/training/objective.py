@@ -177,7 +177,7 @@ def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -
 
 
 def mirror(maps: Tensor, normals: Tensor) -> Tensor:
-    """Return r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and the projected normal (P, 3), unit.
+    """Return r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and projected unit normals (P, 3).
 
     The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells are interpolated,
     so that the result has a gradient with respect to the normal as well as the map. A normal towards the camera has no

@@ -19,10 +19,7 @@ from splinecli.training.tasks import SampleMaps
 
 @dataclass(frozen=True)
 class Metrics:
-    """One line of metrics.csv: means over the steps since the previous line.
-
-    A value that was not computed is None.
-    """
+    """One line of metrics.csv: means over the steps since the previous line. A value that was not computed is None."""
 
     step: int  # number of updates so far
     pixels: int  # number of training pixels drawn so far
