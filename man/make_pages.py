@@ -11,8 +11,8 @@ from typing import Any
 import typer
 
 from splinecli import __version__
-from splinecli.cli.app import app
 from splinecli.cli.commands import help_panels
+from splinecli.cli.main import app
 
 EXIT_STATUS = {
     "0": "Done.",

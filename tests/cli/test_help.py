@@ -10,7 +10,7 @@ import pytest
 import typer
 from make_pages import EXAMPLES, FILES, man_pages
 
-from splinecli.cli.app import app
+from splinecli.cli.main import app
 from splinecli.results.files import OWN_FILES
 from splinecli.results.index import INDEX
 

@@ -48,7 +48,7 @@ def prepare(
     """
     from splinecli.pipeline.batch import worst_exit_code
     from splinecli.pipeline.prepare import prepare_pixel_set
-    from splinecli.pixel_sets.rendered import ScenePlan
+    from splinecli.pixel_sets.entries import ScenePlan
     from splinecli.synthesis.scenes import SceneConfig
 
     config = SceneConfig()

@@ -84,7 +84,7 @@ def train(
         raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
 
     from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
-    from splinecli.training.run import configure_run, open_run
+    from splinecli.training.loop import configure_run, open_run
 
     changes: list[Settings] = []  # in the order of their precedence
     if sets or generator_weight is not None:

@@ -43,11 +43,6 @@ OnProgress = Callable[[float, str], object]
 """Called with the share of all trials that was just done, and a short text. A trial counts by its pixels."""
 
 
-def evaluate(captures: Sequence[Path], estimators: Sequence[Estimator], protocol: Protocol) -> Evaluation:
-    """Score every estimator on every capture under one protocol; see evaluate_all."""
-    return evaluate_all(captures, estimators, [protocol])[0]
-
-
 def evaluate_all(
     captures: Sequence[Path],
     estimators: Sequence[Estimator],

@@ -72,9 +72,6 @@ class Score:
     found_light_error_deg: float | None = None
 
 
-_FIELDS = [field.name for field in fields(Score)]
-
-
 class TrialStore:
     """Scores by trial, in memory and, where a path is given, in a file of JSON lines, which the first score creates.
 
@@ -119,7 +116,7 @@ def _read_line(line: str) -> tuple[str, Score] | None:
     """Return the key and the score of a trial."""
     try:
         record = parse_json(line)
-        key, score = record["key"], Score(**{name: record.get(name) for name in _FIELDS})
+        key, score = record["key"], Score(**{field.name: record.get(field.name) for field in fields(Score)})
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
     usable = isinstance(key, str) and isinstance(score.mae_deg, float) and isinstance(score.seconds, float)

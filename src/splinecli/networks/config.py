@@ -54,7 +54,9 @@ class NetworkConfig:
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
         values = dict(values)
-        fits = _fits(values.pop("fits", ()))
+        fits = values.pop("fits", ())
+        if not isinstance(fits, list | tuple) or not all(isinstance(fit, str) and fit in STARTING_FITS for fit in fits):
+            raise ModelError(f"network setting 'fits' is {fits!r}; expected a list of {', '.join(STARTING_FITS)}")
         for name, value in values.items():
             choices = (True, False) if known[name] is bool else get_args(known[name])
             if choices:
@@ -67,7 +69,7 @@ class NetworkConfig:
                 raise ModelError(
                     f"network setting {name!r} is {value!r}; expected a whole number from {least} to {most}"
                 )
-        config = cls(**values, fits=fits)
+        config = cls(**values, fits=tuple(fits))
         # Both sizes halve the map twice. An instance norm needs more than one cell after that.
         if config.map_size % 4 or not 8 <= config.map_size <= 128:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
@@ -83,12 +85,3 @@ class NetworkConfig:
         if config.grid != "even" and config.size != "paper":
             raise ModelError(f"network grid is {config.grid!r}; it needs the size 'paper'")
         return config
-
-
-def _fits(names: Any) -> tuple[str, ...]:
-    known = ", ".join(STARTING_FITS)
-    if not isinstance(names, list | tuple) or not all(
-        isinstance(name, str) and name in STARTING_FITS for name in names
-    ):
-        raise ModelError(f"network setting 'fits' is {names!r}; expected a list of {known}")
-    return tuple(names)

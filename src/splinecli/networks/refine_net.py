@@ -62,8 +62,9 @@ class RefineNet(nn.Module):
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
         border = (0, -width % COARSEST, 0, -height % COARSEST)
-        layers = _type_of_layers(features)
-        # In training, the sums over the blocks stay in float32.
+        # The number format of the layers. In training, the sums over the blocks stay in float32.
+        device = features.device.type
+        layers = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else features.dtype
         stream = features.dtype if torch.is_grad_enabled() else layers
         masks = [pad(mask, border).to(layers)]
         for _ in self.down:
@@ -96,12 +97,6 @@ class RefineNet(nn.Module):
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
             corrected = corrected + weight * difference
         return unit_maps(corrected) * mask, (error + change[:, 3:5]) * mask
-
-
-def _type_of_layers(maps: Tensor) -> torch.dtype:
-    """Return the number format in which layers compute on these maps."""
-    device = maps.device.type
-    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps.dtype
 
 
 def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype) -> Tensor:

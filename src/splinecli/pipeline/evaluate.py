@@ -256,27 +256,21 @@ def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
 
 
 def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
-    return _scorer(command, fingerprints, options).score(draw)
+    return _Scorer(command, fingerprints, options).score(draw)
 
 
 @lru_cache(maxsize=1)
-def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
-    """Return the scorer of the command that this worker serves: files may change until the next command."""
-    estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
-    for name, expected in fingerprints:
-        if (found := estimators[name].fingerprint) != expected:
-            raise ModelError(
-                f"{name} is {found} here, expected {expected} as on the machine of the command",
-                hint="Use the same weight file everywhere, and the same --precision",
-            )
-    return _Scorer(estimators)
-
-
 class _Scorer:
-    """Scores draws, and keeps the last capture in memory."""
+    """Scores draws of the command that this worker serves: files may change until the next. Keeps the last capture."""
 
-    def __init__(self, estimators: dict[str, Estimator]) -> None:
-        self._estimators = estimators
+    def __init__(self, _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
+        self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
+        for name, expected in fingerprints:
+            if (found := self._estimators[name].fingerprint) != expected:
+                raise ModelError(
+                    f"{name} is {found} here, expected {expected} as on the machine of the command",
+                    hint="Use the same weight file everywhere, and the same --precision",
+                )
         self._last: tuple[CaptureReading, TrialSource, Notes] | None = None
 
     def score(self, task: DrawTask) -> Scored:

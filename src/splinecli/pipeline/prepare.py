@@ -13,8 +13,14 @@ from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import SILENT, Advance, Observer
-from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
-from splinecli.pixel_sets.rendered import ScenePlan, load_rendered, save_rendered
+from splinecli.pixel_sets.entries import (
+    CaptureChangedError,
+    ScenePlan,
+    add_capture,
+    load_rendered,
+    name_captures,
+    save_rendered,
+)
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
 from splinecli.pixel_sets.writer import PixelSetWriter
 from splinecli.system.files import UNFINISHED, as_input_error, check_writable, write_bytes

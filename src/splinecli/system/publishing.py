@@ -60,12 +60,12 @@ class NewFiles:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._hidden: dict[str, Path] = {}
+        self.hidden: dict[str, Path] = {}
 
     @property
     def sizes(self) -> dict[str, int]:
         """The bytes of each complete file by its name."""
-        return {name: path.stat().st_size for name, path in sorted(self._hidden.items())}
+        return {name: path.stat().st_size for name, path in sorted(self.hidden.items())}
 
     @contextmanager
     def open(self, name: str) -> Iterator[IO[bytes]]:
@@ -73,9 +73,9 @@ class NewFiles:
         _check_place(self._folder / name, self._folder)
         with refusals_as_output_errors(self._folder / name):
             with create_hidden(self._folder) as file:
-                self._hidden[name] = Path(file.name)
+                self.hidden[name] = Path(file.name)
                 yield file
-            sync(self._hidden[name])
+            sync(self.hidden[name])
 
     def write(self, name: str, content: Content) -> None:
         """Write a new file. An array becomes NPY, text UTF-8 with escapes for what is not valid. Raises OutputError."""
@@ -90,22 +90,17 @@ class NewFiles:
         if report is not None:
             _remove(self._folder / report, self._folder)
             sync(self._folder)
-        for name in (*self._hidden, *stale):
+        for name in (*self.hidden, *stale):
             _remove(self._folder / name, self._folder)
-        for name in sorted(self._hidden, key=lambda name: name == report):
+        for name in sorted(self.hidden, key=lambda name: name == report):
             place = self._folder / name
             if name == report:
                 sync(self._folder)
             place.parent.mkdir(exist_ok=True)
-            self._hidden[name].replace(place)
+            self.hidden[name].replace(place)
             if place.parent != self._folder:
                 sync(place.parent)
         sync(self._folder)
-
-    def discard(self) -> None:
-        """Remove the files that are not in their places."""
-        for path in self._hidden.values():
-            path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -126,7 +121,8 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
         with refusals_as_output_errors(folder):
             new.publish(report, stale)
     finally:
-        new.discard()
+        for path in new.hidden.values():
+            path.unlink(missing_ok=True)
 
 
 def refuse_link(folder: Path) -> None:
