@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.values import (
+from splinecli.cli.shared import (
     Device,
     Precision,
     listed,

@@ -14,7 +14,7 @@ from typing import Any
 import typer
 
 from splinecli.capture.record import MIN_LIGHTS
-from splinecli.cli.values import listed
+from splinecli.cli.shared import listed
 from splinecli.errors import OutputError, SplinecliError
 from splinecli.system.memory import is_out_of_memory
 

@@ -14,7 +14,7 @@ from splinecli.capture.formats.text import is_number
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.failures import printed_documents
-from splinecli.cli.values import (
+from splinecli.cli.shared import (
     Device,
     FirstLight,
     LightForm,

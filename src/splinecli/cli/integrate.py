@@ -6,7 +6,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.values import NormalConvention, complete_list, record_from, split_commas
+from splinecli.cli.shared import NormalConvention, complete_list, record_from, split_commas
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 
 

@@ -8,7 +8,7 @@ from typer import Argument, Option
 from splinecli.capture import find_captures
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.values import parse_cluster
+from splinecli.cli.shared import parse_cluster
 
 
 def prepare(

@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.values import Device, complete_weights
+from splinecli.cli.shared import Device, complete_weights
 from splinecli.errors import UsageError, printable
 from splinecli.training import defaults
 

@@ -50,13 +50,11 @@ class RefineNet(nn.Module):
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
-        """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside the mask.
+        """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H, W) of 1 and 0.
 
-        Args:
-            features: (B, CHANNELS, H, W), see refine_features; zero outside the mask.
-            mask: (B, 1, H, W), 1 inside, else 0.
-            inner: the part of the map that is wanted, whose bounds are multiples of COARSEST or the end; None for all.
-                The decoder leaves the rest out.
+        The features (B, CHANNELS, H, W) of refine_features are zero outside the mask, too. `inner` is the part of the
+        map that is wanted, whose bounds are multiples of COARSEST or the end; None for all. The decoder leaves the rest
+        out.
         """
         height, width = mask.shape[-2:]
         rows, columns = (slice(None), slice(None)) if inner is None else inner

@@ -34,11 +34,9 @@ class SetBranch(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return the pixels' tokens (P, width) and the unit normals (P, 3) of least squares.
 
-        Args:
-            observed, residual: (P, F), each pixel scaled to a largest observation of 1.
-            lights: (P, F, 3), unit, in the pixels' frames.
-            valid: (P, F) bool; None for all.
-            normals: (P, K, 3), the starting normals, unit or zero.
+        The observed values and residuals (P, F) of each pixel are scaled to a largest observation of 1. The lights (P,
+        F, 3) are unit, in the pixels' frames, `valid` (P, F) is None for all, and the starting normals (P, K, 3) are
+        unit or zero.
         """
         half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + DARKEST).log()

@@ -179,11 +179,8 @@ class SplineNet(nn.Module):
     ) -> Estimate:
         """Return normals in the capture's frame, and their errors.
 
-        Args:
-            observations: (P, F), linear, divided by the light intensities; any scale.
-            light_directions: (F, 3) or (P, F, 3), unit; x right, y up, z to the camera.
-            valid: (P, F) bool, all by default; the others are left out.
-            rotation: see build_maps.
+        The observations (P, F) are linear, divided by the light intensities, of any scale. The light directions are
+        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. See build_maps for the others.
         """
         # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):

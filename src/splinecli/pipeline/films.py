@@ -12,8 +12,7 @@ from splinecli.pictures.png import encode_png
 from splinecli.pipeline.infer_options import Reading
 from splinecli.pipeline.observer import Observer
 from splinecli.system.files import read_json
-from splinecli.system.locks import RefusedFolderError
-from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
+from splinecli.system.publishing import RefusedFolderError, held_folder, is_plain, new_files, refuse_link
 
 FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film
 _RECORD = "film.json"

@@ -24,9 +24,8 @@ from splinecli.pipeline.observer import Observer
 from splinecli.results.files import MAPS, NORMALS, OWN_FILES, REPORT, UnfinishedError, read_report
 from splinecli.results.index import Entry
 from splinecli.system.files import as_input_error
-from splinecli.system.locks import RefusedFolderError
 from splinecli.system.memory import is_out_of_memory
-from splinecli.system.publishing import is_plain
+from splinecli.system.publishing import RefusedFolderError, is_plain
 
 _SHARD = re.compile(r"([0-9]{1,18})/([0-9]{1,18})")
 

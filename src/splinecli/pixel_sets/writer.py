@@ -11,8 +11,7 @@ from splinecli import __version__
 from splinecli.errors import OutputError
 from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, Entry, Pixels, PixelSet, parse_entries, read_manifest
 from splinecli.system.files import check_writable, file_sha256, write_text
-from splinecli.system.locks import LOCK
-from splinecli.system.publishing import new_files
+from splinecli.system.publishing import LOCK, new_files
 
 
 class PixelSetWriter:

@@ -149,14 +149,11 @@ class LaplacianSolver:
         pull: Floats | float = 0.0,
         distance: Floats | float = 0.0,
     ) -> Floats:
-        """Return the change of heights (P,) that minimises the sum of squares.
+        """Return the change of heights (P,) that minimises the sum of squares, to a relative residual of `precision`.
 
-        Args:
-            weights: (E,) half the second derivative by the gap of each pair.
-            flows: (E,) half the first derivative by the gap of each pair.
-            precision: the relative residual at which the solver stops.
-            pull: (P,) half the second derivative by the height of each pixel, of what pulls it to a known height.
-            distance: (P,) of the heights above these known ones.
+        Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is
+        half the second derivative by the height of each pixel, of what pulls it to a known height, and `distance` (P,)
+        that of the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
         from scipy.sparse.linalg import cg

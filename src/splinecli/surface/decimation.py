@@ -193,15 +193,12 @@ def _covered_pixels(
 
 
 def _barycentric_forms(corners: Floats) -> Floats:
-    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates.
-
-    They are not finite for triangles that cover nothing.
-    """
+    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
     area = np.einsum("tcx,tcx->tc", normal, corners - following)
-    area[np.abs(area) < _FLATTEST] = np.nan
+    area[np.abs(area) < _FLATTEST] = np.nan  # a triangle that covers nothing
     normal = normal / area[..., None]
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 

@@ -100,14 +100,6 @@ def _encode_ply(surface: Surface) -> bytes:
     return ply.replace(b" 1.0\n", f" 1.0\ncomment unit: {surface.unit}\n".encode(), 1)
 
 
-def _encode_stl(surface: Surface) -> bytes:
-    """Encode binary STL, which has positions alone."""
-    import trimesh
-
-    stl: bytes = trimesh.exchange.stl.export_stl(_trimesh(surface.mesh))
-    return stl
-
-
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
     """Encode OBJ with normals, texture coordinates and, with colours, a texture. A comment has the unit's name."""
     import trimesh
@@ -166,7 +158,7 @@ def _encode_png(surface: Surface) -> bytes:
 _ENCODERS: dict[str, Callable[[Surface], Content]] = {
     "glb": _encode_glb,
     "ply": _encode_ply,
-    "stl": _encode_stl,
+    "stl": lambda surface: _trimesh(surface.mesh).export(file_type="stl"),  # binary, with positions alone
     "npy": lambda surface: surface.depth.astype("f4"),
     "tiff": lambda surface: encode_tiff(surface.depth.astype("f4"), f"unit: {surface.unit}"),
     "png": _encode_png,

@@ -50,15 +50,12 @@ class PixelTruth(Protocol):
     @property
     def normals(self) -> Tensor:
         """Unit normals (P, 3)."""
-        ...
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Self:
         """Turn each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
-        ...
 
     def dense_truth(self, size: int) -> DenseMap:
         """Return the complete maps at the scale of the radiance."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,8 @@ class PrincipledMaterial:
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
         """Return pi times the reflected radiance, the BRDF times max(n.l, 0), under unit light (P, D).
 
-        Args:
-            n_dot_l: (P, D) cosines of normal and light. They are negative in attached shadow, where radiance is zero.
-            n_dot_v: (P, 1) cosines of normal and viewing direction, positive.
-            l_dot_v: (D) or (P, D) cosines of light and viewing direction.
+        The cosines of normal and light (P, D) are negative in attached shadow, where radiance is zero. Those of normal
+        and viewing direction (P, 1) are positive; those of light and viewing direction are (D) or (P, D).
         """
         lit = n_dot_l.clamp(min=0)
         # Light from behind the surface has no half vector. Rounding would make it NaN.

@@ -72,16 +72,12 @@ def render_direct(
 
 @dataclass(frozen=True)
 class _Vertices:
-    """N vertices of paths.
+    """N vertices of paths."""
 
-    hits: the surface points. back: unit directions (N, 3) to the previous vertex. pixel, patches: (N,), the pixel of
-    the path and the patch of the surface.
-    """
-
-    hits: Hits
-    back: Tensor
-    pixel: Tensor
-    patches: Tensor
+    hits: Hits  # the surface points
+    back: Tensor  # (N, 3), unit directions to the previous vertex
+    pixel: Tensor  # (N,), the pixel of the path
+    patches: Tensor  # (N,), the patch of the surface
 
     def take(self, rows: Tensor) -> _Vertices:
         kept = rows.numpy()
@@ -225,12 +221,9 @@ LOBES = (0.0, 0.1, 0.0, 0.35)
 def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
     """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the horizon.
 
-    Args:
-        normals: (N, 3), unit normals of the surfaces.
-        back: (N, 3), unit directions to the previous vertices of the paths.
-        first: (N,) int64, index of the direction among those of its pixel. It determines the lobe and the point of the
-            R2 sequence (Roberts 2018), which covers the lobe evenly.
-        shift: (N, 2), offset of the pixel in the sequence.
+    The normals of the surfaces and the directions `back` to the previous vertices of the paths are (N, 3), unit.
+    `first` (N,) int64, the index of the direction among those of its pixel, determines the lobe and the point of the R2
+    sequence (Roberts 2018), which covers the lobe evenly. `shift` (N, 2) is the offset of the pixel in the sequence.
     """
     ordinal = torch.div(first, len(LOBES), rounding_mode="floor")
     u = (shift[:, 0] + ordinal * 0.7548776662466927) % 1.0

@@ -91,13 +91,9 @@ def configure(
 ) -> TrainingConfig:
     """Return a preset, changed by the settings of a file and then by `changes`, in their order.
 
-    A table of sources is replaced as a whole. Other tables are merged key by key. Raises UsageError if there is no such
-    preset, or ModelError if a setting is unknown or its value is not allowed. The message names the file it is in.
-
-    Args:
-        preset_name: None takes the file's entry "preset", or else `base`.
-        file: see read_config_file.
-        base: None for DEFAULT_PRESET.
+    A table of sources is replaced as a whole. Other tables are merged key by key. Without a name of a preset, the
+    file's entry "preset" counts, or else `base`, which is DEFAULT_PRESET for None. Raises UsageError if there is no
+    such preset, or ModelError if a setting is unknown or its value is not allowed. The message names the file it is in.
     """
     settings = read_config_file(file) if file else {}
     named = settings.pop("preset", DEFAULT_PRESET if base is None else None)
