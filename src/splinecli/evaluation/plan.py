@@ -139,9 +139,8 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
 def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
     """Return the draws of a capture, one for each trial.
 
-    Raises:
-        InputError: the capture has no ground truth, or a draw of the file does not fit it.
-        UsageError: it has too few lights, or near lamps that are to be refined.
+    Raises InputError if the capture has no ground truth, or a draw of the file does not fit it, or UsageError if it has
+    too few lights, or near lamps that are to be refined.
     """
     if source.files.ground_truth is None:  # known before the images are read
         raise InputError(

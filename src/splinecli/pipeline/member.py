@@ -136,11 +136,8 @@ def run_member(
 ) -> Outcome:
     """Compute one capture of a batch, unless its results are up to date or are to be kept.
 
-    `method` returns the estimator; it is called if the capture is computed.
-
-    Raises:
-        UsageError, ModelError: what `method` raises. It is wrong for every capture.
-        OutputError: the output folder cannot be written, or the disk is full.
+    `method` returns the estimator; it is called if the capture is computed. Raises UsageError or ModelError as it does:
+    they are wrong for every capture. Raises OutputError if the output folder cannot be written, or the disk is full.
     """
     if member.missing is not None:
         return failed(member.name, member.missing, status="missing")

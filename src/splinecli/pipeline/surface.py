@@ -35,16 +35,10 @@ def make_surface(
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and what the reports say of it.
 
-    Raises InputError or UsageError as integrate_normals, surface_mesh and decimated_mesh do.
-
-    Args:
-        normal_map, mask, camera_matrix, stiffness, prior_detail, progress: see integrate_normals.
-        colours, largest_step: see surface_mesh.
-        n_triangles: see decimated_mesh. None keeps all triangles.
-        pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a surface in pixels,
-            or, with a camera matrix, in mean depths.
-        prior: see integrate_normals; in the unit of the surface. With a camera matrix this is the millimetre, so that
-            pixel_size_mm is not needed.
+    Arguments and errors are those of integrate_normals, surface_mesh and decimated_mesh. Without `n_triangles`, the
+    mesh keeps all. `pixel_size_mm` is the width of a pixel on the object, for a surface in millimetres; None for one in
+    pixels, or, with a camera matrix, in mean depths. The prior is in the unit of the surface. With a camera matrix this
+    is the millimetre, so that pixel_size_mm is not needed.
     """
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm

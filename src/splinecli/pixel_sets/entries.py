@@ -165,9 +165,8 @@ class ScenePlan:
     def check_inputs(self) -> None:
         """Check what rendering needs, before anything is rendered.
 
-        Raises:
-            InputError: a mesh cannot be used.
-            UsageError: there are scenes and the packages of the extra `render` are not installed.
+        Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the packages of the extra
+        `render` are not installed.
         """
         if self.names:
             for package in ("embreex.rtcore_scene", "skimage.measure"):

@@ -43,14 +43,10 @@ class BusyError(RefusedFolderError):
 
 @contextmanager
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Make a folder and lock it.
+    """Make a folder and lock it; `wait` for another process that has locked it, instead of raising BusyError.
 
-    `wait` waits for another process that has locked the folder, instead of raising BusyError.
-
-    Raises:
-        BusyError: another process has locked the folder.
-        RefusedFolderError: another user left a lock file, which this process may not open.
-        OSError: the folder cannot be made or written.
+    Raises RefusedFolderError if another user left a lock file that this process may not open, or OSError if the folder
+    cannot be made or written.
     """
     file = _locked_file(folder, wait=wait)
     try:

@@ -248,18 +248,13 @@ def open_run(
     tensorboard: bool,
     warn: Callable[[str], object],
 ) -> Iterator[Trainer]:
-    """Join the other processes, lock the folder and yield the trainer.
+    """Join the other processes, lock the folder and yield the trainer of a run that `configure_run` has configured.
 
-    Args:
-        config: from `configure_run`.
-        device_name: "auto", "cpu" or "cuda".
-        warn: receives a sentence about what a killed process had left in the folder.
+    `warn` receives a sentence about what a killed process had left in the folder.
 
-    Raises:
-        UsageError: the processes cannot share a batch, the device is not available, or TensorBoard is not installed.
-        ModelError: the checkpoint does not fit, or weights to start from cannot be used.
-        InputError: a pixel set cannot be used.
-        OutputError: the folder cannot be written, or has a run in it and `resume` is not set.
+    Raises UsageError if the processes cannot share a batch, the device is not available, or TensorBoard is not
+    installed; ModelError if the checkpoint does not fit, or weights to start from cannot be used; InputError if a pixel
+    set cannot be used; OutputError if the folder cannot be written, or has a run in it and `resume` is not set.
     """
     check_writable(folder)
     use_available_cores()
