@@ -24,9 +24,8 @@ from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.light_intensities import estimate_light_intensities
 from splinecli.diagnosis.checks import check_arrays, check_capture
 from splinecli.maths.transfer import encode_srgb
-from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import SceneConfig, draw_scene
 

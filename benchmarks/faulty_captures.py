@@ -27,10 +27,9 @@ from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
 from splinecli.refinement.refiner import NetworkRefiner
 from splinecli.synthesis.batches import CaptureConfig
-from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import draw_material, with_one_gloss
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.scenes import draw_patches
 from splinecli.synthesis.shapes import draw_rotation, draw_shape, turn

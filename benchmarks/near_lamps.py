@@ -22,10 +22,9 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.inference import NormalEstimate, estimate_normals
 from splinecli.methods import make_estimator
 from splinecli.surface.integration import integrate_normals
-from splinecli.synthesis.camera import VisibleSurface, find_visible_surface
 from splinecli.synthesis.meshes import Mesh
 from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, VisibleSurface, find_visible_surface
 from splinecli.synthesis.rendering import render_direct
 
 # Angles of the ten lamps from the viewing direction and azimuths in degrees, as placed by hand.

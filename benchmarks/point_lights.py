@@ -5,9 +5,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.synthesis.camera import VisibleSurface
 from splinecli.synthesis.meshes import Floats
-from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, Tracer
+from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, Tracer, VisibleSurface
 from splinecli.synthesis.rendering import Materials
 
 

@@ -3,6 +3,7 @@
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -133,3 +134,10 @@ def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = 
     pictures = shading * (1 if distant else 150.0**2 / distance**2)
     stored = np.rint(pictures * 30_000).astype(np.uint16)
     return write_capture(folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1)
+
+
+def evaluate(captures: Any, estimators: Any, protocol: Any) -> Any:
+    """Score every estimator on every capture under one protocol; see evaluate_all."""
+    from splinecli.evaluation.run import evaluate_all
+
+    return evaluate_all(captures, estimators, [protocol])[0]

@@ -12,7 +12,7 @@ import typer
 
 import figure_tables
 from splinecli.capture import capture_warnings
-from splinecli.cli.app import app
+from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
 
 REPOSITORY = Path(__file__).resolve().parents[1]

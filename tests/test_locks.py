@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from splinecli.errors import OutputError
-from splinecli.system.locks import LOCK, BusyError, locked
+from splinecli.system.publishing import LOCK, BusyError, locked
 
 
 @pytest.fixture(params=["posix", "windows"])

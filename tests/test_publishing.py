@@ -12,8 +12,7 @@ from kills import content, killed_at
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED
-from splinecli.system.locks import LOCK
-from splinecli.system.publishing import UNDONE, NewFiles, held_folder, new_files
+from splinecli.system.publishing import LOCK, UNDONE, NewFiles, held_folder, new_files
 
 REPORT = "report.json"
 OLD = {REPORT: b"old", "a.txt": b"old a", "only old.txt": b"old", "pictures/1.png": b"old 1"}

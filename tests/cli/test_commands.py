@@ -10,8 +10,8 @@ import pytest
 import typer
 
 from cli.test_schema import check
-from splinecli.cli.app import app
 from splinecli.cli.commands import OTHERS, sort_into_panels
+from splinecli.cli.main import app
 
 COMMANDS = typer.main.get_command(app).commands
 

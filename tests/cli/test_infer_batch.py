@@ -24,7 +24,7 @@ from splinecli.pipeline.batch import infer_batch, worst_exit_code
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.observer import Observer
-from splinecli.results import clock, files
+from splinecli.results import files, report
 
 
 def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
@@ -228,7 +228,7 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
 
         return call
 
-    monkeypatch.setattr(clock.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(report.time, "perf_counter", lambda: now)
     for module, name, seconds in (
         (source.CaptureSource, "read", 1),
         (infer, "check_capture", 10),
@@ -245,7 +245,7 @@ def test_the_report_states_the_seconds_of_all_stages(capture, monkeypatch):
         "read": 1, "check": 10, "distil": 100, "estimate": 1000, "pictures": 10_000, "surface": 100_000,
         "write": 1_000_000, "total": 1_111_111,
     }  # fmt: skip
-    assert list(found) == [*clock.STAGES, "total"]
+    assert list(found) == [*report.STAGES, "total"]
 
 
 def test_shards_give_the_results_of_the_whole(capture, make_capture, run):

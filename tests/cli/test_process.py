@@ -42,8 +42,8 @@ def test_libraries_print_nothing(tmp_path: Path) -> None:
     command = """
 import logging, sys, warnings
 from splinecli import __main__
-from splinecli.cli import app
-@app.app.command()
+from splinecli.cli import main
+@main.app.command()
 def noisy():
     logging.getLogger("library").error("a log")
     warnings.warn("a warning", RuntimeWarning)

@@ -122,7 +122,7 @@ def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
 
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
     from splinecli.training import distributed
-    from splinecli.training import run as training_run
+    from splinecli.training import loop as training_run
 
     monkeypatch.setattr(training_run, "join_workers", lambda device: (distributed.Workers(0, 3), device))
     result = run("train", "-o", "run", "--steps", 1)
@@ -133,7 +133,7 @@ def test_processes_that_cannot_share_a_batch(run, monkeypatch):
 
 def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
     assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
-    monkeypatch.setattr("splinecli.training.run.restarts_are_allowed", lambda: True)
+    monkeypatch.setattr("splinecli.training.loop.restarts_are_allowed", lambda: True)
     assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
     assert [row["step"] for row in rows()] == ["3", "5"]
     # Without a checkpoint, a run starts.

@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 
 from scenes import decode_rgb
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
-from splinecli.evaluation.outcome import Evaluation, Result
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.pictures.plotting import method_styles
 
 METHODS = ("ls", "spline-net")

@@ -11,8 +11,7 @@ import pytest
 
 from html_page import HtmlPage
 from splinecli import __version__
-from splinecli.evaluation.outcome import Evaluation, Result, Skipped
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.report import html_report
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from scenes import evaluate
 from splinecli.capture import read_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate, evaluate_all
+from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.maths.normals import unit
 from splinecli.methods import make_estimator

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splinecli.evaluation.outcome import Evaluation, Result
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.statistics import AVERAGE, compare, holm, trial_averages
 
 

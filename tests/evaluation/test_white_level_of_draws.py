@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes import shade, sphere_cap, spiral_lights, write_capture
+from scenes import evaluate, shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
 from splinecli.capture.lights.draws import draw_lights
 from splinecli.capture.restore.white_level import WhiteLevel
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate, evaluate_all
+from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator

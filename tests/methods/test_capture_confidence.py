@@ -14,7 +14,7 @@ from splinecli.light.lamp_light import LampLight
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 from splinecli.methods import make_estimator
-from splinecli.networks.capture_head import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
+from splinecli.networks.error_head import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
 from splinecli.networks.weights import capture_head, manifest
 
 Doubles = NDArray[np.float64]

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from scenes import evaluate
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate
 from splinecli.methods import make_estimator
 
 # Mean angular errors in degrees, on Ball and Cat: ours, and the published ones. The published ones for all 96 lights

@@ -8,10 +8,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from scenes import spiral_lights
+from scenes import evaluate, spiral_lights
 from splinecli.capture import Capture, read_capture
 from splinecli.evaluation.protocol import Protocol
-from splinecli.evaluation.run import evaluate
 from splinecli.evaluation.trial_capture import scored_rows
 from splinecli.inference import estimate_normals
 from splinecli.light.lamp_light import LampLight

@@ -5,8 +5,14 @@ import numpy as np
 import pytest
 
 from splinecli.errors import OutputError
-from splinecli.pictures.error_map import TOP_DEG, colour_errors, error_map_picture
-from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, preview_picture
+from splinecli.pictures.maps import (
+    PREVIEW_LIGHT,
+    TOP_DEG,
+    albedo_picture,
+    colour_errors,
+    error_map_picture,
+    preview_picture,
+)
 from splinecli.pictures.png import encode_png
 
 

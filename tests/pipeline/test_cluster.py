@@ -21,11 +21,11 @@ from splinecli.maths.normals import unit
 from splinecli.pipeline import batch, connection
 from splinecli.pipeline import distribution as distribution_module
 from splinecli.pipeline.batch import infer_batch
-from splinecli.pipeline.capture_list import Member, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Distributor, Item, LostError, Work
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.member import Member, list_captures
 from splinecli.pipeline.observer import SILENT
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")

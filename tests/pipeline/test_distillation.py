@@ -14,8 +14,8 @@ from splinecli.errors import UsageError
 from splinecli.methods import distilled
 from splinecli.methods.least_squares import LeastSquares
 from splinecli.methods.student_size import StudentSize
-from splinecli.pipeline import distillation
-from splinecli.pipeline.distillation import AUTOMATIC_FROM, distil_for
+from splinecli.pipeline import estimate
+from splinecli.pipeline.estimate import AUTOMATIC_FROM, distil_for
 
 LIGHTS = spiral_lights(6, 40)
 
@@ -59,7 +59,7 @@ def test_small_captures_and_exact_ones_are_not_distilled() -> None:
 
 
 def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distillation, "student_sizes", lambda _: (StudentSize(750, 50, 16),) * 2)
+    monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(750, 50, 16),) * 2)
     teacher = Teacher()
     found, warnings = distil_for(capture(3000), teacher, True)
     assert warnings == []
@@ -72,7 +72,7 @@ def test_large_captures_are_distilled_where_that_is_faster(
 ) -> None:
     """The teacher takes at least 20 microseconds a pixel, so 2 seconds for all and 0.002 for the sample."""
     monkeypatch.setattr(distilled, "seconds_of_learning", lambda *_: learning)
-    monkeypatch.setattr(distillation, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
+    monkeypatch.setattr(estimate, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
     found, warnings = distil_for(capture(AUTOMATIC_FROM), Teacher(seconds=0.02), None)
     assert (found is not None) == faster
     assert warnings == []
@@ -80,7 +80,7 @@ def test_large_captures_are_distilled_where_that_is_faster(
 
 def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = StudentSize(500, 50, 16), StudentSize(900, 50, 16)
-    monkeypatch.setattr(distillation, "student_sizes", lambda _: sizes)
+    monkeypatch.setattr(estimate, "student_sizes", lambda _: sizes)
     teacher = Teacher(random=True)
     found, (warning,) = distil_for(capture(3000), teacher, True)
     assert found is None
@@ -96,7 +96,7 @@ def test_refused() -> None:
     ):
         with pytest.raises(UsageError, match=problem):
             distil_for(few, estimator, True)
-        assert distillation.distil_for(few, estimator, None) == (None, [])
+        assert distil_for(few, estimator, None) == (None, [])
 
 
 def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:

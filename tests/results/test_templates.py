@@ -9,8 +9,7 @@ import numpy as np
 import tifffile
 
 from browser import OpenPage
-from splinecli.evaluation.outcome import Evaluation, Result
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.report import html_report
 from splinecli.results.files import NORMALS
 from splinecli.results.index import Entry, Row, index_page

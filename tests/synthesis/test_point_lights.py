@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from point_lights import render_point_lights
-from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from synthesis.test_rendering import matte
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")

@@ -12,9 +12,8 @@ from torch import Tensor
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
 from splinecli.synthesis import rendering
-from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Mesh
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 
 

@@ -6,7 +6,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.values import complete_curves, parse_circle, record_from
+from splinecli.cli.shared import complete_curves, parse_circle, record_from
 
 
 def calibrate(

@@ -10,21 +10,11 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.values import (
-    Device,
-    Precision,
-    listed,
-    parse_cluster,
-    parse_light_count,
-    parse_pixel,
-    parse_skip,
-    record_from,
-)
 from splinecli.errors import InputError
 from splinecli.methods import DEFAULT_METHOD, MethodOptions, method_names
 
 if TYPE_CHECKING:
-    from splinecli.evaluation.outcome import Evaluation
+    from splinecli.evaluation.protocol import Evaluation
 
 
 def evaluate(
@@ -34,7 +24,7 @@ def evaluate(
     method: list[str] | None = Option(
         None,
         metavar="M",
-        help=f"Method to score: all, {listed(method_names())}. May be repeated. [default: spline-net]",
+        help=f"Method to score: all, {shared.listed(method_names())}. May be repeated. [default: spline-net]",
         autocompletion=lambda: [*method_names(), "all"],
     ),
     weights: str | None = shared.WEIGHTS,
@@ -79,8 +69,8 @@ def evaluate(
         help="Average the network's result over R views of each pixel: its lights rotated, for spline-net also"
         " mirrored. [default: 1; cnn-ps: 10]",
     ),
-    device: Device = shared.DEVICE,
-    precision: Precision = shared.PRECISION,
+    device: shared.Device = shared.DEVICE,
+    precision: shared.Precision = shared.PRECISION,
     jobs: int | None = Option(
         None, metavar="N", min=1, help="Number of trials at a time. [default: number of cores; 1 on a GPU]"
     ),
@@ -117,18 +107,18 @@ def evaluate(
 
     from splinecli.pipeline.evaluate import EvaluateOptions, evaluate_captures
 
-    options = record_from(
+    options = shared.record_from(
         EvaluateOptions,
         given,
         methods=tuple(
             name for text in method or [DEFAULT_METHOD] for name in (method_names() if text == "all" else [text])
         ),
-        method_options=record_from(MethodOptions, given),
-        n_lights=tuple(parse_light_count(text) for text in n_lights or []),
+        method_options=shared.record_from(MethodOptions, given),
+        n_lights=tuple(shared.parse_light_count(text) for text in n_lights or []),
         light_noise_deg=tuple(light_noise_deg or [0.0]),
-        skip_first=dict(parse_skip(text) for text in skip_first or []),
-        pixels=tuple(parse_pixel(text) for text in pixel or []),
-        cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
+        skip_first=dict(shared.parse_skip(text) for text in skip_first or []),
+        pixels=tuple(shared.parse_pixel(text) for text in pixel or []),
+        cluster=shared.parse_cluster(workers, cluster, gpu=device is shared.Device.cuda),
     )
     talk = Messages(quiet=quiet)
     outcome = evaluate_captures(datasets, options, talk)

@@ -14,11 +14,12 @@ from typing import Any
 import typer
 
 from splinecli.capture.record import MIN_LIGHTS
-from splinecli.cli.values import listed
+from splinecli.cli.shared import listed
 from splinecli.errors import OutputError, SplinecliError
 from splinecli.system.memory import is_out_of_memory
 
 USAGE = 2
+DEFECT = "this is a defect of splinecli; please report it with the lines above."  # of an error that it did not expect
 NO_MEMORY = "there is not enough memory. Close other programs, or use smaller images."
 # Typer carries its own copy of click, in a place that changes with the version. This is click's base of usage errors.
 ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for arguments that it cannot use
@@ -46,7 +47,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}cannot be read or written ({error.strerror}).", OutputError.exit_code
-    return "this is a defect of splinecli; please report it with the lines above.", SplinecliError.exit_code
+    return DEFECT, SplinecliError.exit_code
 
 
 def error_document(error: Exception) -> dict[str, Any]:
@@ -80,11 +81,6 @@ def printed_documents(*, as_list: bool, as_lines: bool) -> Iterator[Callable[[di
     finally:
         if as_list and not as_lines:
             print("[]" if is_empty else "\n]")
-
-
-def is_defect(error: Exception) -> bool:
-    """Return whether splinecli did not expect the error."""
-    return not isinstance(error, SplinecliError | ParserError | OSError) and not is_out_of_memory(error)
 
 
 def _usage_message(error: Any) -> str:

@@ -14,19 +14,6 @@ from splinecli.capture.formats.text import is_number
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_lines
 from splinecli.cli.failures import printed_documents
-from splinecli.cli.values import (
-    Device,
-    FirstLight,
-    LightForm,
-    NormalConvention,
-    Precision,
-    complete_list,
-    listed,
-    parse_cluster,
-    parse_indices,
-    record_from,
-    split_commas,
-)
 from splinecli.errors import UsageError, printable
 from splinecli.methods import method_names
 from splinecli.results.files import MAPS, NORMALS, SCALED_MAPS
@@ -43,7 +30,7 @@ def infer(
         ..., metavar="CAPTURE", help="Folders with the images of one object each, or films."
     ),
     lights: Path | None = shared.LIGHTS,
-    first_light: FirstLight | None = shared.FIRST_LIGHT,
+    first_light: shared.FirstLight | None = shared.FIRST_LIGHT,
     intensities: Path | None = shared.INTENSITIES,
     refine_lights: bool = shared.REFINE_LIGHTS,
     light_positions: Path | None = shared.LIGHT_POSITIONS,
@@ -65,11 +52,14 @@ def infer(
     flat_field: Path | None = shared.FLAT_FIELD,
     white_level: float | None = shared.WHITE_LEVEL,
     light_frame: str | None = shared.LIGHT_FRAME,
-    lights_format: LightForm = shared.LIGHTS_FORMAT,
+    lights_format: shared.LightForm = shared.LIGHTS_FORMAT,
     as_stored: bool = shared.AS_STORED,
     output: Path = Option(Path("out"), "--output", "-o", metavar="OUT", help="Write results to OUT/<capture name>/."),
     method: str = Option(
-        "spline-net", metavar="METHOD", help=f"Method to use: {listed(method_names())}.", autocompletion=method_names
+        "spline-net",
+        metavar="METHOD",
+        help=f"Method to use: {shared.listed(method_names())}.",
+        autocompletion=method_names,
     ),
     weights: str | None = shared.WEIGHTS,
     n_lights: int | None = Option(None, metavar="K", help="Use K lights drawn at random. [default: all]"),
@@ -83,22 +73,22 @@ def infer(
         help="Let a small network learn the method on a sample of the pixels and estimate the rest, or use the method"
         " on every pixel. [default: the faster one from 100,000 pixels, else --exact]",
     ),
-    device: Device = shared.DEVICE,
-    precision: Precision = shared.PRECISION,
+    device: shared.Device = shared.DEVICE,
+    precision: shared.Precision = shared.PRECISION,
     formats: str = Option(
         "png,npy",
         "--format",
         metavar="LIST",
-        help=f"Files of the normal map: any of {listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are"
+        help=f"Files of the normal map: any of {shared.listed(NORMALS)}. png has 16 bits, png8 has 8, npy and tiff are"
         " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.",
-        autocompletion=complete_list(NORMALS),
+        autocompletion=shared.complete_list(NORMALS),
     ),
     maps: str | None = Option(
         None,
         metavar="LIST",
-        help=f"Further maps to write: any of {listed(MAPS)}. preview is a shaded image. relief:2 sets the height in"
-        " pixels that is white in the picture, curvature:0.1 the mean curvature per pixel.",
-        autocompletion=complete_list(MAPS),
+        help=f"Further maps to write: any of {shared.listed(MAPS)}. preview is a shaded image. relief:2 sets the height"
+        " in pixels that is white in the picture, curvature:0.1 the mean curvature per pixel.",
+        autocompletion=shared.complete_list(MAPS),
     ),
     html: bool = Option(
         False, "--html", help="Also write page.html: the maps, and a view of the surface under a light that you move."
@@ -107,8 +97,8 @@ def infer(
         False, "--surface", help="Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
     ),
     stiffness: float = Option(2.0, metavar="K", min=0, help=shared.STIFFNESS),
-    convention: NormalConvention = Option(
-        NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
+    convention: shared.NormalConvention = Option(
+        shared.NormalConvention.opengl, help="Green channel of the PNG files: opengl is y up, directx is y down."
     ),
     overwrite: bool = shared.OVERWRITE,
     update: bool = shared.UPDATE,
@@ -146,20 +136,20 @@ def infer(
     given = locals()
 
     from splinecli.pipeline.batch import infer_batch
-    from splinecli.pipeline.capture_list import Shard
     from splinecli.pipeline.infer_options import InferOptions
+    from splinecli.pipeline.member import Shard
 
     with printed_documents(as_list=as_json, as_lines=as_json_lines) as document:
         if as_json and as_json_lines:
             raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
         if overwrite and update:
             raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
-        options = record_from(
+        options = shared.record_from(
             InferOptions,
             given,
             seed=seed if n_lights is not None else 0,
-            light_indices=None if light_indices is None else parse_indices(light_indices, "--light-indices"),
-            formats=split_commas(formats, "--format", NORMALS),
+            light_indices=None if light_indices is None else shared.parse_indices(light_indices, "--light-indices"),
+            formats=shared.split_commas(formats, "--format", NORMALS),
             **_split_maps(maps),
         )
         messages = Messages(quiet=quiet)
@@ -170,7 +160,7 @@ def infer(
             messages,
             redo=redo,
             shard=None if shard is None else Shard.parse(shard),
-            cluster=parse_cluster(workers, cluster, gpu=device is Device.cuda),
+            cluster=shared.parse_cluster(workers, cluster, gpu=device is shared.Device.cuda),
         )
         return _show_all(batch, output, messages, document, summaries=not (quiet or as_json or as_json_lines))
 
@@ -189,7 +179,7 @@ def _split_maps(text: str | None) -> dict[str, Any]:
                 expected = " or ".join(f"{name}:NUMBER" for name in SCALED_MAPS)
                 raise UsageError(f"--maps has {item.strip()!r}; a scale is given as {expected}")
             fields[f"{name}_scale"] = float(scale)
-    return {**fields, "maps": split_commas(",".join(names), "--maps", MAPS)}
+    return {**fields, "maps": shared.split_commas(",".join(names), "--maps", MAPS)}
 
 
 def _show_all(

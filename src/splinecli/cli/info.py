@@ -7,7 +7,7 @@ from typer import Argument, Option
 from splinecli.capture.capture_warnings import PROBABLY_WRONG
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.values import FirstLight, LightForm, record_from
+from splinecli.cli.shared import FirstLight, LightForm, record_from
 from splinecli.errors import InputError
 
 
@@ -53,8 +53,8 @@ def info(
     """
     given = locals()
 
+    from splinecli.pipeline.infer_options import Reading
     from splinecli.pipeline.info import describe_capture, summary_lines
-    from splinecli.pipeline.reading import Reading
 
     messages = Messages(quiet=quiet)
     report = describe_capture(

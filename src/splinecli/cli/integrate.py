@@ -6,7 +6,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.values import NormalConvention, complete_list, record_from, split_commas
+from splinecli.cli.shared import NormalConvention, complete_list, record_from, split_commas
 from splinecli.surface.surface_files import DEFAULT_FORMATS, SURFACE_FILES
 
 
@@ -35,10 +35,7 @@ def integrate(
         " [default: albedo.png beside NORMALS, if NORMALS is a folder]",
     ),
     stiffness: float | None = Option(
-        None,
-        metavar="K",
-        min=0,
-        help=f"{shared.STIFFNESS} [default: as in report.json beside the normal map, or 2]",
+        None, metavar="K", min=0, help=f"{shared.STIFFNESS} [default: as in report.json beside the normal map, or 2]"
     ),
     prior: Path | None = Option(
         None,

@@ -1,5 +1,9 @@
-"""Entry point: run the app, and turn every error into one message and an exit code."""
+"""The Typer app and its commands, and the entry point, which turns every error into one message and an exit code.
 
+Importing it must stay cheap: no torch, no OpenCV.
+"""
+
+import inspect
 import io
 import logging
 import os
@@ -8,21 +12,69 @@ import traceback
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
+from typer.models import ParameterInfo
 
-from splinecli.cli.app import app
+from splinecli import __version__
+from splinecli.cli.calibrate import calibrate
+from splinecli.cli.commands import Command, Group
 from splinecli.cli.console import print_lines
-from splinecli.cli.failures import explain, is_defect
+from splinecli.cli.evaluate import evaluate
+from splinecli.cli.failures import DEFECT, explain
+from splinecli.cli.import_weights import import_weights
+from splinecli.cli.infer import infer
+from splinecli.cli.info import info
+from splinecli.cli.integrate import integrate
+from splinecli.cli.prepare import prepare
 from splinecli.cli.signals import INTERRUPTED, TOLD
+from splinecli.cli.train import train
+from splinecli.cli.watch import watch
 from splinecli.errors import printable
+
+app = typer.Typer(
+    name="splinecli",
+    cls=Group,
+    help="Surface normals from a few photographs under known lights (photometric stereo with SPLINE-Net).",
+    epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output, 130 interrupted.",
+    # Plain text reads the same on a terminal, in a pipe and in the documentation.
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"splinecli {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _splinecli(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
+    ] = False,
+) -> None:
+    pass
+
+
+for _command in (infer, watch, info, calibrate, integrate, evaluate, prepare, train, import_weights):
+    # By default, Typer refuses a path without permission. One such capture would then end a batch.
+    for _parameter in inspect.signature(_command).parameters.values():
+        if isinstance(_parameter.default, ParameterInfo):
+            _parameter.default.readable = False
+    app.command(cls=Command)(_command)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (the contract is in docs/files-and-frames.md)."""
     _repair_streams()
-    _let_threads_sleep()
+    # By default, PyTorch's threads spin while they wait for each other. On a machine that is busy with other work this
+    # takes cores from the thread that computes. PyTorch reads the variable when it is first imported.
+    if "GOMP_SPINCOUNT" not in os.environ:
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     logging.lastResort = logging.NullHandler()  # logs of libraries are no messages for users
     out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
@@ -38,9 +90,10 @@ def _run_command(args: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         result = INTERRUPTED
     except Exception as error:
-        if is_defect(error):
+        message, exit_code = explain(error)
+        if message == DEFECT:
             print_lines(traceback.format_exc())
-        return fail(*explain(error))
+        return fail(message, exit_code)
     if result == INTERRUPTED:
         TOLD.set()
         return fail("interrupted.", INTERRUPTED)
@@ -54,12 +107,9 @@ def fail(message: str, exit_code: int) -> int:
 
 
 class UntilClosed:
-    """A text stream that drops all output once its pipe is closed.
+    """A text stream that drops all output once its pipe is closed. All other attributes are the stream's.
 
     With a plain stream, the next line that a command prints would raise an error and end the command's work.
-
-    Args:
-        stream: the stream to write to. All other attributes are this stream's.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -114,13 +164,3 @@ def _apart(stream: TextIO) -> TextIO:
     except OSError:  # a limit on open files; the command reports it
         return stream
     return io.TextIOWrapper(own, stream.encoding, stream.errors, line_buffering=True, write_through=True)
-
-
-def _let_threads_sleep() -> None:
-    """Let PyTorch's threads sleep while they wait for each other, unless the user has chosen otherwise.
-
-    By default they spin. On a machine that is busy with other work this takes cores from the thread that computes.
-    PyTorch reads the variable when it is first imported.
-    """
-    if "GOMP_SPINCOUNT" not in os.environ:
-        os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -8,7 +8,7 @@ from typer import Argument, Option
 from splinecli.capture import find_captures
 from splinecli.cli import shared
 from splinecli.cli.console import Messages, print_report
-from splinecli.cli.values import parse_cluster
+from splinecli.cli.shared import parse_cluster
 
 
 def prepare(
@@ -48,7 +48,7 @@ def prepare(
     """
     from splinecli.pipeline.batch import worst_exit_code
     from splinecli.pipeline.prepare import prepare_pixel_set
-    from splinecli.pixel_sets.rendered import ScenePlan
+    from splinecli.pixel_sets.entries import ScenePlan
     from splinecli.synthesis.scenes import SceneConfig
 
     config = SceneConfig()

@@ -1,8 +1,166 @@
-"""Options that several commands have. A command declares its other options in its signature."""
+"""Options that several commands have, and the values of options: their completion, their parsing, and their records.
+
+A command declares its other options in its signature.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from enum import Enum, StrEnum
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from typer import Option
 
-from splinecli.cli.values import Device, LightForm, Precision, complete_curves, complete_list, complete_weights
+from splinecli.errors import UsageError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    from splinecli.calibration.circle import Circle
+    from splinecli.pipeline.connection import ClusterOptions
+
+    Record = TypeVar("Record", bound=DataclassInstance)
+
+_MOST_DIGITS = 18  # of a number of images
+
+
+# Each is a type of Typer: the values that an option may have.
+Device = StrEnum("Device", ["auto", "cpu", "cuda"])
+FirstLight = StrEnum("FirstLight", ["left", "right", "above", "below"])
+LightForm = StrEnum("LightForm", {"xyz": "xyz", "azel": "azel", "slant_tilt": "slant-tilt"})
+NormalConvention = StrEnum("NormalConvention", ["opengl", "directx"])
+Precision = StrEnum("Precision", ["auto", "float32", "bfloat16"])
+
+
+def complete_curves() -> list[str]:
+    """Return transfer curves, the last of them as an example."""
+    return ["auto", "linear", "srgb", "gamma:2.2"]
+
+
+def complete_weights() -> list[str]:
+    """Return the names of the shipped weights. If none begins with the typed text, the shell completes file names."""
+    # The module that reads this file imports torch, which takes too long for a completion.
+    return list(json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8")))
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return "a, b or c"."""
+    *most, last = names
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return the completion of a list "a,b": the typed items, and each further one behind the last comma."""
+
+    def complete(incomplete: str) -> list[str]:
+        *typed, _ = incomplete.split(",")
+        return [",".join([*typed, name]) for name in items if name not in typed]
+
+    return complete
+
+
+def split_commas(text: str, option: str, allowed: Iterable[str]) -> tuple[str, ...]:
+    """Return the items of "a,b". Raises UsageError for an item that is not allowed."""
+    names = list(allowed)
+    items = tuple(item.strip() for item in text.split(",") if item.strip())
+    for item in items:
+        if item not in names:
+            raise UsageError(f"{option} has {item!r}; expected a list of {', '.join(names)}, such as {names[0]}")
+    if not items:
+        raise UsageError(f"{option} is empty; expected a list of {', '.join(names)}")
+    return items
+
+
+def parse_cluster(workers: str, address: str | None = None, *, gpu: bool = False) -> ClusterOptions | None:
+    """Return where --workers and --cluster let tasks be done; None for this process. Raises UsageError."""
+    from splinecli.pipeline.connection import ClusterOptions
+
+    if workers != "auto" and (not workers.isdecimal() or len(workers) > 4 or int(workers) < 1):
+        raise UsageError(f"--workers is {workers!r}; expected a number from 1, or auto")
+    if address is not None and workers != "1":
+        raise UsageError(
+            "--workers and --cluster contradict each other", hint="Leave --workers out: the cluster has its workers"
+        )
+    if address is None and workers == "1":
+        return None
+    number = 0 if workers == "auto" else int(workers)
+    return ClusterOptions(workers=number, address=address, gpu=gpu)
+
+
+def parse_indices(text: str, option: str) -> tuple[int, ...]:
+    """Return the whole numbers of "0,5,12". Raises UsageError."""
+    try:
+        return tuple(int(item) for item in text.split(","))
+    except ValueError:
+        raise UsageError(f"{option} is {text!r}; expected zero-based numbers such as 0,5,12") from None
+
+
+def parse_circle(text: str) -> Circle:
+    """Return the circle of "X,Y,R". Raises UsageError."""
+    from splinecli.calibration.circle import Circle
+
+    try:
+        x, y, radius = (float(word) for word in text.split(","))
+        if radius > 0 and abs(x) + abs(y) + radius < float("inf"):
+            return Circle(x, y, radius)
+    except ValueError:
+        pass
+    raise UsageError(f"--circle is {text!r}; expected X,Y,R in pixels, such as 512,384,200")
+
+
+def parse_skip(text: str) -> tuple[str, int]:
+    """Return ("bearPNG", 20) for "bearPNG=20" and ("*", 20) for "20". Raises UsageError."""
+    from splinecli.evaluation.protocol import EVERY_CAPTURE
+
+    name, equals, count = text.rpartition("=")
+    if not count.isdecimal() or len(count) > _MOST_DIGITS or bool(name) != bool(equals):
+        raise UsageError(f"--skip-first is {text!r}; expected a number, or one for a capture as in bearPNG=20")
+    return name or EVERY_CAPTURE, int(count)
+
+
+def parse_pixel(text: str) -> tuple[int, int]:
+    """Return the row and the column of "120,85". Raises UsageError."""
+    indices = parse_indices(text, "--pixel")
+    if len(indices) != 2 or min(indices) < 0:
+        raise UsageError(f"--pixel is {text!r}; expected a row and a column such as 120,85")
+    return indices[0], indices[1]
+
+
+def parse_light_count(text: str) -> int | None:
+    """Return a number of lights, or None for "all". Raises UsageError."""
+    if text == "all":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--n-lights is {text!r}; expected a number of lights, or all") from None
+
+
+def record_from(record: type[Record], arguments: Mapping[str, Any], **values: Any) -> Record:
+    """Build a frozen dataclass of options from the arguments of a command that have the names of its fields.
+
+    A choice becomes its value, a list a tuple, and a path text if the field holds no path. `values` are those of fields
+    that need more than this. Raises UsageError if the record refuses a value.
+    """
+    given = {
+        field.name: _of_field(arguments[field.name], str(field.type))
+        for field in fields(record)
+        if field.name in arguments
+    }
+    return record(**given | values)
+
+
+def _of_field(value: Any, kind: str) -> Any:
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, list):
+        return tuple(value)
+    return str(value) if isinstance(value, Path) and "Path" not in kind else value
+
 
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 STIFFNESS = "How easily the surface of integrate or --surface tears at edges: more with a larger number, never with 0."

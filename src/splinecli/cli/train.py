@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from splinecli.cli import shared
 from splinecli.cli.console import Messages
-from splinecli.cli.values import Device, complete_weights
+from splinecli.cli.shared import Device, complete_weights
 from splinecli.errors import UsageError, printable
 from splinecli.training import defaults
 
@@ -84,7 +84,7 @@ def train(
         raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
 
     from splinecli.training.config_files import parse_light_counts, parse_parameter, parse_sources
-    from splinecli.training.run import configure_run, open_run, resumes
+    from splinecli.training.loop import configure_run, open_run
 
     changes: list[Settings] = []  # in the order of their precedence
     if sets or generator_weight is not None:
@@ -96,8 +96,7 @@ def train(
     changes += [parse_parameter(text) for text in param or []]
     if seed is not None:
         changes.append({"seed": seed})
-    resume = resumes(output, resume=resume)
-    settings = configure_run(output, preset, config, changes, resume=resume)
+    settings, resume = configure_run(output, preset, config, changes, resume=resume)
     if steps is not None:
         settings = replace(settings, steps=steps, minutes=0.0)
     if minutes is not None:

@@ -9,21 +9,21 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, open_capture
 from splinecli.errors import UsageError, printable
-from splinecli.evaluation.plan import first_trial
+from splinecli.evaluation.plan import draws_for, read_draws_file
 from splinecli.evaluation.protocol import Protocol, heading
 from splinecli.evaluation.trial_capture import TrialSource
+from splinecli.evaluation.trials import Trial
 from splinecli.inference import estimate_normals
 from splinecli.methods import Estimator
 from splinecli.pictures.method_maps import method_maps
 from splinecli.pictures.observation_maps import observation_map_figure
+from splinecli.system.files import free_name
 
 SHOWN_PERCENTILES = (10, 50, 90, 99)
 """Percentiles of SPLINE-Net's errors: the pixels that are shown unless others are chosen."""
 
 MAPS = "_observation_maps"
-
-MOST_LISTED = 16
-"""Largest number of lights that a title lists."""
+MOST_LISTED = 16  # largest number of lights that a title lists
 
 
 class CaptureFigure(NamedTuple):
@@ -46,20 +46,17 @@ def capture_figures(
     """Return a figure of the methods' maps for the protocol's first draw; with SPLINE-Net also one of pixels.
 
     Under near lamps, there is none of pixels. All pixels in the mask are estimated, also where the protocol has
-    max_pixels.
+    max_pixels. Raises InputError if the capture cannot be read or scored, or UsageError if a pixel has no ground truth.
 
     Args:
         name: name of the capture in the tables.
         stem: stem of the figures' file names.
         pixels: (row, column) of the pixels whose observation maps are shown; by default those at SHOWN_PERCENTILES.
         on_progress: called with the share of the work that was just done.
-
-    Raises:
-        InputError: the capture cannot be read or scored.
-        UsageError: a pixel has no ground truth.
     """
     source = open_capture(folder, white_level=protocol.white_level)
-    trial = first_trial(source, name, protocol)
+    read, draws_file = read_draws_file(protocol)
+    trial = Trial(name, "", 0, draws_for(source, name, read, draws_file)[0], read, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)
     advance = on_progress or (lambda share: None)
     steps = 1 + len(estimators)
@@ -97,12 +94,8 @@ def file_stems(names: Sequence[str]) -> list[str]:
     """Return a different stem of a file name for each capture, also where names have slashes."""
     stems: list[str] = []
     for name in names:
-        plain = stem = name.replace("/", "_")
-        number = 2
-        while {stem, f"{stem}{MAPS}"} & {*stems, *(f"{taken}{MAPS}" for taken in stems)}:
-            stem = f"{plain}_{number}"
-            number += 1
-        stems.append(stem)
+        taken = {*stems, *(f"{stem}{MAPS}" for stem in stems)}
+        stems.append(free_name(name.replace("/", "_"), lambda stem: bool({stem, f"{stem}{MAPS}"} & taken), "_"))  # noqa: B023
     return stems
 
 
@@ -133,10 +126,7 @@ def _observation_maps(
         rows, columns = rows[chosen], columns[chosen]
     place = np.cumsum(capture.mask.ravel()).reshape(capture.mask.shape)[rows, columns] - 1
     sparse, dense, truth = estimator.maps(
-        capture.observations[place],
-        capture.light_directions,
-        whole.observations[place],
-        whole.light_directions,
+        capture.observations[place], capture.light_directions, whole.observations[place], whole.light_directions
     )
     return observation_map_figure(
         sparse,

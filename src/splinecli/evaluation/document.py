@@ -14,16 +14,13 @@ from splinecli import __version__
 from splinecli.errors import printable
 from splinecli.evaluation.capture_figures import CaptureFigure
 from splinecli.evaluation.error_plots import light_noise_curves, lights_curves
-from splinecli.evaluation.outcome import Evaluation, all_skipped
-from splinecli.evaluation.protocol import Protocol, lights_value
+from splinecli.evaluation.protocol import Evaluation, Protocol, all_skipped, lights_value
 from splinecli.evaluation.report import html_report
 from splinecli.evaluation.statistics import compare
 from splinecli.evaluation.tables import latex, markdown
 from splinecli.system.publishing import new_files
 
-SCHEMA = 1
-"""Schema version of results.json. It rises when a field changes its meaning."""
-
+SCHEMA = 1  # Schema version of results.json. It rises when a field changes its meaning.
 _DIGITS = 4  # behind the point, of degrees and seconds
 _P_DIGITS = 3  # significant ones: p-values span many orders of magnitude
 _FORMULA = ("=", "+", "-", "@")
@@ -31,9 +28,7 @@ _FORMULA = ("=", "+", "-", "@")
 
 TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json", "figures"
 LIGHTS_PLOT, LIGHT_NOISE_PLOT = "lights.png", "light_noise.png"
-
-Plots = Mapping[str, tuple[str, bytes]]
-"""A caption and a PNG by the name of the file."""
+Plots = Mapping[str, tuple[str, bytes]]  # a caption and a PNG by the name of the file
 
 
 def make_plots(evaluations: Sequence[Evaluation]) -> Plots:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splinecli.errors import printable
-from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.protocol import lights_in_words
+from splinecli.evaluation.protocol import Evaluation, lights_in_words
 from splinecli.evaluation.statistics import AVERAGE, trial_averages
 from splinecli.pictures.plotting import method_styles, png_bytes
 
@@ -31,12 +30,7 @@ _MOST_ACROSS = 3
 _DPI = 200
 _SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
 # matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
-_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = (
-    (0, ()),
-    (0, (4, 2)),
-    (0, (1, 1.5)),
-    (0, (5, 1.5, 1, 1.5)),
-)
+_DASHES: tuple[tuple[float, tuple[float, ...]], ...] = ((0, ()), (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
 _NEAREST_TICKS = 0.045  # share of the axis: labels that are closer would overlap
 
 
@@ -84,13 +78,8 @@ def _curves(
     """Return the panels side by side as PNG, with one curve for each method and series, and one legend for all.
 
     A curve has a band of one standard deviation to either side. Its colour and marker show the method, its dashes the
-    series. The legend names the series where there are several.
-
-    Args:
-        x: the place of an evaluation on a capture's x axis.
-        tick: the label at this place.
-        series: the name of the curves that the evaluation belongs to.
-        label: of the x axes.
+    series. `x` gives an evaluation's place on a capture's x axis, `tick` the label there, `series` the name of its
+    curves.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

@@ -13,8 +13,7 @@ from splinecli.capture.record import MIN_LIGHTS
 from splinecli.capture.restore.light_refinement import check_distant
 from splinecli.capture.stamp import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.outcome import Evaluation, Result, Skipped
-from splinecli.evaluation.protocol import EVERY_CAPTURE, Protocol
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, Protocol, Result, Skipped
 from splinecli.evaluation.statistics import AVERAGE
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, open_to_score
 from splinecli.evaluation.trials import Trial, TrialStore
@@ -129,13 +128,6 @@ def plan_capture(
     return CaptureJob(source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing)
 
 
-def first_trial(source: CaptureSource, name: str, protocol: Protocol) -> Trial:
-    """Return the first trial of a capture, without a method. Raises what evaluate_all raises."""
-    protocol, draws_file = read_draws_file(protocol)
-    draw = draws_for(source, name, protocol, draws_file)[0]
-    return Trial(name, "", 0, draw, protocol, "")
-
-
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
     """Return the protocol with the numbers of lights and trials of its draws file, and its draws. Raises InputError."""
     if protocol.draws_file is None:
@@ -147,9 +139,8 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
 def draws_for(source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None) -> list[Draw]:
     """Return the draws of a capture, one for each trial.
 
-    Raises:
-        InputError: the capture has no ground truth, or a draw of the file does not fit it.
-        UsageError: it has too few lights, or near lamps that are to be refined.
+    Raises InputError if the capture has no ground truth, or a draw of the file does not fit it, or UsageError if it has
+    too few lights, or near lamps that are to be refined.
     """
     if source.files.ground_truth is None:  # known before the images are read
         raise InputError(

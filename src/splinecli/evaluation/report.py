@@ -9,8 +9,7 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import printable
-from splinecli.evaluation.outcome import Evaluation, all_captures, all_skipped
-from splinecli.evaluation.protocol import EVERY_CAPTURE, heading, lights_in_words
+from splinecli.evaluation.protocol import EVERY_CAPTURE, Evaluation, all_captures, all_skipped, heading, lights_in_words
 from splinecli.evaluation.statistics import (
     AVERAGE,
     SIGNIFICANCE,
@@ -39,16 +38,14 @@ class Cell(NamedTuple):
     mark: Mark = ""
 
 
-Table = list[list[Cell]]
-"""A header row, then rows whose first cell is a header."""
+Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 
 
 def html_report(evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]) -> str:
     """Return the report of one evaluation, or of several that differ in the lights or the light noise.
 
-    Args:
-        figures: pairs of a caption, which is also the alternative text, and a PNG.
-        notes: sentences about the captures.
+    `figures` are pairs of a caption, which is also the alternative text, and a PNG; `notes` sentences about the
+    captures.
     """
     first = evaluations[0]
     return render(

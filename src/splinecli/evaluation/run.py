@@ -12,7 +12,6 @@ from threading import Lock
 from typing import NamedTuple
 
 from splinecli.errors import InputError, SplinecliError, UsageError
-from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import (
     CaptureJob,
     ProtocolTrials,
@@ -21,7 +20,7 @@ from splinecli.evaluation.plan import (
     plan_capture,
     read_draws_file,
 )
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw
 from splinecli.evaluation.trials import Score, Trial, TrialStore
 from splinecli.methods import Estimator
@@ -42,11 +41,6 @@ Elsewhere = Callable[[Sequence[DrawTask]], Iterator[tuple[DrawTask, Scored]]]
 
 OnProgress = Callable[[float, str], object]
 """Called with the share of all trials that was just done, and a short text. A trial counts by its pixels."""
-
-
-def evaluate(captures: Sequence[Path], estimators: Sequence[Estimator], protocol: Protocol) -> Evaluation:
-    """Score every estimator on every capture under one protocol; see evaluate_all."""
-    return evaluate_all(captures, estimators, [protocol])[0]
 
 
 def evaluate_all(

@@ -13,13 +13,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.evaluation.outcome import Evaluation
+from splinecli.evaluation.protocol import Evaluation
 
-AVERAGE = "average"
-"""Name that stands for the average over all captures, in place of a capture's name."""
-
-SIGNIFICANCE = 0.05
-"""p-value below which two methods differ."""
+AVERAGE = "average"  # name that stands for the average over all captures, in place of a capture's name
+SIGNIFICANCE = 0.05  # p-value below which two methods differ
 
 # Error maps are float32: MAEs closer than this are equal.
 _SAME_DEG = 1e-6
@@ -32,25 +29,20 @@ class Comparison:
     There is no test with one trial, or where the differences of all trials are equal but not zero: this is one trial
     several times. interval_deg, p_value and p_holm are then None. Where all differences are zero, the interval is
     (0, 0) and p is 1. Differences count as equal within 1e-6 degrees, the precision of the error maps.
-
-    Args:
-        capture: name of the capture, or AVERAGE.
-        difference_deg: mean over the trials of the MAE of `first` minus that of `second`; `first` is better below 0.
-        std_deg: population standard deviation of the differences.
-        interval_deg: 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0
-            while p_holm is above SIGNIFICANCE.
-        p_holm: p_value corrected for the number of pairs that were tested on this capture.
     """
 
-    capture: str
+    capture: str  # name of the capture, or AVERAGE
     first: str
     second: str
     trials: int
+    # mean over the trials of the MAE of `first` minus that of `second`; `first` is better below 0
     difference_deg: float
-    std_deg: float
+    std_deg: float  # population standard deviation of the differences
+    # 95 % interval of the mean difference, not corrected for the number of pairs. It can exclude 0 while p_holm is
+    # above SIGNIFICANCE.
     interval_deg: tuple[float, float] | None
     p_value: float | None
-    p_holm: float | None
+    p_holm: float | None  # p_value corrected for the number of pairs that were tested on this capture
 
     @property
     def differs(self) -> bool | None:

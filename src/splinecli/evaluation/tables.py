@@ -7,8 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 
 from splinecli.errors import printable
-from splinecli.evaluation.outcome import Evaluation
-from splinecli.evaluation.protocol import heading, protocol_in_words
+from splinecli.evaluation.protocol import Evaluation, heading, protocol_in_words
 from splinecli.evaluation.statistics import AVERAGE
 
 _MOST_WIDE = 6  # captures: with more, the table is set in small type, so that DiLiGenT's ten fit on a page

@@ -32,13 +32,8 @@ from splinecli.system.progress import Progress
 
 _RETILTS = 100
 _LARGEST_TILT_DEG = 89.0
-
-OnImage = Callable[[int, int], object]
-"""Called with the number of images read so far and their total."""
-
-Notes = list[tuple[str, ...]]
-"""Sentences about a capture, for each protocol."""
-
+OnImage = Callable[[int, int], object]  # called with the number of images read so far and their total
+Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
 DAMAGED_IMAGES = {"bearPNG": 20}
 """The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported."""
 
@@ -152,20 +147,13 @@ def tilt_lights(
 
 @dataclass(frozen=True)
 class CaptureReading:
-    """What the trials of a capture need of it.
+    """What the trials of a capture need of it."""
 
-    Args:
-        folder: the capture's folder as it was given. Other processes open it again.
-        protocols: those that can score it. All protocols of an evaluation score the same pixels.
-        lights: those of all trials, in rising order.
-        whole: whether all pixels are needed: a method sees neighbours, or lights are refined or found.
-    """
-
-    folder: Path
+    folder: Path  # the capture's folder as it was given. Other processes open it again.
     name: str
-    protocols: tuple[Protocol, ...]
-    lights: tuple[int, ...]
-    whole: bool
+    protocols: tuple[Protocol, ...]  # those that can score it. All protocols of an evaluation score the same pixels.
+    lights: tuple[int, ...]  # those of all trials, in rising order
+    whole: bool  # whether all pixels are needed: a method sees neighbours, or lights are refined or found
 
     def read(self, source: CaptureSource, on_image: OnImage = lambda *_: None) -> tuple[TrialSource, Notes]:
         """Return the capture under all its lights, and the notes on it, by protocol. Raises InputError, UsageError."""

@@ -18,20 +18,14 @@ _LONGEST_LINE = 1 << 16  # characters
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one capture under one draw of lights, with everything that decides its score.
+    """One method on one capture under one draw of lights, with everything that decides its score."""
 
-    Args:
-        capture: name of the capture in the tables.
-        number: of the trial, from 0.
-        made_of: digest of the capture's files and of the method's settings.
-    """
-
-    capture: str
+    capture: str  # name of the capture in the tables
     method: str
-    number: int
+    number: int  # of the trial, from 0
     lights: Draw
     protocol: Protocol
-    made_of: str
+    made_of: str  # digest of the capture's files and of the method's settings
 
     @property
     def record(self) -> dict[str, Any]:
@@ -69,35 +63,20 @@ class Trial:
 
 @dataclass(frozen=True)
 class Score:
-    """The score of a trial.
+    """The score of a trial."""
 
-    Args:
-        mae_deg: mean angular error over the scored pixels.
-        seconds: time spent on estimating their normals.
-        estimated_intensities: whether the light intensities were estimated from the images.
-        found_light_error_deg: mean error of light directions that were estimated from the images; None where none were.
-    """
-
-    mae_deg: float
-    seconds: float
-    estimated_intensities: bool
+    mae_deg: float  # mean angular error over the scored pixels
+    seconds: float  # time spent on estimating their normals
+    estimated_intensities: bool  # whether the light intensities were estimated from the images
+    # mean error of light directions that were estimated from the images; None where none were
     found_light_error_deg: float | None = None
 
 
-_FIELDS = [field.name for field in fields(Score)]
-
-
 class TrialStore:
-    """Scores by trial, in memory and, where a path is given, in a file of JSON lines.
+    """Scores by trial, in memory and, where a path is given, in a file of JSON lines, which the first score creates.
 
-    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed.
-
-    Args:
-        path: the file, which the first score creates; None keeps the scores in memory only.
-        fresh: whether to delete the scores of an earlier evaluation.
-
-    Raises:
-        OutputError: the file cannot be read or written.
+    A line that cannot be read, such as one that was cut short, is dropped. A link is replaced, not followed. `fresh`
+    deletes the scores of an earlier evaluation. Raises OutputError if the file cannot be read or written.
     """
 
     def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:
@@ -137,7 +116,7 @@ def _read_line(line: str) -> tuple[str, Score] | None:
     """Return the key and the score of a trial."""
     try:
         record = parse_json(line)
-        key, score = record["key"], Score(**{name: record.get(name) for name in _FIELDS})
+        key, score = record["key"], Score(**{field.name: record.get(field.name) for field in fields(Score)})
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
     usable = isinstance(key, str) and isinstance(score.mae_deg, float) and isinstance(score.seconds, float)

@@ -16,37 +16,26 @@ _RANGES = {"set_width": (0, 4096), "li_blocks": (1, 64), "ne_blocks": (1, 64), "
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The layers of a SPLINE-Net or a CNN-PS.
+    """The layers of a SPLINE-Net or a CNN-PS."""
 
-    Attributes:
-        size: "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
-        map_size: cells along a side of the observation map.
-        grid: how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
-        fits: the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact
-            size only.
-        interpolates: whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
-        error_head: whether NE-Net also estimates its own error. Compact size only.
-        refines: whether a refinement net corrects the map of normals afterwards. Needs an error head.
-        width: channels of the compact size.
-        li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size.
-        head_width: hidden features of NE-Net's head in the compact size.
-        set_width: channels of the set branch, 0 for none. Compact size only.
-        set_layers: attention layers of the set branch.
-    """
-
+    # "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
     size: Literal["paper", "compact"] = "compact"
-    map_size: int = MAP_SIZE
-    width: int = 64
+    map_size: int = MAP_SIZE  # cells along a side of the observation map
+    width: int = 64  # channels of the compact size
+    # li_blocks, ne_blocks: residual blocks of LI-Net and of NE-Net in the compact size
     li_blocks: int = 2
     ne_blocks: int = 3
-    head_width: int = 256
-    grid: Grid = "even"
+    head_width: int = 256  # hidden features of NE-Net's head in the compact size
+    grid: Grid = "even"  # how lights fall on the cells. "cnn-ps" is for the authors' weights and needs the paper size.
+    # the fits among STARTING_FITS whose normals NE-Net starts from, beside the robust Lambertian fit. Compact size
+    # only.
     fits: tuple[str, ...] = ()
+    # whether there is a LI-Net. Without one, NE-Net reads the sparse map alone, which is CNN-PS.
     interpolates: bool = True
-    error_head: bool = False
-    refines: bool = False
-    set_width: int = 0
-    set_layers: int = 3
+    error_head: bool = False  # whether NE-Net also estimates its own error. Compact size only.
+    refines: bool = False  # whether a refinement net corrects the map of normals afterwards. Needs an error head.
+    set_width: int = 0  # channels of the set branch, 0 for none. Compact size only.
+    set_layers: int = 3  # attention layers of the set branch
 
     @property
     def is_canonical(self) -> bool:
@@ -65,7 +54,9 @@ class NetworkConfig:
         if unknown:
             raise ModelError(f"unknown network setting {unknown[0]!r}; known are {', '.join(known)}")
         values = dict(values)
-        fits = _fits(values.pop("fits", ()))
+        fits = values.pop("fits", ())
+        if not isinstance(fits, list | tuple) or not all(isinstance(fit, str) and fit in STARTING_FITS for fit in fits):
+            raise ModelError(f"network setting 'fits' is {fits!r}; expected a list of {', '.join(STARTING_FITS)}")
         for name, value in values.items():
             choices = (True, False) if known[name] is bool else get_args(known[name])
             if choices:
@@ -78,7 +69,7 @@ class NetworkConfig:
                 raise ModelError(
                     f"network setting {name!r} is {value!r}; expected a whole number from {least} to {most}"
                 )
-        config = cls(**values, fits=fits)
+        config = cls(**values, fits=tuple(fits))
         # Both sizes halve the map twice. An instance norm needs more than one cell after that.
         if config.map_size % 4 or not 8 <= config.map_size <= 128:
             raise ModelError(f"network setting 'map_size' is {config.map_size}; expected 8 to 128 in fours")
@@ -94,12 +85,3 @@ class NetworkConfig:
         if config.grid != "even" and config.size != "paper":
             raise ModelError(f"network grid is {config.grid!r}; it needs the size 'paper'")
         return config
-
-
-def _fits(names: Any) -> tuple[str, ...]:
-    known = ", ".join(STARTING_FITS)
-    if not isinstance(names, list | tuple) or not all(
-        isinstance(name, str) and name in STARTING_FITS for name in names
-    ):
-        raise ModelError(f"network setting 'fits' is {names!r}; expected a list of {known}")
-    return tuple(names)

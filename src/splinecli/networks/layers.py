@@ -1,13 +1,11 @@
-"""Layers that the compact LI-Net and NE-Net share."""
+"""Layers that several networks share."""
 
 from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
-PATCH = 4
-"""Side in cells of the patches that an encoder joins into one position."""
-
+PATCH = 4  # side in cells of the patches that an encoder joins into one position
 Layer = TypeVar("Layer", nn.Conv2d, nn.Linear)
 
 
@@ -19,17 +17,23 @@ def zeroed(layer: Layer) -> Layer:
 
 
 class ResidualBlock(nn.Module):
-    """x + conv3x3(relu(conv3x3(relu(x)))) on (P, C, h, w). It has no norm and starts as the identity."""
+    """x + conv3x3(relu(conv3x3(relu(x)))) on (P, C, h, w), zero outside of a mask if there is one.
+
+    It has no norm and starts as the identity.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = zeroed(nn.Conv2d(width, width, 3, padding=1))
 
-    def forward(self, x: Tensor) -> Tensor:
-        hidden = self.first(torch.relu(x))
-        out: Tensor = x + self.second(torch.relu(hidden))
-        return out
+    def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
+        hidden: Tensor = self.first(torch.relu(x))
+        # In place: a tile's maps of 32 channels decide how much memory is needed.
+        change: Tensor = self.second((hidden if mask is None else hidden.mul_(mask)).relu_())
+        if mask is not None:
+            change.mul_(mask)
+        return change.add_(x) if change.dtype == x.dtype else x + change
 
 
 class MapEncoder(nn.Module):

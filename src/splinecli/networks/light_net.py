@@ -6,9 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, softplus
 
-SIDE = 48
-"""Height and width of the images that the network sees."""
-
+SIDE = 48  # height and width of the images that the network sees
 INPUTS = 4
 _WIDTHS = 24, 48, 96, 128
 _JOINED = 64
@@ -17,17 +15,11 @@ _LEAST_SHARPNESS, _LARGEST_SHARPNESS = -2.0, 8.5  # logarithms; errors of 90 deg
 
 
 class LightGuess(NamedTuple):
-    """What the network reads off the F images of each of B captures.
+    """What the network reads off the F images of each of B captures."""
 
-    Attributes:
-        directions: (B, F, 3), unit; the modes of von Mises-Fisher distributions.
-        sharpness: (B, F), the logarithms of the concentrations of these distributions.
-        log_intensities: (B, F), the logarithms of the intensities; their mean over each capture is zero.
-    """
-
-    directions: Tensor
-    sharpness: Tensor
-    log_intensities: Tensor
+    directions: Tensor  # (B, F, 3), unit; the modes of von Mises-Fisher distributions
+    sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
+    log_intensities: Tensor  # (B, F), the logarithms of the intensities; their mean over each capture is zero
 
 
 class LightNet(nn.Module):
@@ -81,14 +73,10 @@ def _with_all(x: Tensor, lights: int) -> Tensor:
 
 
 def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
-    """Return what the network sees (F, INPUTS, H, W) of images (F, H, W): linear, of any scale.
+    """Return what the network sees (F, INPUTS, H, W) of images (F, H, W): linear, of any scale, 0 or more.
 
     Channels: the image, the image over the mean of all images, which hardly depends on the material, that mean, and the
-    mask. The first and the third are roots, as shares of the mean brightness of the object.
-
-    Args:
-        images: 0 or more.
-        mask: (H, W), 1 on the object, else 0.
+    mask (H, W), 1 on the object, else 0. The first and the third are roots, as shares of the object's mean brightness.
     """
     images = images * mask
     mean = images.mean(dim=0)
@@ -102,8 +90,7 @@ def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
 def square_images(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Cut images (F, H, W) to the box of a mask (H, W), pad them to squares and resize these to SIDE.
 
-    Returns:
-        The images (F, SIDE, SIDE), means over the mask's pixels, and the mask (SIDE, SIDE) as zeros and ones.
+    Returns images (F, SIDE, SIDE), means over the mask's pixels, and the mask (SIDE, SIDE) as zeros and ones.
     """
     rows, columns = (mask.any(dim=1 - axis).nonzero()[:, 0] for axis in (0, 1))
     box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -7,8 +7,7 @@ from splinecli.networks.config import NetworkConfig
 from splinecli.networks.error_head import ErrorHead
 from splinecli.networks.layers import PATCH, MapEncoder, zeroed
 
-DROPOUT = 0.2
-"""Share of the channels that the paper size drops in training."""
+DROPOUT = 0.2  # share of the channels that the paper size drops in training
 
 
 class PaperNENet(nn.Module):

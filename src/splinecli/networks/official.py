@@ -45,17 +45,11 @@ _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
-    """Return the authors' network, float32, in evaluation mode.
+    """Return the authors' network, float32, in evaluation mode, from two files of state dictionaries.
 
-    Dropout is off in evaluation mode, while the authors' test code leaves it on.
-
-    Args:
-        li_net_file: state dictionary of their generator (G), which is LI-Net.
-        ne_net_file: state dictionary of their discriminator (D), which is NE-Net.
-
-    Raises:
-        ModelError: a file cannot be read or is not a state dictionary, or a tensor is missing, unknown, of another
-            shape or not finite.
+    Their generator (G) is LI-Net, their discriminator (D) NE-Net. Dropout is off in evaluation mode, while the authors'
+    test code leaves it on. Raises ModelError if a file cannot be read or is not a state dictionary, or a tensor is
+    missing, unknown, of another shape or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates
@@ -97,11 +91,7 @@ def _read_ne_net(path: Path, ne_net: nn.Module) -> dict[str, Tensor]:
 
 
 def _rename(
-    path: Path,
-    state: dict[str, Tensor],
-    network: nn.Module,
-    names: dict[str, str],
-    dropped: dict[str, torch.Size],
+    path: Path, state: dict[str, Tensor], network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
 ) -> dict[str, Tensor]:
     """Return their tensors under our names, float32; `names` gives theirs by ours, `dropped` the shapes not needed."""
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"

@@ -19,10 +19,8 @@ _WEIGHT_OF_ERRORS = 0.05
 class Perceptron(nn.Module):
     """Corrects the least-squares normal of a pixel from its observations, in the capture's order of lights.
 
-    Args:
-        light_directions: (F, 3), unit; or (P, F, 3) of some pixels, where near lamps give each its own.
-        width: units in each hidden layer.
-        generator: draws the weights.
+    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, where near lamps give each its own. The hidden
+    layers are `width` wide. The generator draws the weights.
     """
 
     solve: Tensor | None

@@ -33,16 +33,12 @@ def channels(name: str) -> slice:
 
 
 CHANNELS = sum(WIDTHS.values())
-READ = channels("noise").start
-"""Number of the channels that the net reads."""
-
+READ = channels("noise").start  # number of the channels that the net reads
 VECTORS = tuple((channels(name).start, channels(name).start + 1) for name in _VECTORS)
 """Channels that hold the x and y of vectors, and turn with the image."""
 
 _FIRST = channels("light_moments").start
-TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)
-"""Channels that hold the xx, yy and xy of a tensor."""
-
+TENSOR = (_FIRST, _FIRST + 1, _FIRST + 2)  # channels that hold the xx, yy and xy of a tensor
 MEDIAN_OFFSET = 3.0  # brings the logarithm of usual errors in radians near zero
 
 

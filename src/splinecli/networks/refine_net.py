@@ -1,5 +1,6 @@
 """The refinement net: corrects a map of normals and of their errors by what lies around each pixel."""
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from types import EllipsisType
@@ -8,34 +9,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
-from splinecli.networks.gaussian import gaussian_sum
-from splinecli.networks.layers import zeroed
+from splinecli.networks.layers import ResidualBlock, zeroed
 from splinecli.networks.refine_channels import READ, split_features
 
-WIDTHS = (32, 64, 96, 64)
-"""Channels at the full resolution, and at a half, a quarter and an eighth of it."""
-
-ENCODING_BLOCKS = (1, 2, 3, 2)
-DECODING_BLOCKS = (1, 1, 0)
-"""Residual blocks of each scale on the way down, and on the way up."""
-
-SIGMAS = (0.7, 1.5, 3.0)
-"""Widths in pixels of the smoothed normals that the net weighs against the estimated one."""
+WIDTHS = (32, 64, 96, 64)  # channels at the full resolution, and at a half, a quarter and an eighth of it
+ENCODING_BLOCKS = (1, 2, 3, 2)  # residual blocks of each scale on the way down
+DECODING_BLOCKS = (1, 1, 0)  # and on the way up
+SIGMAS = (0.7, 1.5, 3.0)  # widths in pixels of the smoothed normals that the net weighs against the estimated one
 
 # Logarithms of errors in radians, for the weights of the smoothing.
 _LEAST_MEDIAN, _LARGEST_MEDIAN = -6.0, 1.0
-
-COARSEST = 2 ** (len(WIDTHS) - 1)
-"""Side of the coarsest scale's pixels. The origins of tiles are multiples of it."""
-
-REACH = 96
-"""No pixel further away than this changes a result."""
-
-_DECODED = 4
-"""Pixels of each scale that the decoder needs around a part of the map, at least."""
-
-Part = tuple[slice, slice]
-"""Rows and columns of a map."""
+COARSEST = 2 ** (len(WIDTHS) - 1)  # Side of the coarsest scale's pixels. The origins of tiles are multiples of it.
+REACH = 96  # no pixel further away than this changes a result
+_DECODED = 4  # pixels of each scale that the decoder needs around a part of the map, at least
+Part = tuple[slice, slice]  # rows and columns of a map
 
 
 class RefineNet(nn.Module):
@@ -53,30 +40,29 @@ class RefineNet(nn.Module):
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
-            nn.ModuleList(_MaskedBlock(width) for _ in range(count))
+            nn.ModuleList(ResidualBlock(width) for _ in range(count))
             for width, count in zip(WIDTHS, ENCODING_BLOCKS, strict=True)
         )
         self.decode = nn.ModuleList(
-            nn.ModuleList(_MaskedBlock(width) for _ in range(count))
+            nn.ModuleList(ResidualBlock(width) for _ in range(count))
             for width, count in zip(WIDTHS, DECODING_BLOCKS, strict=False)
         )
         self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
 
     def forward(self, features: Tensor, mask: Tensor, inner: Part | None = None) -> tuple[Tensor, Tensor]:
-        """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside the mask.
+        """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H, W) of 1 and 0.
 
-        Args:
-            features: (B, CHANNELS, H, W), see refine_features; zero outside the mask.
-            mask: (B, 1, H, W), 1 inside, else 0.
-            inner: the part of the map that is wanted, whose bounds are multiples of COARSEST or the end; None for all.
-                The decoder leaves the rest out.
+        The features (B, CHANNELS, H, W) of refine_features are zero outside the mask, too. `inner` is the part of the
+        map that is wanted, whose bounds are multiples of COARSEST or the end; None for all. The decoder leaves the rest
+        out.
         """
         height, width = mask.shape[-2:]
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
         border = (0, -width % COARSEST, 0, -height % COARSEST)
-        layers = _type_of_layers(features)
-        # In training, the sums over the blocks stay in float32.
+        # The number format of the layers. In training, the sums over the blocks stay in float32.
+        device = features.device.type
+        layers = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else features.dtype
         stream = features.dtype if torch.is_grad_enabled() else layers
         masks = [pad(mask, border).to(layers)]
         for _ in self.down:
@@ -109,12 +95,6 @@ class RefineNet(nn.Module):
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
             corrected = corrected + weight * difference
         return unit_maps(corrected) * mask, (error + change[:, 3:5]) * mask
-
-
-def _type_of_layers(maps: Tensor) -> torch.dtype:
-    """Return the number format in which layers compute on these maps."""
-    device = maps.device.type
-    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps.dtype
 
 
 def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -153,26 +133,29 @@ def unit_maps(vectors: Tensor) -> Tensor:
 
 
 def _smoothed(normals: Tensor, median: Tensor, mask: Tensor) -> list[Tensor]:
-    """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask.
-
-    Normals weigh as much as they are certain: by one over the median of their errors, whose logarithm is given.
-    """
+    """Return the unit normals (B, 3, H, W) of a Gaussian filter of each of SIGMAS, zero outside the mask."""
+    # Normals weigh as much as they are certain: by one over the median of their errors, whose logarithm is given.
     weight = (-median.clamp(_LEAST_MEDIAN, _LARGEST_MEDIAN)).exp() * mask
-    found = []
-    for sigma in SIGMAS:
-        found.append(unit_maps(gaussian_sum(normals * weight, sigma)) * mask)
+    return [unit_maps(gaussian_sum(normals * weight, sigma)) * mask for sigma in SIGMAS]
+
+
+def reach_of(sigma: float) -> int:
+    """Return how many pixels to either side a filter of this width sees."""
+    return math.ceil(3 * sigma)
+
+
+def gaussian_sum(maps: Tensor, sigma: float) -> Tensor:
+    """Return sums of maps (..., H, W) with Gaussian weights, of which the largest is 1. Outside, maps count as zero."""
+    reach = reach_of(sigma)
+    kernel = [math.exp(-0.5 * (place / sigma) ** 2) for place in range(-reach, reach + 1)]
+    return _filtered(_filtered(maps, kernel, -1), kernel, -2)
+
+
+def _filtered(maps: Tensor, kernel: Sequence[float], axis: int) -> Tensor:
+    # Faster than convolutions of so few channels.
+    reach, size = len(kernel) // 2, maps.shape[axis]
+    padded = pad(maps, (reach, reach) if axis == -1 else (0, 0, reach, reach))
+    found = kernel[0] * padded.narrow(axis, 0, size)
+    for start, weight in enumerate(kernel[1:], 1):
+        found.add_(padded.narrow(axis, start, size), alpha=weight)
     return found
-
-
-class _MaskedBlock(nn.Module):
-    """x + conv3x3(relu(conv3x3(relu(x)))), zero outside the mask. It starts as the identity."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = zeroed(nn.Conv2d(width, width, 3, padding=1))
-
-    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        hidden = self.first(torch.relu(x)).mul_(mask).relu_()
-        change: Tensor = self.second(hidden).mul_(mask)
-        return change.add_(x) if change.dtype == x.dtype else x + change

@@ -7,12 +7,8 @@ from splinecli.fits.weighted_least_squares import weighted_sum
 from splinecli.maths.solve_3x3 import inverse_3x3, multiply_symmetric
 from splinecli.networks.layers import zeroed
 
-HEAD_WIDTH = 16
-"""Channels of an attention head."""
-
-DARKEST = 1e-3
-"""Added to observations before their logarithm is taken."""
-
+HEAD_WIDTH = 16  # channels of an attention head
+DARKEST = 1e-3  # added to observations before their logarithm is taken
 _PRIOR = 1e-4  # keeps the weighted least squares solvable where the weights leave fewer than three lights
 
 
@@ -38,11 +34,9 @@ class SetBranch(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return the pixels' tokens (P, width) and the unit normals (P, 3) of least squares.
 
-        Args:
-            observed, residual: (P, F), each pixel scaled to a largest observation of 1.
-            lights: (P, F, 3), unit, in the pixels' frames.
-            valid: (P, F) bool; None for all.
-            normals: (P, K, 3), the starting normals, unit or zero.
+        The observed values and residuals (P, F) of each pixel are scaled to a largest observation of 1. The lights (P,
+        F, 3) are unit, in the pixels' frames, `valid` (P, F) is None for all, and the starting normals (P, K, 3) are
+        unit or zero.
         """
         half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + DARKEST).log()

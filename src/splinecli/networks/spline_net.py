@@ -12,13 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from splinecli.fits.lambertian import fit_lambertian
-from splinecli.maths.observation_map import (
-    cell_directions,
-    map_scale,
-    rotate_about_view_axis,
-    sparse_map,
-    unit_disc,
-)
+from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis, sparse_map, unit_disc
 from splinecli.networks.config import NetworkConfig
 from splinecli.networks.li_net import CompactLINet, PaperLINet
 from splinecli.networks.ne_net import CompactNENet, PaperNENet
@@ -30,14 +24,10 @@ RESIDUAL_LIMIT = 3.0
 
 
 class Rotation(NamedTuple):
-    """A turn of the lights about the view axis, and a reflection.
+    """A turn of the lights about the view axis, and a reflection."""
 
-    Attributes:
-        turn_deg: angle in degrees, a number or (P,).
-        mirror: whether y is flipped after the turn. An isotropic pixel looks the same under its mirrored lights.
-    """
-
-    turn_deg: float | Tensor = 0.0
+    turn_deg: float | Tensor = 0.0  # angle in degrees, a number or (P,)
+    # whether y is flipped after the turn. An isotropic pixel looks the same under its mirrored lights.
     mirror: bool = False
 
 
@@ -45,34 +35,25 @@ NO_ROTATION = Rotation()
 
 
 class PixelMaps(NamedTuple):
-    """Observation maps of P pixels and what belongs to them, in each pixel's own frame.
+    """Observation maps of P pixels and what belongs to them, in each pixel's own frame."""
 
-    Attributes:
-        sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation.
-        lambertian_normals: (P, 3), unit.
-        scale: (P, 1), the largest observation, which is 1 in the maps.
-        fitted_normals: (P, K, 3), of the further fits in the configuration.
-        cosine, sine: (P,), of the turn from the capture's frame to the pixel's.
-        mirrored: whether y is flipped after the turn.
-        observed, residuals: (P, F), the scaled observations and their residuals.
-        lights: (P, F, 3), in the pixels' frames.
-        valid: (P, F) bool, or None for all.
-    """
-
+    # sparse, occupied, residual, lambertian_map: (P, 1, w, w); occupied is 1 in cells with an observation
     sparse: Tensor
     occupied: Tensor
     residual: Tensor
     lambertian_map: Tensor
-    lambertian_normals: Tensor
-    scale: Tensor
-    fitted_normals: Tensor
+    lambertian_normals: Tensor  # (P, 3), unit
+    scale: Tensor  # (P, 1), the largest observation, which is 1 in the maps
+    fitted_normals: Tensor  # (P, K, 3), of the further fits in the configuration
+    # cosine, sine: (P,), of the turn from the capture's frame to the pixel's
     cosine: Tensor
     sine: Tensor
-    mirrored: bool
+    mirrored: bool  # whether y is flipped after the turn
+    # observed, residuals: (P, F), the scaled observations and their residuals
     observed: Tensor
     residuals: Tensor
-    lights: Tensor
-    valid: Tensor | None
+    lights: Tensor  # (P, F, 3), in the pixels' frames
+    valid: Tensor | None  # (P, F) bool, or None for all
 
 
 class Estimate(NamedTuple):
@@ -117,9 +98,8 @@ class SplineNet(nn.Module):
     ) -> PixelMaps:
         """Build the maps of observations (P, F) under light_directions (F, 3) or (P, F, 3), in the pixels' frames.
 
-        Args:
-            valid: (P, F) bool, all by default; the others are left out.
-            rotation: a further rotation of the lights, after that to the canonical azimuth.
+        Those that are not valid (P, F) are left out. The rotation of the lights comes after that to the canonical
+        azimuth.
         """
         scale = map_scale(observations, valid)
         observed = observations / scale
@@ -199,11 +179,8 @@ class SplineNet(nn.Module):
     ) -> Estimate:
         """Return normals in the capture's frame, and their errors.
 
-        Args:
-            observations: (P, F), linear, divided by the light intensities; any scale.
-            light_directions: (F, 3) or (P, F, 3), unit; x right, y up, z to the camera.
-            valid: (P, F) bool, all by default; the others are left out.
-            rotation: see build_maps.
+        The observations (P, F) are linear, divided by the light intensities, of any scale. The light directions are
+        unit, (F, 3) or (P, F, 3); x right, y up, z to the camera. See build_maps for the others.
         """
         # Only the convolutions may run in bfloat16: the fits and the maps' geometry need every digit.
         with torch.autocast(observations.device.type, enabled=False):

@@ -27,13 +27,10 @@ STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
 def fit_normals(
     names: Sequence[str], observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
 ) -> Tensor:
-    """Return unit normals (P, K, 3) of K fits, zero where a fit has none.
+    """Return unit normals (P, K, 3) of K fits among STARTING_FITS, zero where a fit has none.
 
-    Args:
-        names: among STARTING_FITS.
-        observations: (P, F), each pixel scaled to a largest value of 1.
-        light_directions: (F, 3) or (P, F, 3), unit.
-        valid: (P, F) bool, all by default.
+    The observations (P, F) have a largest value of 1 in each pixel. The light directions are unit, (F, 3) or (P, F, 3).
+    `valid` is (P, F) bool, all by default.
     """
     if not names:
         return observations.new_zeros(len(observations), 0, 3)

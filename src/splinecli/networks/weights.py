@@ -14,8 +14,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
-from splinecli.networks.capture_head import CaptureHead
 from splinecli.networks.config import NetworkConfig
+from splinecli.networks.error_head import CaptureHead
 from splinecli.networks.light_net import LightNet
 from splinecli.networks.spline_net import SplineNet
 from splinecli.system.files import file_sha256, is_special, parse_json, write_bytes
@@ -35,16 +35,11 @@ SHIPPED = resources.files("splinecli") / "assets"
 
 @dataclass(frozen=True)
 class LoadedNetwork:
-    """A network that is ready to estimate normals (float32, evaluation mode).
-
-    Attributes:
-        name: the shipped name, or the file name without its suffix.
-        sha256: SHA-256 of the weight file.
-    """
+    """A network that is ready to estimate normals (float32, evaluation mode)."""
 
     network: SplineNet
-    name: str
-    sha256: str
+    name: str  # the shipped name, or the file name without its suffix
+    sha256: str  # SHA-256 of the weight file
 
 
 def tensors_sha256(tensors: dict[str, Tensor]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import encode_picture
-from splinecli.pictures.error_map import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
+from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 from splinecli.pictures.plotting import png_bytes
 from splinecli.pictures.png import Picture
 
@@ -41,12 +41,8 @@ def method_maps(
     maps are cropped to the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
     that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that have errors.
 
-    Args:
-        ground_truth: (H, W, 3) unit normals, zero where there is no ground truth.
-        mask: (H, W), not empty.
-        normal_maps: (H, W, 3) by method, in the order of the columns.
-        error_maps_deg: (H, W) by method, NaN where there is no error.
-        title: the title of the picture.
+    The ground truth (H, W, 3) is unit, or zero where there is none; the mask (H, W) is not empty. By method, in the
+    order of the columns, there are normals (H, W, 3) and errors (H, W), NaN where there is no error.
     """
     from matplotlib.figure import Figure
 

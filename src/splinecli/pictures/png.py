@@ -20,13 +20,8 @@ def encode_png(
 ) -> bytes:
     """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) of 8 or 16 bits.
 
-    Args:
-        picture: the picture.
-        texts: texts of the file by keyword, in Latin-1 (PNG specification, tEXt).
-        film: whether the values have the primaries and the transfer curve of a film (BT.709; cICP).
-
-    Raises:
-        OutputError: OpenCV cannot encode the picture.
+    It has texts by keyword, in Latin-1 (PNG specification, tEXt). The values of a film have the primaries and the
+    transfer curve of BT.709 (cICP). Raises OutputError if OpenCV cannot encode the picture.
     """
     import cv2
 

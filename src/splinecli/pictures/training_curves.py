@@ -7,29 +7,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splinecli.pictures.plotting import png_bytes
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI = 110
 _LARGEST_LINEAR_RATIO = 20  # An axis whose values span more is logarithmic.
 
 Columns = Mapping[str, Sequence[float | None]]
 
 
-def training_curves(columns: Columns) -> bytes:
-    """Draw the loss, the angular errors and the map errors against the step; PNG.
-
-    Args:
-        columns: the columns of metrics.csv by name, all of one length; None marks a value that was not computed.
-    """
-    return png_bytes(training_figure(columns), _DPI)
-
-
 def training_figure(columns: Columns) -> Figure:
-    """Return the matplotlib figure of `training_curves`."""
+    """Return a matplotlib figure of the loss, the angular errors and the map errors against the step.
+
+    `columns` are those of metrics.csv by name, all of one length; None marks a value that was not computed.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.6), layout="constrained")

@@ -22,17 +22,11 @@ class _Seen:
 
 
 class Arrivals:
-    """The captures in a folder that are complete and were not returned before.
+    """The captures in a folder, its subfolders, that are complete and were not returned before.
 
-    A capture is complete when it contains a file of a certain name, or when nothing in it has changed for some time.
-    Folders whose names begin with a dot are left out. One that changes after it was returned is returned again.
-
-    Args:
-        folder: the captures are its subfolders.
-        marker: the name of the file; None to wait for `seconds` without a change.
-        seconds: see marker.
-        without: a folder, such as that of the results, that is no capture and lies in none.
-        clock: a clock that never goes back, in seconds.
+    A capture is complete when it contains a file named `marker`, or, for None, when nothing in it has changed for some
+    seconds. Folders whose names begin with a dot are left out, and `without`, such as the folder of the results, which
+    is no capture and lies in none. One that changes after it was returned is returned again. The clock never goes back.
     """
 
     def __init__(
@@ -52,8 +46,7 @@ class Arrivals:
     def take(self) -> list[Path]:
         """Return the captures that became complete since the last call, in natural order of their names.
 
-        Raises:
-            InputError: the folder cannot be read.
+        Raises InputError if the folder cannot be read.
         """
         found = {path: _stamp(path) for path in self._subfolders()}
         self._seen = {path: seen for path, seen in self._seen.items() if path in found}

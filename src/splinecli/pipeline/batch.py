@@ -9,13 +9,12 @@ from pathlib import Path
 
 from splinecli.errors import InputError, ModelError, SplinecliError
 from splinecli.methods import Estimator, MethodOptions
-from splinecli.pipeline.capture_list import Member, Shard, list_captures
 from splinecli.pipeline.capture_memory import choose_workers, expected_bytes
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
 from splinecli.pipeline.infer import make_method
 from splinecli.pipeline.infer_options import InferOptions
-from splinecli.pipeline.member import Outcome, Redo, failed, run_member
+from splinecli.pipeline.member import Member, Outcome, Redo, Shard, failed, list_captures, run_member
 from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.results.index import INDEX, Entry, check_index_free, has_index, index_page, with_earlier
 from splinecli.system.files import check_writable, write_text

@@ -70,9 +70,8 @@ class CalibrateOptions:
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Calibrate the lights, write OUTPUT_FILES and return the report.
 
-    Raises:
-        InputError: an image or file cannot be used, or the numbers of images and lights differ.
-        OutputError: the results exist and `overwrite` is not set, or they cannot be written.
+    Raises InputError if an image or file cannot be used, or the numbers of images and lights differ, or OutputError if
+    the results exist and `overwrite` is not set, or they cannot be written.
     """
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)

@@ -8,8 +8,8 @@ from splinecli.capture import CaptureSource
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.image_size import capture_bytes
 from splinecli.errors import SplinecliError
-from splinecli.pipeline.capture_list import Member
 from splinecli.pipeline.infer_options import InferOptions
+from splinecli.pipeline.member import Member
 from splinecli.system.devices import choose_device, count_available_cores
 from splinecli.system.memory import available_memory
 

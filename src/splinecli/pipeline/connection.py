@@ -45,17 +45,11 @@ _QUIET = {
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterOptions:
-    """Where items are done.
+    """Where items are done."""
 
-    Args:
-        workers: the number of processes of this machine, if there is no `address`. 0 for as many as it can use.
-        address: the address of a Dask scheduler, or its scheduler file.
-        gpu: whether only workers with the Dask resource GPU are used.
-    """
-
-    workers: int = 1
-    address: str | None = None
-    gpu: bool = False
+    workers: int = 1  # the number of processes of this machine, if there is no `address`. 0 for as many as it can use.
+    address: str | None = None  # the address of a Dask scheduler, or its scheduler file
+    gpu: bool = False  # whether only workers with the Dask resource GPU are used
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
         """Return these options with a process for each core in place of 0, and at most one for each item.

@@ -58,19 +58,14 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Work:
-    """What all items of a command share. It travels with each item.
+    """What all items of a command share. It travels with each item."""
 
-    Args:
-        do: called with the arguments of an item. It returns the result, or raises what is wrong with the worker.
-        probe: a file in the output folder. Workers that do not see it have another storage.
-        folder: the working folder of the command, which its relative paths start from.
-        versions: of the packages that must be the same.
-    """
-
+    # called with the arguments of an item. It returns the result, or raises what is wrong with the worker.
     do: Callable[..., Any]
-    probe: str
+    probe: str  # a file in the output folder. Workers that do not see it have another storage.
+    # the working folder of the command, which its relative paths start from
     folder: str = field(default_factory=os.getcwd)
-    versions: dict[str, str] = field(default_factory=_versions)
+    versions: dict[str, str] = field(default_factory=_versions)  # of the packages that must be the same
 
     def enter(self) -> None:
         """Make this worker ready. Raises UsageError or InputError if it does not fit."""

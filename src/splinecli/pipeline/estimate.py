@@ -1,24 +1,93 @@
-"""From a capture to its normals, with all checks and warnings: for `infer` and for splinecli.estimate_normals."""
+"""From a capture to its normals, with all checks and warnings: for `infer` and for splinecli.estimate_normals.
+
+A distilled estimator replaces a network where that is faster, or where the user asks for it.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from splinecli.capture import Capture
-from splinecli.capture.capture_warnings import ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
+from splinecli.capture.capture_warnings import NOT_DISTILLED, ROUGH_LIGHTS, UNTRAINED_LIGHTS, CaptureWarning
 from splinecli.diagnosis.checks import check_confidence, refuse_if_strict
-from splinecli.inference import NormalEstimate, estimate_normals
+from splinecli.errors import UsageError
+from splinecli.inference import NormalEstimate, estimate_normals, light_on
 from splinecli.methods import Estimator
+from splinecli.methods.estimator import ConfidentEstimator, tells_confidence
 from splinecli.methods.near_light import find_surface
-from splinecli.pipeline.distillation import distil_for
+from splinecli.methods.student_size import FEWEST_PIXELS, StudentSize, student_sizes
 from splinecli.pipeline.observer import SILENT, Advance, Observer
-from splinecli.results.clock import Clock
+from splinecli.results.report import Clock
+from splinecli.system.devices import count_available_cores
 
 if TYPE_CHECKING:
     from splinecli.methods.distilled import DistilledEstimator
+
+AUTOMATIC_FROM = 100_000  # pixels: smaller captures are distilled only where the user asks for it
+GAIN = 2.0  # above that size, learning must be this many times as fast as the network; a GPU may not need it
+
+
+def distil_for(
+    capture: Capture, estimator: Estimator, wanted: bool | None, observer: Observer = SILENT
+) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
+    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and warnings.
+
+    A capture under near lamps has the points of its surface. `wanted` is None for the faster way. Raises UsageError if
+    it is wanted, but the method gives no confidence, or the capture is too small.
+    """
+    if wanted is False or (wanted is None and capture.n_pixels < AUTOMATIC_FROM):
+        return None, []
+    if not tells_confidence(estimator):
+        return _refuse(wanted, f"method {estimator.name} gives no confidence and cannot be distilled")
+    sizes = student_sizes(capture.n_pixels)
+    if sizes[0].sample < FEWEST_PIXELS:
+        return _refuse(wanted, f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
+    if wanted is None and not _is_faster(capture, estimator, sizes[0]):
+        return None, []
+    from splinecli.methods.distilled import distil
+
+    for size in sizes:
+        try:
+            with observer.progress(f"{capture.name}: learning", 2 * size.sample, unit="pixels") as advance:
+                distilled = distil(estimator, partial(light_on, capture), capture.n_pixels, size, progress=advance)
+        except UsageError as error:  # most pixels are a dark background
+            return _refuse(wanted, f"{capture.name}: {error.problem}")
+        if distilled.distillation.is_good:
+            return distilled, []
+    text = (
+        f"The network estimated every pixel. A small one learned from a sample, but was"
+        f" {distilled.distillation.mean_deg:.1f} degrees away from it, where it expects errors of"
+        f" {distilled.distillation.expected_deg:.1f} degrees."
+    )
+    return None, [CaptureWarning(NOT_DISTILLED, text)]
+
+
+def _refuse(wanted: bool | None, problem: str) -> tuple[None, list[CaptureWarning]]:
+    if wanted:
+        raise UsageError(problem, hint="Leave --distil out")
+    return None, []
+
+
+def _is_faster(capture: Capture, estimator: ConfidentEstimator, size: StudentSize) -> bool:
+    """Measure whether learning takes at most a GAIN-th of the time of the network on every pixel."""
+    from splinecli.methods.distilled import seconds_of_learning
+
+    count = max(1024, 256 * count_available_cores())  # a batch for each core
+    light = light_on(capture, np.linspace(0, capture.n_pixels - 1, count).astype(np.intp))
+    for _ in range(2):  # the first time, a GPU also loads its kernels
+        started = time.perf_counter()
+        estimator.estimate(light.observations, light.directions)
+        per_pixel = (time.perf_counter() - started) / len(light.observations)
+    learning = size.sample * per_pixel + seconds_of_learning(light.directions, size, estimator.device)
+    return GAIN * learning < capture.n_pixels * per_pixel
+
 
 _STAGES = {"removing indirect light": "indirect_light", "refining": "refine"}  # as the clock calls them
 
@@ -37,16 +106,10 @@ def estimate_capture(
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
     """Return the normals of a capture, which then has all warnings, and the distilled estimator if there was one.
 
-    Args:
-        capture: with the warnings from reading it.
-        estimator: the method.
-        check: returns the warnings about the capture's lights and images; see diagnosis/checks.py.
-        refine_lights: returns the capture with refined lights.
-        distil: see distil_for.
-        strict: raise InputError where a warning says that an input is probably wrong.
-        observer: receives the progress.
-        progress: called with the number of pixels that were just estimated, in place of the observer.
-        clock: is told of the stages.
+    The capture has the warnings from reading it. `check` returns those about its lights and images
+    (diagnosis/checks.py), and `refine_lights` the capture with refined lights. `distil` is as in distil_for. `progress`
+    is called with the number of pixels that were just estimated, in place of the observer. With `strict`, a warning
+    that an input is probably wrong is an InputError.
     """
     clock = clock or Clock()
     clock.begin("check")
@@ -70,15 +133,11 @@ def estimate_capture(
 
         advance = stages.enter_context(stage("estimating"))
         estimate = estimate_normals(capture, distilled or estimator, progress=progress or advance, stage=stage)
-    warnings += [*found, *_untrained_lights(estimator, capture), *check_confidence(estimate.expected_under_5)]
+    if estimator.weights is not None:
+        from splinecli.networks.weights import untrained_warning
+
+        texts = untrained_warning(estimator.weights["sha256"], capture.n_lights)
+        found = [*found, *(CaptureWarning(UNTRAINED_LIGHTS, text) for text in texts)]
+    warnings += [*found, *check_confidence(estimate.expected_under_5)]
     refuse_if_strict(warnings, capture.name, strict=strict)
     return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled
-
-
-def _untrained_lights(estimator: Estimator, capture: Capture) -> list[CaptureWarning]:
-    if estimator.weights is None:
-        return []
-    from splinecli.networks.weights import untrained_warning
-
-    warnings = untrained_warning(estimator.weights["sha256"], capture.n_lights)
-    return [CaptureWarning(UNTRAINED_LIGHTS, text) for text in warnings]

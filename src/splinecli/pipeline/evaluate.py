@@ -18,9 +18,8 @@ from splinecli.capture.restore.white_level import check_white_level
 from splinecli.errors import InputError, ModelError, UsageError
 from splinecli.evaluation.capture_figures import CaptureFigure, capture_figures, file_stems, has_observation_maps
 from splinecli.evaluation.document import TRIALS, make_plots, write_results
-from splinecli.evaluation.outcome import Evaluation
 from splinecli.evaluation.plan import distinct_names
-from splinecli.evaluation.protocol import Protocol
+from splinecli.evaluation.protocol import Evaluation, Protocol
 from splinecli.evaluation.run import DrawTask, Elsewhere, Scored, evaluate_all
 from splinecli.evaluation.trial_capture import CaptureReading, Notes, SharedDraw, TrialSource, open_to_score
 from splinecli.evaluation.trials import TrialStore
@@ -42,6 +41,8 @@ DEFAULT_LIGHTS = 10
 class EvaluateOptions:
     """The options of `evaluate`, as its help describes them.
 
+    Raises UsageError if a value is out of its range, or two options contradict each other.
+
     Args:
         methods: a name that comes twice counts once.
         n_lights: None in it stands for all lights; one evaluation for each. Empty for DEFAULT_LIGHTS, or for the
@@ -50,9 +51,6 @@ class EvaluateOptions:
         trials: None for DEFAULT_TRIALS. jobs: None for the cores, or for 1 on a GPU.
         pixels: (row, column) of each.
         cluster: the processes or machines that score trials; None for this process.
-
-    Raises:
-        UsageError: a value is out of its range, or two options contradict each other.
     """
 
     methods: tuple[str, ...] = (DEFAULT_METHOD,)
@@ -258,27 +256,21 @@ def _items(draws: Iterable[DrawTask]) -> Iterator[Item]:
 
 
 def _score(command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions, draw: DrawTask) -> Scored:
-    return _scorer(command, fingerprints, options).score(draw)
+    return _Scorer(command, fingerprints, options).score(draw)
 
 
 @lru_cache(maxsize=1)
-def _scorer(_command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> _Scorer:
-    """Return the scorer of the command that this worker serves: files may change until the next command."""
-    estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
-    for name, expected in fingerprints:
-        if (found := estimators[name].fingerprint) != expected:
-            raise ModelError(
-                f"{name} is {found} here, expected {expected} as on the machine of the command",
-                hint="Use the same weight file everywhere, and the same --precision",
-            )
-    return _Scorer(estimators)
-
-
 class _Scorer:
-    """Scores draws, and keeps the last capture in memory."""
+    """Scores draws of the command that this worker serves: files may change until the next. Keeps the last capture."""
 
-    def __init__(self, estimators: dict[str, Estimator]) -> None:
-        self._estimators = estimators
+    def __init__(self, _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions) -> None:
+        self._estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
+        for name, expected in fingerprints:
+            if (found := self._estimators[name].fingerprint) != expected:
+                raise ModelError(
+                    f"{name} is {found} here, expected {expected} as on the machine of the command",
+                    hint="Use the same weight file everywhere, and the same --precision",
+                )
         self._last: tuple[CaptureReading, TrialSource, Notes] | None = None
 
     def score(self, task: DrawTask) -> Scored:

@@ -9,11 +9,10 @@ from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film
 from splinecli.capture.stamp import digest, stamp_content
 from splinecli.errors import UsageError
 from splinecli.pictures.png import encode_png
+from splinecli.pipeline.infer_options import Reading
 from splinecli.pipeline.observer import Observer
-from splinecli.pipeline.reading import Reading
 from splinecli.system.files import read_json
-from splinecli.system.locks import RefusedFolderError
-from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
+from splinecli.system.publishing import RefusedFolderError, held_folder, is_plain, new_files, refuse_link
 
 FOLDER = "frames"  # the folder in the output folder of `infer` with a folder of frames for each film
 _RECORD = "film.json"

@@ -28,9 +28,8 @@ from splinecli.pipeline.observer import SILENT, Observer
 from splinecli.pipeline.surface import make_surface, view_of_report
 from splinecli.results import files
 from splinecli.results.albedo import albedo_map
-from splinecli.results.clock import Clock
 from splinecli.results.page import result_page
-from splinecli.results.report import report_of
+from splinecli.results.report import Clock, report_of
 from splinecli.surface.integration import relief_of_normals
 from splinecli.surface.mesh import check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface

@@ -18,10 +18,10 @@ from splinecli.errors import InputError, UsageError
 from splinecli.methods.student_size import student_sizes
 from splinecli.pictures.light_sky import sky_plot
 from splinecli.pipeline.capture_memory import BASE_BYTES, infer_bytes
-from splinecli.pipeline.distillation import AUTOMATIC_FROM
+from splinecli.pipeline.estimate import AUTOMATIC_FROM
 from splinecli.pipeline.films import unpacked
+from splinecli.pipeline.infer_options import Reading
 from splinecli.pipeline.observer import SILENT, Observer
-from splinecli.pipeline.reading import Reading
 from splinecli.system.files import check_free, write_bytes
 
 # Pixels a second on a laptop's processor; benchmarks/inference_speed.py measures those of your machine.

@@ -73,10 +73,8 @@ class IntegrateOptions:
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Integrate a normal map, write the surface and its report, and return the report.
 
-    Raises:
-        InputError: a file cannot be read, or the files do not fit together.
-        OutputError: the results exist and `overwrite` is not set, or they cannot be written.
-        UsageError: the stiffness or the largest step is negative.
+    Raises InputError if a file cannot be read, or the files do not fit together; OutputError if the results exist and
+    `overwrite` is not set, or cannot be written; UsageError if the stiffness or the largest step is negative.
     """
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")

@@ -13,14 +13,12 @@ from splinecli.pictures.png import encode_png
 from splinecli.pipeline.connection import ClusterOptions
 from splinecli.pipeline.distribution import Item, LostError, distributor
 from splinecli.pipeline.observer import SILENT, Advance, Observer
-from splinecli.pixel_sets.captures import CaptureChangedError, add_capture, name_captures
-from splinecli.pixel_sets.rendered import (
+from splinecli.pixel_sets.entries import (
+    CaptureChangedError,
     ScenePlan,
-    add_rendered,
-    add_scene,
-    has_scene,
+    add_capture,
     load_rendered,
-    render_planned,
+    name_captures,
     save_rendered,
 )
 from splinecli.pixel_sets.store import MANIFEST, PixelSet
@@ -82,10 +80,7 @@ def prepare_pixel_set(
                     observer.error(str(error))
                     skipped.append({"source": str(folder), "reason": str(error), "exit_code": error.exit_code})
                 advance(1)
-            if cluster is None:
-                _render_here(writer, plan, observer, advance)
-            else:
-                _render_on_workers(writer, plan, cluster, observer, advance)
+            _render_scenes(writer, plan, cluster, observer, advance)
         pixel_set = PixelSet(output, ())
         if len(writer):
             # Before the set counts as finished, so that a finished set has its own overview.
@@ -103,35 +98,38 @@ def prepare_pixel_set(
     }
 
 
-def _render_here(writer: PixelSetWriter, plan: ScenePlan, observer: Observer, advance: Advance) -> None:
-    for position in range(len(plan.names)):
-        done = 0.0
+def _render_scenes(
+    writer: PixelSetWriter, plan: ScenePlan, cluster: ClusterOptions | None, observer: Observer, advance: Advance
+) -> None:
+    """Render the scenes that the set does not have, and add them in the order of the plan, here or on workers.
 
-        def reach(share: float) -> None:
-            nonlocal done
-            advance(share - done)
-            done = share
+    Raises LostError if the workers of a scene were lost, after all other scenes, or what a worker or the set raises.
+    """
+    reached = 0.0
 
-        for name in add_scene(writer, plan, position, reach):
+    def reach(share: float) -> None:
+        nonlocal reached
+        advance(share - reached)
+        reached = share
+
+    def finish(position: int) -> None:
+        nonlocal reached
+        for name in plan.entry_names(position).values():
             observer.say(writer.describe(name))
         reach(1.0)
+        reached = 0.0
 
-
-def _render_on_workers(
-    writer: PixelSetWriter, plan: ScenePlan, cluster: ClusterOptions, observer: Observer, advance: Advance
-) -> None:
-    """Render the scenes that the set does not have, and add them in the order of the plan, as one process does.
-
-    A worker writes a scene to a hidden file of the set. This process alone adds it to the set.
-
-    Raises:
-        LostError: the workers of a scene were lost. The other scenes are in the set.
-        SplinecliError: what add_scene or Distributor.run raises.
-    """
-    numbers = range(len(plan.names))
-    missing = [number for number in numbers if not has_scene(writer, plan, number)]
-    in_set = ((number, None) for number in numbers if number not in missing)
+    positions = range(len(plan.names))
+    missing = [p for p in positions if not all(name in writer for name in plan.entry_names(p).values())]
+    if cluster is None:
+        for position in positions:
+            if position in missing:
+                plan.add(writer, position, *plan.render(position, reach))
+            finish(position)
+        return
+    in_set = ((position, None) for position in positions if position not in missing)
     rendered: dict[int, str | LostError | None] = {}
+    # A worker writes a scene to a hidden file of the set. This process alone adds it to the set.
     render = partial(_render, replace(plan), writer.folder)  # the plan without what it has read from files
     position = 0
     try:
@@ -143,12 +141,10 @@ def _render_on_workers(
                     shape = rendered[position]
                     if isinstance(shape, str):
                         path = _path(writer.folder, position)
-                        add_rendered(writer, plan, position, shape, load_rendered(path))
+                        plan.add(writer, position, shape, load_rendered(path))
                         path.unlink()
                     if not isinstance(shape, LostError):
-                        for name in plan.entry_names(position).values():
-                            observer.say(writer.describe(name))
-                        advance(1)
+                        finish(position)
                     position += 1
     finally:
         for number in missing:
@@ -165,6 +161,6 @@ def _path(folder: Path, position: int) -> Path:
 def _render(plan: ScenePlan, folder: Path, position: int) -> str:
     """Render a scene on a worker, write it to its hidden file, and return what was rendered."""
     plan.check_inputs()
-    shape, pixels = render_planned(plan, position)
+    shape, pixels = plan.render(position)
     save_rendered(pixels, _path(folder, position))
     return shape

@@ -35,17 +35,10 @@ def make_surface(
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and what the reports say of it.
 
-    Args:
-        normal_map, mask, camera_matrix, stiffness, prior_detail, progress: see integrate_normals.
-        colours, largest_step: see surface_mesh.
-        n_triangles: see decimated_mesh. None keeps all triangles.
-        pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a surface in pixels,
-            or, with a camera matrix, in mean depths.
-        prior: see integrate_normals; in the unit of the surface. With a camera matrix this is the millimetre, so that
-            pixel_size_mm is not needed.
-
-    Raises:
-        InputError, UsageError: see integrate_normals, surface_mesh and decimated_mesh.
+    Arguments and errors are those of integrate_normals, surface_mesh and decimated_mesh. Without `n_triangles`, the
+    mesh keeps all. `pixel_size_mm` is the width of a pixel on the object, for a surface in millimetres; None for one in
+    pixels, or, with a camera matrix, in mean depths. The prior is in the unit of the surface. With a camera matrix this
+    is the millimetre, so that pixel_size_mm is not needed.
     """
     if prior is not None and camera_matrix is None and pixel_size_mm is not None:
         prior = prior / pixel_size_mm
@@ -82,12 +75,8 @@ def view_of_report(
 ) -> tuple[NDArray[np.float64] | None, float | None]:
     """Return camera matrix and pixel size in millimetres of the normal map that a report of `infer` describes.
 
-    Args:
-        report: see report_of.
-        camera_matrix, pixel_size_mm: of the photographs, in place of those of the report.
-
-    Raises:
-        KeyError, TypeError, ValueError, UsageError: it is no report of this version of `infer`.
+    `camera_matrix` and `pixel_size_mm` are those of the photographs, in place of those of the report. Raises KeyError,
+    TypeError, ValueError or UsageError if it is no report of this version of `infer`.
     """
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])

@@ -19,26 +19,17 @@ from splinecli.synthesis.lights import draw_light_counts, rank_in_cone
 _MAPPED_BYTES = 128 << 20
 # The operating system reads this much around the first byte of a page.
 _READ_AHEAD_BYTES = 64 << 10
-
-FILL_ROUNDS = 3
-"""Each round fills gaps one cell further from the cells with a light."""
+FILL_ROUNDS = 3  # each round fills gaps one cell further from the cells with a light
 
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """The truth behind P pixels of a pixel set, under up to F lights each.
+    """The truth behind P pixels of a pixel set, under up to F lights each."""
 
-    Attributes:
-        normals: (P, 3) unit normals.
-        radiance: (P, F).
-        light_directions: (P, F, 3) unit vectors towards the lights.
-        known: (P, F), False for the padding of pixels with fewer lights.
-    """
-
-    normals: Tensor
-    radiance: Tensor
-    light_directions: Tensor
-    known: Tensor
+    normals: Tensor  # (P, 3) unit normals
+    radiance: Tensor  # (P, F)
+    light_directions: Tensor  # (P, F, 3) unit vectors towards the lights
+    known: Tensor  # (P, F), False for the padding of pixels with fewer lights
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> SampledPixels:
         """Rotate each pixel about the view axis by its own angle, given as cosine (P,) and sine (P,)."""
@@ -53,18 +44,11 @@ class SampledPixels:
 
 
 def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
-    """Interpolate the cells that lie between cells with a value.
+    """Interpolate the cells between cells with a value: these are `known` in the result, and all usable ones `filled`.
 
-    A cell without a value gets the weighted mean of its eight neighbours in each of FILL_ROUNDS rounds. A cell
-    whose neighbours all lie on one side of it stays empty.
-
-    Args:
-        values: (P, 1, w, w) observations.
-        known: (P, 1, w, w), 1 in cells with an observation, else 0.
-        inside: (w, w), 1 in the unit disc. Cells outside stay empty.
-
-    Returns:
-        The filled maps, with the given cells as `known` and all usable cells as `filled`.
+    A cell without a value gets the weighted mean of its eight neighbours in each of FILL_ROUNDS rounds. A cell whose
+    neighbours all lie on one side of it stays empty. Values and `known`, 1 in cells with an observation, else 0, are
+    (P, 1, w, w); `inside` (w, w) is 1 in the unit disc, outside of which cells stay empty.
     """
     near = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 0.0, 2.0], [1.0, 2.0, 1.0]])
     across = near * values.new_tensor([-1.0, 0.0, 1.0])
@@ -87,11 +71,7 @@ class PixelSetSource:
     """
 
     def __init__(
-        self,
-        pixel_set: PixelSet,
-        entries: Sequence[Entry],
-        config: CaptureConfig,
-        generator: torch.Generator,
+        self, pixel_set: PixelSet, entries: Sequence[Entry], config: CaptureConfig, generator: torch.Generator
     ) -> None:
         self.pixel_set = pixel_set
         self.entries = tuple(entries)

@@ -40,25 +40,15 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Entry:
-    """The description of an entry in the manifest.
+    """The description of an entry in the manifest."""
 
-    Attributes:
-        name: the folder of the entry, unique in its set.
-        scene: entries of one scene share their shape, so that all of them train or all of them validate.
-        source: where the pixels come from, for the user.
-        recipe: plain values that decide the content of the entry.
-        n_pixels: P.
-        n_lights: F.
-        sha256: checksum of each array file by the name of the array.
-    """
-
-    name: str
-    scene: str
-    source: str
-    recipe: dict[str, Any]
-    n_pixels: int
-    n_lights: int
-    sha256: dict[str, str]
+    name: str  # the folder of the entry, unique in its set
+    scene: str  # entries of one scene share their shape, so that all of them train or all of them validate
+    source: str  # where the pixels come from, for the user
+    recipe: dict[str, Any]  # plain values that decide the content of the entry
+    n_pixels: int  # P
+    n_lights: int  # F
+    sha256: dict[str, str]  # checksum of each array file by the name of the array
 
 
 @dataclass(frozen=True)
@@ -90,15 +80,12 @@ class PixelSet:
 def open_pixel_set(folder: Path) -> PixelSet:
     """Open a set after comparing every file with the checksums in its manifest.
 
-    Raises:
-        InputError: the set is unfinished or empty, or a file is missing or changed. The error names the file.
+    Raises InputError if the set is unfinished or empty, or a file is missing or changed. The error names the file.
     """
     manifest = read_manifest(folder)
     if manifest.get("complete") is not True:
         raise InputError(
-            "the pixel set is not finished",
-            path=folder,
-            hint="Run the same 'splinecli prepare' again to finish it",
+            "the pixel set is not finished", path=folder, hint="Run the same 'splinecli prepare' again to finish it"
         )
     pixel_set = PixelSet(folder, tuple(parse_entries(manifest, folder)))
     if not pixel_set.entries:

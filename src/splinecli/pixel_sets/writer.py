@@ -9,19 +9,9 @@ import numpy as np
 
 from splinecli import __version__
 from splinecli.errors import OutputError
-from splinecli.pixel_sets.store import (
-    ARRAYS,
-    FORMAT,
-    MANIFEST,
-    Entry,
-    Pixels,
-    PixelSet,
-    parse_entries,
-    read_manifest,
-)
+from splinecli.pixel_sets.store import ARRAYS, FORMAT, MANIFEST, Entry, Pixels, PixelSet, parse_entries, read_manifest
 from splinecli.system.files import check_writable, file_sha256, write_text
-from splinecli.system.locks import LOCK
-from splinecli.system.publishing import new_files
+from splinecli.system.publishing import LOCK, new_files
 
 
 class PixelSetWriter:
@@ -63,11 +53,7 @@ class PixelSetWriter:
         return self._entries[name].recipe
 
     def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
-        """Compare the recipe of an entry of the set with the one asked for.
-
-        Returns:
-            The first setting that differs and its two values, in words. None if the recipes are equal.
-        """
+        """Return the first setting in which the recipe of an entry differs from another and both values, or None."""
         asked, found = _plain(recipe), self._entries[name].recipe
         for key in [*asked, *found]:
             if asked.get(key) != found.get(key):
@@ -82,8 +68,7 @@ class PixelSetWriter:
     def add(self, name: str, scene: str, source: str, recipe: dict[str, Any], pixels: Pixels) -> None:
         """Write an entry of at least one pixel, in place of an earlier entry of that name.
 
-        Raises:
-            OutputError: it cannot be written. The other entries are then as they were before.
+        Raises OutputError if it cannot be written. The other entries are then as they were before.
         """
         n_pixels, n_lights = pixels.observations.shape
         checksums = {}

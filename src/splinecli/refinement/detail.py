@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from splinecli.networks.gaussian import gaussian_sum, reach_of
-from splinecli.networks.refine_net import unit_maps
+from splinecli.networks.refine_net import gaussian_sum, reach_of, unit_maps
 from splinecli.refinement.halving import enlarge
 
 FINE = 1.5

@@ -23,17 +23,12 @@ def albedo_map(
     """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light reaches.
 
     A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the lights that agree with
-    the pixel's median of I / (n.l). Its scale is that of the images divided by the light intensities, so it is known
-    up to one factor for the whole capture unless the intensities are absolute.
+    the pixel's median of I / (n.l). Its scale is that of the images divided by the light intensities, so it is known up
+    to one factor for the whole capture unless the intensities are absolute.
 
-    Args:
-        source: the source of the capture. Its images are read again, one at a time, for their colours.
-        capture: what the source read; under near lamps, with the points of its surface.
-        normal_map: (H, W, 3), unit in the capture's mask.
-        progress: called once after each image.
-
-    Raises:
-        InputError: an image can no longer be read.
+    The images of the source are read again, one at a time, for their colours; `progress` is called after each. The
+    capture is what the source read; under near lamps, with the points of its surface. The normal map (H, W, 3) is unit
+    in its mask. Raises InputError if an image can no longer be read.
     """
     normals = take_pixels(normal_map, capture.mask)
     counts = np.empty(capture.observations.shape, np.bool_)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -15,22 +14,22 @@ from splinecli.capture import Capture
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.maths.derivatives import curvature_of_normals, gradient_of_normals
 from splinecli.maths.normals import Convention, describe, encode_picture
-from splinecli.pictures.error_map import error_map_picture
 from splinecli.pictures.maps import (
     albedo_picture,
     confidence_picture,
+    error_map_picture,
     preview_picture,
     signed_picture,
 )
 from splinecli.pictures.png import encode_png
-from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, file_names
+from splinecli.surface.surface_files import SURFACE_FILES, SURFACE_REPORT, encode_tiff, file_names
 from splinecli.system.exr import encode_exr
 from splinecli.system.files import read_json
 from splinecli.system.publishing import Content, is_plain, new_files
 
 if TYPE_CHECKING:
     from splinecli.inference import NormalEstimate
-    from splinecli.results.clock import Clock
+    from splinecli.results.report import Clock
 
 NORMALS = {
     "png": "normals.png",
@@ -65,9 +64,7 @@ MAPS = {
 }
 """The files of each optional map."""
 
-SCALED_MAPS = ("curvature", "relief")
-"""Maps whose picture has a fixed scale, which the user may choose."""
-
+SCALED_MAPS = ("curvature", "relief")  # maps whose picture has a fixed scale, which the user may choose
 OWN_FILES = (
     *NORMALS.values(),
     ERROR_MAP,
@@ -98,19 +95,11 @@ def write_estimate(
     clock: Clock,
     more: Iterable[tuple[str, Content]] = (),
 ) -> dict[str, Any]:
-    """Write the results of a capture into `folder` and return the finished report.
+    """Write the results of a capture into `folder` and return the report of report_of, finished.
 
-    The files replace those of an earlier run in the folder (see new_files). The caller holds the folder.
-
-    Args:
-        report: what report_of returned.
-        formats: keys of NORMALS.
-        convention: whether green is y up or y down in pictures of normals.
-        clock: tells the seconds of all stages, of which writing is the last.
-        more: names and contents of further files of OWN_FILES.
-
-    Raises:
-        OutputError: a file cannot be written.
+    The files replace those of an earlier run in the folder (see new_files), which the caller holds. The formats are
+    keys of NORMALS; `more` are names and contents of further files of OWN_FILES. Writing is the last stage of the
+    clock. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = [name for name in OWN_FILES if name != FOUND_MASK] + own_light_files(folder)
@@ -237,9 +226,4 @@ def _value_files(names: tuple[str, str], values: NDArray[np.float32], descriptio
     """Yield a map (H, W) or (H, W, C) as a float32 NPY file and, with tiff, as a TIFF file with a description."""
     yield names[0], values
     if tiff:
-        import tifffile
-
-        file = BytesIO()
-        layout = "contig" if values.ndim == 3 else None
-        tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
-        yield names[1], file.getvalue()
+        yield names[1], encode_tiff(values, description)

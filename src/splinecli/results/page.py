@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths.normals import unit
-from splinecli.pictures.error_map import TICKS, TOP_DEG, colour_errors
-from splinecli.pictures.maps import PREVIEW_LIGHT, albedo_picture, confidence_picture
+from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, albedo_picture, colour_errors, confidence_picture
 from splinecli.pictures.png import Picture, encode_png
 from splinecli.results.templates import render
 
@@ -37,7 +36,8 @@ def result_page(
 
     Maps over LARGEST_MAP or LONGEST_SIDE are reduced, with their proportions kept. A pixel of a reduced map is the mean
     of the values that are in the mask (or have an error) in its area; mean normals are scaled to unit length. The page
-    states its size then. The figures on the page are those of the report, over all pixels.
+    states its size then. The figures on the page are those of the report, over all pixels. Raises OutputError if a
+    picture cannot be encoded.
 
     Args:
         report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths on
@@ -48,9 +48,6 @@ def result_page(
         confidence_map: (H, W), probabilities.
         error_map_deg: (H, W) degrees, NaN where there is no error.
         light_plot: a PNG of the lights, where they were found from the images.
-
-    Raises:
-        OutputError: a picture cannot be encoded.
     """
     normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
     maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))

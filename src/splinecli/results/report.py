@@ -1,6 +1,7 @@
-"""The report that `infer` writes for a capture, report.json."""
+"""The report that `infer` writes for a capture, report.json, and the clock of its stages."""
 
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -10,6 +11,31 @@ from splinecli import __version__
 from splinecli.capture.stored import name_reading
 from splinecli.inference import NormalEstimate
 from splinecli.methods import Estimator
+
+STAGES = ("read", "check", "distil", "estimate", "indirect_light", "refine", "pictures", "surface", "write")
+"""The stages, in their order, but for page.html: it is one of the pictures, and comes after the surface."""
+
+
+class Clock:
+    """Adds up the seconds of stages, each of which ends where the next one begins. The first is reading."""
+
+    def __init__(self) -> None:
+        self._seconds = dict.fromkeys(STAGES, 0.0)
+        self._stage, self._since = STAGES[0], time.perf_counter()
+
+    def begin(self, stage: str) -> None:
+        """End the current stage and begin one of STAGES."""
+        now = time.perf_counter()
+        self._seconds[self._stage] += now - self._since
+        self._stage, self._since = stage, now
+
+    def seconds(self) -> dict[str, float]:
+        """Return the seconds of each stage so far, and of all together as `total`."""
+        self.begin(self._stage)
+        return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
+            "total": round(sum(self._seconds.values()), 3)
+        }
+
 
 SCHEMA = 2  # rises when a field of the report changes its meaning
 
@@ -26,14 +52,9 @@ def report_of(
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without the surface.
 
-    write_estimate adds `seconds`, `folder` and `files`.
-
-    Args:
-        options: the options of the run, ready for JSON.
-        inputs: a digest that changes when an input file changes.
-        light_file: the file that gave the lights; None where they were found from the images.
-        as_stored: whether the capture was read without any restoration.
-        distillation: what DistilledEstimator.report returns; None where the method estimated every pixel.
+    write_estimate adds `seconds`, `folder` and `files`. The options are ready for JSON. `inputs` is a digest that
+    changes when an input file changes. `light_file` is None where the lights were found from the images, and
+    `distillation`, what DistilledEstimator.report returns, where the method estimated every pixel.
     """
     capture = estimate.capture
     intensities, errors, expected = capture.estimated_intensities, estimate.errors, estimate.expected_under_5

@@ -1,4 +1,4 @@
-"""The equations of bilateral normal integration, and their weights.
+"""The equations of bilateral normal integration, their weights, and their linear solver.
 
 The unknown is one height h per pixel, in pixels: z itself for an orthographic camera, -f log(depth) for a pinhole
 camera of focal length f. The normal n of a pixel fixes how h changes towards the next pixel on the right and below:
@@ -23,6 +23,7 @@ far as the normal is contradicted, with r the larger residual of the two sides:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +33,8 @@ from splinecli.surface.camera import focal_length, pixel_rays, ray_basis
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int32]
-
-STIFFNESS = 2.0
-"""How easily the surface tears, as in the paper."""
-
-CONTRADICTION = 0.3
-"""Residual that contradicts a normal: that of a frontal one which is off by 17 degrees."""
+STIFFNESS = 2.0  # how easily the surface tears, as in the paper
+CONTRADICTION = 0.3  # residual that contradicts a normal: that of a frontal one which is off by 17 degrees
 
 # The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a third or more, so
 # the normal says nothing reliable about the height. The equations of the neighbours fix the height of such pixels, and
@@ -47,25 +44,17 @@ SMALLEST_COSINE = 0.05
 
 @dataclass(frozen=True)
 class BilateralEquations:
-    """The equations of P pixels.
+    """The equations of P pixels."""
 
-    Args:
-        facing: (P,), zero where the normal is not usable.
-        slants: (P,) along the rows and (P,) along the columns, zero where the normal is not usable.
-        pairs: the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the
-            left or above, and (E,) pixel numbers on the right or below.
-    """
-
-    facing: Floats
-    slants: tuple[Floats, Floats]
+    facing: Floats  # (P,), zero where the normal is not usable
+    slants: tuple[Floats, Floats]  # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
+    # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel numbers on the left or
+    # above, and (E,) pixel numbers on the right or below.
     pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
 
     @classmethod
     def from_normals(
-        cls,
-        normal_map: NDArray[np.floating],
-        mask: NDArray[np.bool_],
-        camera_matrix: NDArray[np.floating] | None,
+        cls, normal_map: NDArray[np.floating], mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating] | None
     ) -> BilateralEquations:
         """Return the equations of a normal map (H, W, 3) at the pixels of a mask (H, W)."""
         normals = unit(normal_map[mask].astype(np.float64))
@@ -118,3 +107,86 @@ class BilateralEquations:
 def _pairs(near: Pixels, far: Pixels) -> tuple[Pixels, Pixels]:
     both = (near >= 0) & (far >= 0)
     return near[both], far[both]
+
+
+# Small costs on the change of gaps and of heights in one solve; the equations have costs up to 1. Pixels that no
+# equation ties to others keep their heights, and the system is never singular.
+_DAMPING_OF_GAPS = 1e-7
+_DAMPING_OF_HEIGHTS = 1e-12
+_MAX_STEPS = 200
+_STEPS_BEFORE_RENEWAL = 15  # above this number of steps, a new preconditioner saves more time than it costs
+
+
+class LaplacianSolver:
+    """Solve the normal equations of pairs of neighbours again and again, with other weights each time.
+
+    The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients with an algebraic
+    multigrid preconditioner.
+
+    The setup of multigrid costs as much as several solves, so it is kept while the weights stay similar.
+    """
+
+    def __init__(self, pairs: tuple[tuple[Pixels, Pixels], ...], n_pixels: int) -> None:
+        from scipy.sparse import csr_matrix
+
+        self._near = np.concatenate([near for near, _ in pairs])
+        self._far = np.concatenate([far for _, far in pairs])
+        self._n_pixels = n_pixels
+        self._preconditioner: Any = None
+        # The matrix always has the same pattern. A matrix of positions says which value goes where.
+        pixels = np.arange(n_pixels, dtype=np.int32)
+        rows = np.concatenate((self._near, self._far, pixels))
+        columns = np.concatenate((self._far, self._near, pixels))
+        positions = np.arange(len(rows), dtype=np.int32)
+        self._pattern = csr_matrix((positions, (rows, columns)), shape=(n_pixels, n_pixels))
+
+    def solve(
+        self,
+        weights: Floats,
+        flows: Floats,
+        *,
+        precision: float,
+        pull: Floats | float = 0.0,
+        distance: Floats | float = 0.0,
+    ) -> Floats:
+        """Return the change of heights (P,) that minimises the sum of squares, to a relative residual of `precision`.
+
+        Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is
+        half the second derivative by the height of each pixel, of what pulls it to a known height, and `distance` (P,)
+        that of the heights above these known ones.
+        """
+        from pyamg import ruge_stuben_solver
+        from scipy.sparse.linalg import cg
+
+        matrix = self._laplacian(weights + _DAMPING_OF_GAPS, pull)
+        if self._preconditioner is None:
+            # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up and to use.
+            self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
+        steps = 0
+
+        def count(_: Floats) -> None:
+            nonlocal steps
+            steps += 1
+
+        change: Floats
+        change, _ = cg(
+            matrix,
+            self._sum(flows, self._near) - self._sum(flows, self._far) - pull * distance,
+            rtol=precision,
+            maxiter=_MAX_STEPS,
+            M=self._preconditioner,
+            callback=count,
+        )
+        if steps > _STEPS_BEFORE_RENEWAL:
+            self._preconditioner = None
+        return change
+
+    def _laplacian(self, weights: Floats, pull: Floats | float) -> Any:
+        from scipy.sparse import csr_matrix
+
+        diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + _DAMPING_OF_HEIGHTS + pull
+        values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
+        return csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
+
+    def _sum(self, of_pairs: Floats, pixels: Pixels) -> Floats:
+        return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

@@ -14,15 +14,10 @@ Floats = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Blocks:
-    """The blocks of step x step pixels that contain a pixel of the object.
+    """The blocks of step x step pixels that contain a pixel of the object."""
 
-    Args:
-        mask: (h, w) bool, true for these blocks; p of them.
-        step: pixels along a side of a block.
-    """
-
-    mask: NDArray[np.bool_]
-    step: int
+    mask: NDArray[np.bool_]  # (h, w) bool, true for these blocks; p of them
+    step: int  # pixels along a side of a block
 
     @classmethod
     def over(cls, mask: NDArray[np.bool_], number: int) -> Blocks:

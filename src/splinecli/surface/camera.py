@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError, UsageError
 
 Floats = NDArray[np.float64]
-
-_LARGEST = 1e6
-"""Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular."""
+_LARGEST = 1e6  # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
 
 
 def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> Floats:
     """Return the points (P, 3) at depth 1, z = -1, that a camera at the origin sees in the pixels of a mask (H, W).
 
-    Raises:
-        UsageError: the camera matrix is not 3 x 3.
-        InputError: the numbers are not those of a camera matrix.
+    Raises UsageError if the camera matrix is not 3 x 3, or InputError if the numbers are not those of a camera matrix.
     """
     rows, columns = np.nonzero(mask)
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
@@ -31,12 +27,9 @@ def pixel_rays(mask: NDArray[np.bool_], camera_matrix: NDArray[np.floating]) -> 
 def image_points(
     points: NDArray[np.floating], shape: tuple[int, ...], camera_matrix: NDArray[np.floating] | None
 ) -> Floats:
-    """Return the columns and rows (P, 2) at which a camera sees points (P, 3).
+    """Return the columns and rows (P, 2) at which a camera (3, 3), or an orthographic one for None, sees points (P, 3).
 
-    Args:
-        points: from the camera, or, without a camera matrix, in pixels from the centre of the image.
-        shape: height and width of the image.
-        camera_matrix: (3, 3), or None for an orthographic camera.
+    The points are from the camera, or for None in pixels from the centre of the image of `shape`, height and width.
     """
     if camera_matrix is None:
         return np.asarray(points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64)

@@ -16,21 +16,11 @@ from splinecli.errors import InputError
 from splinecli.maths.normals import unit
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length, image_points, ray_basis
-from splinecli.surface.mesh import (
-    SurfaceMesh,
-    fill_outside,
-    surface_mesh,
-    texture_coordinates,
-    vertex_normals,
-)
+from splinecli.surface.mesh import SurfaceMesh, fill_outside, surface_mesh, texture_coordinates, vertex_normals
 from splinecli.system.extras import import_extra
 
-TRIANGLES_LEFT = 4
-"""Triangles before decimation, over those after it, at least."""
-
-LARGE_MAP = 500_000
-"""Pixels from which the triangles of a map are so many that those of blocks are decimated."""
-
+TRIANGLES_LEFT = 4  # triangles before decimation, over those after it, at least
+LARGE_MAP = 500_000  # pixels from which the triangles of a map are so many that those of blocks are decimated
 _TRIANGLES = 50_000  # at a time
 _OUTSIDE = 1e-6  # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
 _FLATTEST = 1e-9  # square pixels: triangles that the camera sees from the side cover nothing
@@ -146,19 +136,12 @@ def _tangents(
 
 
 def _normal_texture(
-    points: Floats,
-    triangles: NDArray[np.integer],
-    normals: Floats,
-    tangents: Floats,
-    normal_map: NDArray[np.floating],
+    points: Floats, triangles: NDArray[np.integer], normals: Floats, tangents: Floats, normal_map: NDArray[np.floating]
 ) -> NDArray[np.uint8]:
     """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the nearest inside.
 
-    Args:
-        points: (V, 2), the columns and rows of the vertices in the image.
-        triangles: (T, 3), numbers of vertices.
-        normals, tangents: (V, 3), unit.
-        normal_map: (H, W, 3), unit on the object, zero outside.
+    `points` (V, 2) are the columns and rows of the vertices in the image. The normal map (H, W, 3) is zero off the
+    object.
     """
     texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
     known = np.zeros(normal_map.shape[:2], np.bool_)
@@ -210,15 +193,12 @@ def _covered_pixels(
 
 
 def _barycentric_forms(corners: Floats) -> Floats:
-    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates.
-
-    They are not finite for triangles that cover nothing.
-    """
+    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
     area = np.einsum("tcx,tcx->tc", normal, corners - following)
-    area[np.abs(area) < _FLATTEST] = np.nan
+    area[np.abs(area) < _FLATTEST] = np.nan  # a triangle that covers nothing
     normal = normal / area[..., None]
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 

@@ -3,7 +3,7 @@
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes: the surface tears only
 where it contradicts the normals, and large maps are integrated from coarse to fine. A coarse surface from elsewhere may
 give what is wider than some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and
-normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations, `laplacian` the linear solver.
+normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the linear solver.
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
-from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations
+from splinecli.surface.bilateral_equations import SMALLEST_COSINE, STIFFNESS, BilateralEquations, LaplacianSolver
 from splinecli.surface.blocks import Blocks
 from splinecli.surface.camera import focal_length
-from splinecli.surface.laplacian import LaplacianSolver
 
 Floats = NDArray[np.float64]
 
@@ -41,8 +40,7 @@ _MIXED_DEG = 20.0  # between a block's mean normal and one of its normals: the b
 RELIEF_WIDTH = 64.0
 """Waves of this width in pixels keep half of their height; the normals' small errors over wider ones do not count."""
 
-Progress = Callable[[float], object]
-"""Called with the share of the work that was just done."""
+Progress = Callable[[float], object]  # called with the share of the work that was just done
 
 
 def integrate_normals(
@@ -96,18 +94,11 @@ def integrate_normals(
 
 
 def relief_of_normals(normal_map: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask.
+    """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
-    Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals, pulled to
-    height zero. Of a wave of k radians per pixel, this share is kept:
-    k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2).
-
-    Args:
-        normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
-        mask: (H, W).
-
-    Raises:
-        InputError: the mask is empty.
+    Without the shape in the large, it shows dents, scratches and tool marks: the surface of the normals (H, W, 3),
+    pulled to height zero. Of a wave of k radians per pixel, this share is kept: k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2).
+    Raises InputError if the mask is empty.
     """
     flat = np.zeros(mask.shape)
     return integrate_normals(normal_map, mask, stiffness=0, prior=flat, prior_detail=RELIEF_WIDTH).astype(np.float32)
@@ -154,11 +145,7 @@ def _integrate(surface: _Surface, stiffness: float, progress: Progress) -> Float
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
-        of_blocks[blocks.mask] = _integrate(
-            coarse,
-            stiffness,
-            lambda share: progress((1 - own_share) * share),
-        )
+        of_blocks[blocks.mask] = _integrate(coarse, stiffness, lambda share: progress((1 - own_share) * share))
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights

@@ -17,27 +17,20 @@ from splinecli.surface.camera import focal_length, image_points, pixel_rays
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """A triangle mesh with the textures of its image.
+    """A triangle mesh with the textures of its image."""
 
-    Args:
-        vertices: (V, 3) float32.
-        triangles: (T, 3) int32, the numbers of three vertices each, counter-clockwise as the camera sees them.
-        normals: (V, 3) float32, unit.
-        uvs: (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from
-            0 at the top to 1 at the bottom, as in glTF.
-        texture: (H, W, 3) uint8, sRGB colours, or None.
-        normal_texture: (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where
-            `normals` are exact. See decimation.py.
-        tangents: (V, 3) float32, unit, where there is a normal texture.
-    """
-
-    vertices: NDArray[np.float32]
+    vertices: NDArray[np.float32]  # (V, 3) float32
+    # (T, 3) int32, the numbers of three vertices each, counter-clockwise as the camera sees them
     triangles: NDArray[np.int32]
-    normals: NDArray[np.float32]
+    normals: NDArray[np.float32]  # (V, 3) float32, unit
+    # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the right, v from 0 at
+    # the top to 1 at the bottom, as in glTF
     uvs: NDArray[np.float32]
-    texture: NDArray[np.uint8] | None = None
+    texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
+    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None where `normals` are
+    # exact. See decimation.py.
     normal_texture: NDArray[np.uint8] | None = None
-    tangents: NDArray[np.float32] | None = None
+    tangents: NDArray[np.float32] | None = None  # (V, 3) float32, unit, where there is a normal texture
 
     @property
     def colours(self) -> NDArray[np.uint8] | None:
@@ -61,7 +54,7 @@ def surface_mesh(
     """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by row.
 
     Four pixels of the mask in a square make two triangles, split along the diagonal whose ends differ less in height.
-    Three make one triangle.
+    Three make one triangle. Raises UsageError if the largest step is negative.
 
     Args:
         depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix, as
@@ -73,9 +66,6 @@ def surface_mesh(
         largest_step: leaves out triangles whose corners differ by more than this in height, in pixels (for a pinhole
             camera, in pixels at the depth of the triangle). They are the walls where the surface is torn. None keeps
             all triangles.
-
-    Raises:
-        UsageError: the largest step is negative.
     """
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")

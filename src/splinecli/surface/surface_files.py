@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splinecli.surface.mesh import SurfaceMesh
+    from splinecli.system.publishing import Content
 
 SURFACE_FILES = {
     "glb": ("mesh.glb",),
@@ -28,35 +29,23 @@ SURFACE_FILES = {
 }
 """The file names of each format; mesh.png is the texture of an OBJ file, if there are colours."""
 
-SURFACE_REPORT = "surface.json"
-"""The report that `integrate` writes beside them."""
-
+SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 DEFAULT_MESHES = ("glb", "ply")
 DEPTH_FORMATS = ("npy", "tiff", "png")
 DEFAULT_FORMATS = (*DEFAULT_MESHES, *DEPTH_FORMATS)
-
-GRAY = 204
-"""Colour of a mesh without a texture, of 255."""
-
+GRAY = 204  # colour of a mesh without a texture, of 255
 _WHITE = 65535  # of 16 bits
 _FLOAT = 5126  # of glTF
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A depth map and its mesh.
+    """A depth map and its mesh."""
 
-    Args:
-        depth: (H, W), NaN outside the object.
-        mesh: the mesh of the same surface.
-        unit: the name of the unit of both.
-        millimetres: the length of this unit in a file of glTF.
-    """
-
-    depth: NDArray[np.floating]
-    mesh: SurfaceMesh
-    unit: str
-    millimetres: float
+    depth: NDArray[np.floating]  # (H, W), NaN outside the object
+    mesh: SurfaceMesh  # the mesh of the same surface
+    unit: str  # the name of the unit of both
+    millimetres: float  # the length of this unit in a file of glTF
 
 
 def file_names(formats: Sequence[str]) -> tuple[str, ...]:
@@ -64,11 +53,10 @@ def file_names(formats: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for form in formats for name in SURFACE_FILES[form])
 
 
-def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, bytes]]:
-    """Yield the name and the content of each file of a surface, in formats that are keys of SURFACE_FILES.
+def encode_surface(surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS) -> Iterator[tuple[str, Content]]:
+    """Yield the name and the content (see NewFiles.write) of each file of a surface; formats are keys of SURFACE_FILES.
 
-    Raises:
-        InputError: a mesh without triangles cannot be written as GLB.
+    Raises InputError if a mesh without triangles cannot be written as GLB.
     """
     for form in formats:
         if form == "obj":
@@ -112,14 +100,6 @@ def _encode_ply(surface: Surface) -> bytes:
     return ply.replace(b" 1.0\n", f" 1.0\ncomment unit: {surface.unit}\n".encode(), 1)
 
 
-def _encode_stl(surface: Surface) -> bytes:
-    """Encode binary STL, which has positions alone."""
-    import trimesh
-
-    stl: bytes = trimesh.exchange.stl.export_stl(_trimesh(surface.mesh))
-    return stl
-
-
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
     """Encode OBJ with normals, texture coordinates and, with colours, a texture. A comment has the unit's name."""
     import trimesh
@@ -138,19 +118,13 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
     return {"mesh.obj": text.encode(), **files}
 
 
-def _encode_npy(surface: Surface) -> bytes:
-    import numpy as np
-
-    file = io.BytesIO()
-    np.save(file, surface.depth.astype(np.float32), allow_pickle=False)
-    return file.getvalue()
-
-
-def _encode_tiff(surface: Surface) -> bytes:
+def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
+    """Return the TIFF file of a map (H, W) or (H, W, C)."""
     import tifffile
 
     file = io.BytesIO()
-    tifffile.imwrite(file, surface.depth.astype("f4"), description=f"unit: {surface.unit}")
+    layout = "contig" if values.ndim == 3 else None
+    tifffile.imwrite(file, values, photometric="minisblack", planarconfig=layout, description=description)
     return file.getvalue()
 
 
@@ -181,12 +155,12 @@ def _encode_png(surface: Surface) -> bytes:
     return file.getvalue()
 
 
-_ENCODERS: dict[str, Callable[[Surface], bytes]] = {
+_ENCODERS: dict[str, Callable[[Surface], Content]] = {
     "glb": _encode_glb,
     "ply": _encode_ply,
-    "stl": _encode_stl,
-    "npy": _encode_npy,
-    "tiff": _encode_tiff,
+    "stl": lambda surface: _trimesh(surface.mesh).export(file_type="stl"),  # binary, with positions alone
+    "npy": lambda surface: surface.depth.astype("f4"),
+    "tiff": lambda surface: encode_tiff(surface.depth.astype("f4"), f"unit: {surface.unit}"),
     "png": _encode_png,
     "exr": _encode_exr,
 }
@@ -197,11 +171,7 @@ def _trimesh(mesh: SurfaceMesh, visual: Any = None, scale: float = 1) -> Any:
     import trimesh
 
     return trimesh.Trimesh(
-        mesh.vertices * np.float32(scale),
-        mesh.triangles,
-        vertex_normals=mesh.normals,
-        visual=visual,
-        process=False,
+        mesh.vertices * np.float32(scale), mesh.triangles, vertex_normals=mesh.normals, visual=visual, process=False
     )
 
 

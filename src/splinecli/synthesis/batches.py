@@ -22,40 +22,26 @@ class CaptureConfig:
     """How pixels are photographed, and the share of the pixels whose capture has each fault.
 
     A share of 0 switches a fault off.
-
-    Attributes:
-        min_lights, max_lights, usual_lights: see draw_light_counts.
-        light_direction_error_share: pixels with errors of the light directions.
-        light_intensity_error_share: pixels with errors of the light intensities.
-        unequal_lights_share: pixels whose lights differ in intensity, which is divided out.
-        saturated_share: pixels that are clipped. Half of them are restored as `infer` does.
-        sensor_noise: whether there are noise and quantisation.
-        eight_bit_share: pixels with 8 bits; the others have 10 to 16.
     """
 
+    # min_lights, max_lights, usual_lights: see draw_light_counts
     min_lights: int = 4
     max_lights: int = 96
     usual_lights: int = 10
-    light_direction_error_share: float = 0.5
-    light_intensity_error_share: float = 0.5
-    unequal_lights_share: float = 0.5
-    saturated_share: float = 0.1
-    sensor_noise: bool = True
-    eight_bit_share: float = 0.3
+    light_direction_error_share: float = 0.5  # pixels with errors of the light directions
+    light_intensity_error_share: float = 0.5  # pixels with errors of the light intensities
+    unequal_lights_share: float = 0.5  # pixels whose lights differ in intensity, which is divided out
+    saturated_share: float = 0.1  # pixels that are clipped. Half of them are restored as `infer` does.
+    sensor_noise: bool = True  # whether there are noise and quantisation
+    eight_bit_share: float = 0.3  # pixels with 8 bits; the others have 10 to 16
 
 
 class DenseMap(NamedTuple):
-    """True dense maps.
+    """True dense maps."""
 
-    Attributes:
-        values: (P, 1, w, w), zero where nothing is known, such as outside the unit disc.
-        known: of the same shape, 1 where values are measured.
-        filled: of the same shape, 1 where values are measured or interpolated from measured neighbours.
-    """
-
-    values: Tensor
-    known: Tensor
-    filled: Tensor
+    values: Tensor  # (P, 1, w, w), zero where nothing is known, such as outside the unit disc
+    known: Tensor  # of the same shape, 1 where values are measured
+    filled: Tensor  # of the same shape, 1 where values are measured or interpolated from measured neighbours
 
 
 class PixelTruth(Protocol):
@@ -64,34 +50,23 @@ class PixelTruth(Protocol):
     @property
     def normals(self) -> Tensor:
         """Unit normals (P, 3)."""
-        ...
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> Self:
         """Turn each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
-        ...
 
     def dense_truth(self, size: int) -> DenseMap:
         """Return the complete maps at the scale of the radiance."""
-        ...
 
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """P pixels as a capture shows them, and their truth.
+    """P pixels as a capture shows them, and their truth."""
 
-    Attributes:
-        observations: (P, F), linear, divided by the light intensities.
-        light_directions: (P, F, 3), unit, as calibrated.
-        valid: (P, F) bool; false for padding.
-        truth: the normals and dense maps.
-        exposure: (P, 1), the factor from the radiance of the truth to the observations.
-    """
-
-    observations: Tensor
-    light_directions: Tensor
-    valid: Tensor
-    truth: PixelTruth
-    exposure: Tensor
+    observations: Tensor  # (P, F), linear, divided by the light intensities
+    light_directions: Tensor  # (P, F, 3), unit, as calibrated
+    valid: Tensor  # (P, F) bool; false for padding
+    truth: PixelTruth  # the normals and dense maps
+    exposure: Tensor  # (P, 1), the factor from the radiance of the truth to the observations
 
 
 def photograph(

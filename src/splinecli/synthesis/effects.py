@@ -21,25 +21,17 @@ class Wall:
     """A surface beside each pixel that hides a sector of low lights and reflects the others.
 
     A pixel without a wall has tan_height = reflectance = 0.
-
-    Attributes:
-        azimuth: (P, 3), unit vector in the image plane towards the wall.
-        tan_height, tan_half_width: (P, 1), tangents of the wall's elevation and of half its width.
-        softness: (P, 1), width of the shadow's edge in l_z.
-        facing: (P, 3), the wall's normal.
-        reflectance: (P, 1), share of the light on the wall that reaches the pixel.
-        towards: (P, 3), unit vector to the part of the wall that reflects.
-        has_pixel_material: (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte.
     """
 
-    azimuth: Tensor
+    azimuth: Tensor  # (P, 3), unit vector in the image plane towards the wall
+    # tan_height, tan_half_width: (P, 1), tangents of the wall's elevation and of half its width
     tan_height: Tensor
     tan_half_width: Tensor
-    softness: Tensor
-    facing: Tensor
-    reflectance: Tensor
-    towards: Tensor
-    has_pixel_material: Tensor
+    softness: Tensor  # (P, 1), width of the shadow's edge in l_z
+    facing: Tensor  # (P, 3), the wall's normal
+    reflectance: Tensor  # (P, 1), share of the light on the wall that reaches the pixel
+    towards: Tensor  # (P, 3), unit vector to the part of the wall that reflects
+    has_pixel_material: Tensor  # (P, 1) bool, whether the wall has the pixel's material; otherwise it is matte
 
     def visibility(self, directions: Tensor) -> Tensor:
         """Return the share of each light that passes the wall (P, D): a cast shadow over one sector of the map.
@@ -85,12 +77,7 @@ class Wall:
 
 
 def draw_wall(
-    normals: Tensor,
-    share: float,
-    generator: torch.Generator,
-    *,
-    shadows: bool = True,
-    interreflections: bool = True,
+    normals: Tensor, share: float, generator: torch.Generator, *, shadows: bool = True, interreflections: bool = True
 ) -> Wall:
     """Draw walls for a share of the pixels with these normals (P, 3).
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from splinecli.synthesis.principled import draw_material, with_one_gloss
 from splinecli.synthesis.random_numbers import draw_number
 
-_SMOOTH_SHARE = 1 / 3
-"""A share of the pieces has no detail: smooth things must stay smooth, whatever they are made of."""
+_SMOOTH_SHARE = 1 / 3  # a share of the pieces has no detail: smooth things must stay smooth, whatever they are made of
 
 
 def draw_engraved(
@@ -22,18 +21,13 @@ def draw_engraved(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Draw a piece; return its unit normals (P, 3), its radiance (P, F), and its mask (size, size) with P true pixels.
 
-    Some pieces are half ellipsoids, whose mask ends at their rim. The others are plates that fill the frame: tilted by
-    a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has one kind of
-    detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or bent; facets of 3 to 20 pixels; or a
-    random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third of it
-    for the texture. A third of the pieces are smooth. The material is that of draw_material, with 1 to 300 patches; in
-    half of the pieces these differ in their base alone.
-
-    Args:
-        lights: (F, 3), unit.
-        round_share: share of half ellipsoids.
+    `round_share` of the pieces are half ellipsoids, whose mask ends at their rim. The others are plates that fill the
+    frame: tilted by a slope of up to 0.7, with three waves of U(0.3, 2) frames and slopes of up to 0.3. Each piece has
+    one kind of detail: grooves U(1, 6) pixels wide to either side, regular or not, straight or bent; facets of 3 to 20
+    pixels; or a random texture with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a
+    third of it for the texture. A third of the pieces are smooth. The material is that of draw_material, with 1 to 300
+    patches; in half of the pieces these differ in their base alone. The lights (F, 3) are unit.
     """
-
     uniform = partial(draw_number, generator)
     normals, mask = _draw_base(size, round_share, generator)
     if uniform() >= _SMOOTH_SHARE:

@@ -17,8 +17,7 @@ from splinecli.synthesis.random_numbers import draw_uniform
 DARK_SHARE = 0.4
 """Share of the pixels that are dark beside the brightest of their capture, from which the exposure is chosen."""
 
-BITS = (10, 12, 14, 16)
-"""Depths of the pixels that do not have 8 bits, equally often."""
+BITS = (10, 12, 14, 16)  # depths of the pixels that do not have 8 bits, equally often
 
 
 def disturb_light_directions(directions: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -108,11 +107,7 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
 def restore(observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
     """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full scale.
 
-    Args:
-        observed: (P, F), clipped.
-        clipped: (P, F) bool.
-        directions: (P, F, 3), unit.
-        valid: (P, F) bool; the others are left out.
+    All are (P, F), the directions (P, F, 3), unit. Observations that are not valid are left out.
     """
     chosen = (draw_uniform(generator, len(observed), 1) < 0.5)[:, 0] & clipped.any(dim=1)
     rows = chosen.nonzero()[:, 0]

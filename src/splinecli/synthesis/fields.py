@@ -141,8 +141,7 @@ def triangulate(field: Field, half_widths: tuple[float, float, float], spacing: 
     return Mesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), normals)
 
 
-COARSE = 4
-"""Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely."""
+COARSE = 4  # Number of samples along the edge of a coarse cell. Cells far from the surface are not sampled finely.
 
 
 def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
@@ -177,12 +176,9 @@ def _evaluate(field: Field, x: Floats, y: Floats, z: Floats) -> Floats:
 
 
 def _largest_part(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, NDArray[np.int32]]:
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    from trimesh.graph import connected_component_labels
 
-    ones = np.ones(2 * len(faces), dtype=np.int8)
-    ends = (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())
-    _, part = connected_components(coo_array((ones, ends), shape=(len(vertices),) * 2), directed=False)
+    part = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices))
     kept = part == np.bincount(part).argmax()
     row = np.cumsum(kept) - 1
     return vertices[kept], row[faces[kept[faces[:, 0]]]].astype(np.int32)

@@ -42,9 +42,7 @@ def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
     return torch.where(z >= half_angle.cos(), uniform, 2 - z)
 
 
-Points = tuple[Tensor, Tensor]
-"""x and y (P, F) of lights in the disc of their projections."""
-
+Points = tuple[Tensor, Tensor]  # x and y (P, F) of lights in the disc of their projections
 RIG_SHARES = {"ellipse": 0.68, "cone": 0.08, "ring": 0.08, "line": 0.08, "hand-held": 0.08}
 """Shares of the kinds of rigs."""
 

@@ -13,10 +13,7 @@ from splinecli.errors import InputError
 from splinecli.system.memory import is_out_of_memory
 
 Floats = NDArray[np.floating]
-
-REACH = 0.94
-"""Half-width of the object in the camera's square."""
-
+REACH = 0.94  # half-width of the object in the camera's square
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
 """Bytes of a file of each format. A byte of the first three may give a triangle, of 110 bytes in memory."""
@@ -24,26 +21,19 @@ _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 +
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    vertices: (V, 3) float32.
-    faces: (T, 3) int32, rows of vertices, anticlockwise as seen from outside.
-    vertex_normals: (V, 3) float32, unit, outward; shading interpolates them.
-    """
-
-    vertices: Floats
-    faces: NDArray[np.int32]
-    vertex_normals: Floats
+    vertices: Floats  # (V, 3) float32
+    faces: NDArray[np.int32]  # (T, 3) int32, rows of vertices, anticlockwise as seen from outside
+    vertex_normals: Floats  # (V, 3) float32, unit, outward; shading interpolates them
 
 
 def read_mesh(path: str | Path) -> Mesh:
     """Read a mesh file (PLY, OBJ, STL or OFF) and fit it into the frame.
 
     The +z axis of the file points to the camera. The normal of a vertex is the mean of the faces around it, weighted by
-    angle. Long edges are split, so that every part of the surface has vertices and can have its own material.
-
-    Raises:
-        InputError: the file is missing, too long, not a mesh, or has no faces.
+    angle. Long edges are split, so that every part of the surface has vertices and can have its own material. Raises
+    InputError if the file is missing, too long, not a mesh, or has no faces.
     """
     import trimesh
 
@@ -82,9 +72,7 @@ def read_mesh(path: str | Path) -> Mesh:
 def _read_known(path: Path) -> tuple[str, bytes]:
     """Return the format of a mesh file, by its content, and its content.
 
-    Raises:
-        InputError: it is of another format or too long.
-        OSError: it cannot be read.
+    Raises InputError if it is of another format or too long, or OSError if it cannot be read.
     """
     with path.open("rb") as file:
         content = file.read(max(_LONGEST.values()) + 1)

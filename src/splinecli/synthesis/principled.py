@@ -31,17 +31,7 @@ _RETRO_EXPONENT = 20
 class PrincipledMaterial:
     """Parameters of the principled BRDF, each (P, 1), in Burley's ranges; specular reaches 4, as in CyclesPS.
 
-    Six are not Burley's.
-
-    interface_loss: where above 0, the diffuse light loses this share at grazing angles, on its way in and on its way
-        out, as through the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
-    minnaert: kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): under 1 it is flat
-        as on dust, over 1 steep as on marble.
-    tail_exponent: gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2 is
-        GGX; smaller values give longer tails.
-    second_share: share of the facets that form a second highlight, such as the flakes of a metallic paint.
-    second_roughness: the roughness of these facets.
-    retro: a lobe towards the light, as of fabrics, dust and road paint, in units of the base colour.
+    The last six are not Burley's.
     """
 
     base: Tensor
@@ -51,12 +41,18 @@ class PrincipledMaterial:
     sheen: Tensor
     clearcoat: Tensor
     clearcoat_gloss: Tensor
+    # where above 0, the diffuse light loses this share at grazing angles, on its way in and on its way out, as through
+    # the smooth surface of a plastic or a glaze. Burley's retro-reflection is then left out.
     interface_loss: Tensor
+    # kappa of Minnaert's law. The diffuse light is multiplied by (n.l n.v)^(kappa - 1): under 1 it is flat as on dust,
+    # over 1 steep as on marble.
     minnaert: Tensor
+    # gamma of the highlight's distribution (generalised Trowbridge-Reitz), above 1 and at most 2. 2 is GGX; smaller
+    # values give longer tails.
     tail_exponent: Tensor
-    second_share: Tensor
-    second_roughness: Tensor
-    retro: Tensor
+    second_share: Tensor  # share of the facets that form a second highlight, such as the flakes of a metallic paint
+    second_roughness: Tensor  # the roughness of these facets
+    retro: Tensor  # a lobe towards the light, as of fabrics, dust and road paint, in units of the base colour
 
     def take(self, pixels: slice | Tensor) -> PrincipledMaterial:
         """Return the materials of some of the pixels. An index tensor may name a pixel several times."""
@@ -65,10 +61,8 @@ class PrincipledMaterial:
     def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
         """Return pi times the reflected radiance, the BRDF times max(n.l, 0), under unit light (P, D).
 
-        Args:
-            n_dot_l: (P, D) cosines of normal and light. They are negative in attached shadow, where radiance is zero.
-            n_dot_v: (P, 1) cosines of normal and viewing direction, positive.
-            l_dot_v: (D) or (P, D) cosines of light and viewing direction.
+        The cosines of normal and light (P, D) are negative in attached shadow, where radiance is zero. Those of normal
+        and viewing direction (P, 1) are positive; those of light and viewing direction are (D) or (P, D).
         """
         lit = n_dot_l.clamp(min=0)
         # Light from behind the surface has no half vector. Rounding would make it NaN.

@@ -1,6 +1,8 @@
-"""Intersection of rays with a mesh, by Embree (https://www.embree.org) through embreex.
+"""Intersection of rays with a mesh, by Embree (https://www.embree.org) through embreex, and what a camera sees of it.
 
-embreex belongs to the extra `render`. It is imported when a Tracer is made.
+embreex belongs to the extra `render`. It is imported when a Tracer is made. The orthographic camera looks along -z at
+the square [-1, 1]^2. Its pixel is the mean of k x k samples on a regular grid. One sample at the centre is not enough:
+on glossy metal its radiance is off by a tenth.
 """
 
 from __future__ import annotations
@@ -17,23 +19,17 @@ OFFSET = 1e-4
 """Distance from the surface at which rays start. The frame has half-width 1, so rounding in float32 displaces hits by
 about 1e-7, and one of 128 pixels is 0.016 wide."""
 
-TRACED_ROWS = 16_384
-"""Number of points whose shadows are traced together."""
+TRACED_ROWS = 16_384  # number of points whose shadows are traced together
 
 
 @dataclass(frozen=True)
 class Hits:
-    """The first surface points that N rays hit.
+    """The first surface points that N rays hit."""
 
-    triangle: (N,) int, row of the mesh's faces.
-    weights: (N, 3), barycentric weights of the corners.
-    position: (N, 3), on the triangle.
-    normal, facet_normal: (N, 3), unit, interpolated and that of the triangle.
-    """
-
-    triangle: NDArray[np.int64]
-    weights: Floats
-    position: Floats
+    triangle: NDArray[np.int64]  # (N,) int, row of the mesh's faces
+    weights: Floats  # (N, 3), barycentric weights of the corners
+    position: Floats  # (N, 3), on the triangle
+    # normal, facet_normal: (N, 3), unit, interpolated and that of the triangle
     normal: Floats
     facet_normal: Floats
 
@@ -49,8 +45,7 @@ class Hits:
 class Tracer:
     """A mesh that is prepared for ray tracing. All arrays of origins and directions are (N, 3).
 
-    Raises:
-        UsageError: embreex is not installed.
+    Raises UsageError if embreex is not installed.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -134,3 +129,49 @@ class ShadowCache:
 
 def _packed(vectors: Floats) -> Floats:
     return np.ascontiguousarray(vectors, dtype=np.float32)
+
+
+MIN_NORMAL_Z = 0.05  # pixels that are seen at a more grazing angle are left out
+
+
+@dataclass(frozen=True)
+class VisibleSurface:
+    """The surface points that the camera sees in P pixels, with S samples each."""
+
+    mask: NDArray[np.bool_]  # (H, W), the pixels that are seen
+    normals: Floats  # (P, 3), unit, the mean of the samples' normals; pixels row-major
+    samples: Hits  # P * S surface points; those of one pixel follow each other
+    samples_per_pixel: int  # S
+
+    def samples_of(self, pixels: NDArray[np.int64]) -> Hits:
+        """Return all samples of some pixels."""
+        count = self.samples_per_pixel
+        return self.samples.take((pixels[:, None] * count + np.arange(count)).ravel())
+
+
+def find_visible_surface(tracer: Tracer, size: int, samples: int) -> VisibleSurface:
+    """Trace the camera's rays: size x size pixels of samples x samples samples each.
+
+    A pixel is left out if one of its samples misses the surface, or if it is seen at a grazing angle.
+    """
+    steps = (np.arange(size * samples, dtype=np.float32) + 0.5) * np.float32(2 / (size * samples)) - 1
+    row, column = np.meshgrid(np.arange(size * samples), np.arange(size * samples), indexing="ij")
+
+    def by_pixel(grid: NDArray[np.int64]) -> NDArray[np.int64]:
+        return grid.reshape(size, samples, size, samples).transpose(0, 2, 1, 3).ravel()
+
+    x, y = steps[by_pixel(column)], -steps[by_pixel(row)]
+    top = np.full_like(x, tracer.mesh.vertices[:, 2].max() + 1)
+    rays, hits = tracer.first_hits(np.stack((x, y, top), axis=1), np.array([[0, 0, -1]], dtype=np.float32))
+    front = hits.normal[:, 2] > 0
+    rays, hits = rays[front], hits.take(front)
+    per_pixel = samples * samples
+    pixel = rays // per_pixel
+    whole = np.bincount(pixel, minlength=size * size) == per_pixel
+    hits = hits.take(whole[pixel])
+    normals = hits.normal.reshape(-1, per_pixel, 3).mean(axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    kept = normals[:, 2] > MIN_NORMAL_Z
+    whole[whole] = kept
+    mask = whole.reshape(size, size)
+    return VisibleSurface(mask, normals[kept], hits.take(np.repeat(kept, per_pixel)), per_pixel)

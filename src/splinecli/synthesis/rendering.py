@@ -14,6 +14,7 @@ that emit or receive indirect light have at least roughness SOFTEST (path space 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -22,15 +23,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.synthesis.camera import VisibleSurface
 from splinecli.synthesis.meshes import Floats
 from splinecli.synthesis.principled import PrincipledMaterial
-from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer
-from splinecli.synthesis.sampling import LOBES, draw_directions
+from splinecli.synthesis.ray_tracing import TRACED_ROWS, Hits, ShadowCache, Tracer, VisibleSurface
 
-SOFTEST = 0.3
-"""Lowest roughness of surfaces that light other surfaces."""
-
+SOFTEST = 0.3  # lowest roughness of surfaces that light other surfaces
 MOST_WEIGHT = 8.0
 MOST_RADIANCE = 8.0
 """Limits on the contribution of one path, relative to its expected share. Larger values are only noise."""
@@ -75,16 +72,12 @@ def render_direct(
 
 @dataclass(frozen=True)
 class _Vertices:
-    """N vertices of paths.
+    """N vertices of paths."""
 
-    hits: the surface points. back: unit directions (N, 3) to the previous vertex. pixel, patches: (N,), the pixel of
-    the path and the patch of the surface.
-    """
-
-    hits: Hits
-    back: Tensor
-    pixel: Tensor
-    patches: Tensor
+    hits: Hits  # the surface points
+    back: Tensor  # (N, 3), unit directions to the previous vertex
+    pixel: Tensor  # (N,), the pixel of the path
+    patches: Tensor  # (N,), the patch of the surface
 
     def take(self, rows: Tensor) -> _Vertices:
         kept = rows.numpy()
@@ -105,9 +98,7 @@ def render_indirect(
 ) -> dict[str, Tensor]:
     """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times before.
 
-    Args:
-        patch_of_face: (T,), row of the materials of each face.
-        directions: number of paths per pixel.
+    `patch_of_face` (T,) is the row of the materials of each face, `directions` the number of paths per pixel.
     """
     pixels = len(visible.normals)
     soft = {name: soften(material) for name, material in materials.items()}
@@ -221,3 +212,79 @@ def _thin_out(
     rows = (torch.rand(len(chance), generator=generator) < chance).nonzero()[:, 0]
     survived = {name: weight[rows] / chance[rows, None] for name, weight in weights.items()}
     return vertices.take(rows), survived
+
+
+LOBES = (0.0, 0.1, 0.0, 0.35)
+"""Widths (roughness squared) of the lobes of four successive directions; 0 is the cosine lobe."""
+
+
+def draw_directions(normals: Tensor, back: Tensor, first: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the horizon.
+
+    The normals of the surfaces and the directions `back` to the previous vertices of the paths are (N, 3), unit.
+    `first` (N,) int64, the index of the direction among those of its pixel, determines the lobe and the point of the R2
+    sequence (Roberts 2018), which covers the lobe evenly. `shift` (N, 2) is the offset of the pixel in the sequence.
+    """
+    ordinal = torch.div(first, len(LOBES), rounding_mode="floor")
+    u = (shift[:, 0] + ordinal * 0.7548776662466927) % 1.0
+    v = (shift[:, 1] + ordinal * 0.5698402909980532) % 1.0
+    tangent, bitangent = basis(normals)
+    local_view = torch.stack([(back * axis).sum(-1) for axis in (tangent, bitangent, normals)], dim=1)
+    lobe = first % len(LOBES)
+    # Lobes of the same kind use different parts of the sequence.
+    u = (u + lobe * 0.25) % 1.0
+    alpha = torch.tensor(LOBES)[lobe][:, None]
+    radius, angle = u.sqrt(), 2 * math.pi * v
+    matte = torch.stack((radius * angle.cos(), radius * angle.sin(), (1 - u).sqrt()), dim=1)
+    half = _visible_normal(local_view, alpha.clamp(min=0.01), u, v)
+    mirrored = 2 * (local_view * half).sum(-1, keepdim=True) * half - local_view
+    local = torch.where(alpha == 0, matte, mirrored)
+    world = local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normals
+    return world, density(local[:, 2:], local_view[:, 2:], (local * local_view).sum(-1, keepdim=True))
+
+
+def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
+    """Return the density of the mixture per steradian, from cosines that have the same shape."""
+    half_length = (2 * (1 + w_dot_v)).clamp(min=1e-6).sqrt()
+    n_dot_h = ((n_dot_w + n_dot_v) / half_length).clamp(0, 1)
+    total = LOBES.count(0.0) * n_dot_w.clamp(min=0) / math.pi
+    for alpha in LOBES:
+        if alpha:
+            squared = alpha * alpha
+            spread = n_dot_h * n_dot_h * (squared - 1) + 1
+            visible = 2 / (n_dot_v + (squared + (1 - squared) * n_dot_v * n_dot_v).sqrt())
+            total = total + squared / (math.pi * spread * spread) * visible / 4
+    return total / len(LOBES)
+
+
+def basis(normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two unit vectors (N, 3) that form a right-handed frame with each unit normal (Duff et al. 2017)."""
+    x, y, z = normals.unbind(dim=1)
+    sign = torch.where(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    tangent = torch.stack((1 + sign * x * x * a, sign * b, -sign * x), dim=1)
+    return tangent, torch.stack((b, sign + y * y * a, -y), dim=1)
+
+
+def _visible_normal(view: Tensor, alpha: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Return visible normals (N, 3) in the frame of the surface normal, by the routine of Heitz."""
+    stretched = torch.nn.functional.normalize(
+        torch.cat((alpha * view[:, :2], view[:, 2:].clamp(min=1e-4)), dim=1), dim=1
+    )
+    first, second = basis(stretched)
+    radius, angle = u.sqrt(), 2 * math.pi * v
+    across, along = radius * angle.cos(), radius * angle.sin()
+    # `second` must be the axis along which the disc is cut by the horizon: the one nearer to the normal.
+    upward = torch.stack((first[:, 2], second[:, 2]), dim=1)
+    length = upward.norm(dim=1, keepdim=True).clamp(min=1e-6)
+    cosine, sine = (upward / length).unbind(dim=1)
+    level = sine[:, None] * first - cosine[:, None] * second
+    steep = cosine[:, None] * first + sine[:, None] * second
+    share = 0.5 * (1 + stretched[:, 2])
+    along = (1 - share) * (1 - across * across).clamp(min=0).sqrt() + share * along
+    depth = (1 - across * across - along * along).clamp(min=0).sqrt()
+    normal = across[:, None] * level + along[:, None] * steep + depth[:, None] * stretched
+    return torch.nn.functional.normalize(
+        torch.cat((alpha * normal[:, :2], normal[:, 2:].clamp(min=1e-6)), dim=1), dim=1
+    )

@@ -11,81 +11,53 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.synthesis.camera import find_visible_surface
 from splinecli.synthesis.meshes import Floats, Mesh
 from splinecli.synthesis.principled import CLASSES, PrincipledMaterial, draw_material, with_one_gloss
-from splinecli.synthesis.ray_tracing import Tracer
+from splinecli.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.synthesis.rendering import render_direct, render_indirect
 from splinecli.synthesis.shapes import draw_shape
 
-MIN_LIGHT_Z = 0.03
-"""Lowest z of a light, the cosine of its angle to the viewing direction."""
+MIN_LIGHT_Z = 0.03  # lowest z of a light, the cosine of its angle to the viewing direction
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Settings for drawing and rendering scenes.
+    """Settings for drawing and rendering scenes."""
 
-    Args:
-        size: width and height in pixels.
-        lights: F, the number of lights.
-        samples: k of the k x k samples per pixel.
-        directions: number of paths per pixel for indirect light.
-        bounces: largest number of reflections before the visible surface; 0 for direct light only.
-    """
-
-    size: int = 128
-    lights: int = 500
-    samples: int = 4
-    directions: int = 256
-    bounces: int = 4
+    size: int = 128  # width and height in pixels
+    lights: int = 500  # F, the number of lights
+    samples: int = 4  # k of the k x k samples per pixel
+    directions: int = 256  # number of paths per pixel for indirect light
+    bounces: int = 4  # largest number of reflections before the visible surface; 0 for direct light only
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene before rendering.
+    """A scene before rendering."""
 
-    shape: kind of the shape.
-    mesh: the shape.
-    lights: (F, 3), unit directions towards the lights.
-    materials: by class, with one row per patch of the surface.
-    patch_of_face: (T,), the patch of each face.
-    seed: seed of the paths of indirect light.
-    """
-
-    shape: str
-    mesh: Mesh
-    lights: Floats
-    materials: dict[str, PrincipledMaterial]
-    patch_of_face: NDArray[np.int64]
-    seed: int
+    shape: str  # kind of the shape
+    mesh: Mesh  # the shape
+    lights: Floats  # (F, 3), unit directions towards the lights
+    materials: dict[str, PrincipledMaterial]  # by class, with one row per patch of the surface
+    patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
+    seed: int  # seed of the paths of indirect light
 
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """The images of a scene.
+    """The images of a scene."""
 
-    mask: (H, W).
-    normals: (P, 3), unit; pixels row-major.
-    observations: by class, (P, F) float32; 1 is a matte white surface that faces the light.
-    """
-
-    mask: NDArray[np.bool_]
-    normals: Floats
-    observations: dict[str, Floats]
+    mask: NDArray[np.bool_]  # (H, W)
+    normals: Floats  # (P, 3), unit; pixels row-major
+    observations: dict[str, Floats]  # by class, (P, F) float32; 1 is a matte white surface that faces the light
 
 
 def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = None) -> Scene:
-    """Draw scene number `index` of the set with this seed.
+    """Draw scene number `index` of the set with this seed, of a given mesh or, for None, of a random shape.
 
     The surface has 1,000 to 6,000 patches in 70 % of the scenes, 2 to 40 in 20 %, and one in 10 %. In half of the
-    scenes the patches differ in their base alone, as on a painted or printed object of one gloss.
-
-    Args:
-        mesh: the shape. None draws one at random.
-
-    Raises:
-        UsageError: the extra `render` is not installed.
+    scenes the patches differ in their base alone, as on a painted or printed object of one gloss. Raises UsageError if
+    the extra `render` is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
@@ -109,8 +81,7 @@ def draw_scene(seed: int, index: int, config: SceneConfig, mesh: Mesh | None = N
 def render_scene(scene: Scene, config: SceneConfig, progress: Callable[[float], None] | None = None) -> RenderedScene:
     """Render the scene in all its materials. `progress` is called with the finished share, from 0 to 1.
 
-    Raises:
-        UsageError: the extra `render` is not installed.
+    Raises UsageError if the extra `render` is not installed.
     """
     report = progress or (lambda _: None)
     tracer = Tracer(scene.mesh)

@@ -6,6 +6,7 @@ Unions of round blobs alone would be too convex: they have few cast shadows and 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -27,22 +28,16 @@ from splinecli.synthesis.meshes import Floats, Mesh, fit_to_frame
 SPACING = 0.0125
 """Distance between the samples of the fields. For comparison, 128 pixels over the frame are 0.0156 apart."""
 
-FEWEST_FACES = 5_000
-"""Meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces."""
+FEWEST_FACES = 5_000  # meshes with fewer faces are drawn again: cuts sometimes leave nothing or only small pieces
 
 
 def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[str, Mesh]:
     """Draw a random shape, fitted into the camera's frame, and return the name of its kind and its mesh.
 
     40 % are carved (warped unions of solids with pieces cut out), 20 % rough (spheres with noise), 15 % relief (folded
-    slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera).
-
-    Args:
-        place: determines the kind, from 0 to 1. Evenly spread values give a set the right share of each kind.
-            None draws it at random.
-
-    Raises:
-        UsageError: the extra `render` is not installed.
+    slabs that fill the frame), and 25 % vessels (bowls and cups that show their inside to the camera). `place`, from 0
+    to 1, determines the kind: evenly spread values give a set the right share of each. Raises UsageError if the extra
+    `render` is not installed.
     """
     place = rng.random() if place is None else place
     name = list(KINDS)[int(np.searchsorted(np.cumsum((0.4, 0.2, 0.15)), place, side="right"))]
@@ -90,20 +85,17 @@ def _place(field: Field, rng: np.random.Generator, reach: Range) -> Field:
 Range = tuple[float, float]
 
 
-def _draw_waves(rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1) -> Field:
-    """Draw smooth noise with a frequency in cycles per unit length; the mean slope determines its height."""
+def _draw_waves(
+    rng: np.random.Generator, frequencies: Range, slopes: Range, *, outputs: int = 1, ridged: bool = False
+) -> Field:
+    """Draw smooth or ridged noise with a frequency in cycles per unit length, and a height by its mean slope."""
     frequency = rng.uniform(*frequencies)
-    height = np.float32(rng.uniform(*slopes) / (2 * np.pi * frequency))
-    noise = waves(rng, frequency, outputs)
+    height = np.float32(rng.uniform(*slopes) / ((4 if ridged else 2) * np.pi * frequency))
+    noise = ridges(rng, frequency) if ridged else waves(rng, frequency, outputs)
     return lambda points: height * noise(points)
 
 
-def _draw_folds(rng: np.random.Generator, frequencies: Range, slopes: Range) -> Field:
-    """Draw ridged noise; arguments as for smooth noise."""
-    frequency = rng.uniform(*frequencies)
-    height = np.float32(rng.uniform(*slopes) / (4 * np.pi * frequency))
-    noise = ridges(rng, frequency)
-    return lambda points: height * noise(points)
+_draw_folds = partial(_draw_waves, ridged=True)
 
 
 def draw_carved(rng: np.random.Generator) -> Mesh | None:

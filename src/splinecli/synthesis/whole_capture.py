@@ -19,43 +19,31 @@ from splinecli.synthesis.faults import (
 )
 from splinecli.synthesis.random_numbers import draw_number
 
-_BRIGHT_SHARE = 1e-3
-"""Share of the observations that may be brighter than the one from which the exposure is chosen."""
-
+_BRIGHT_SHARE = 1e-3  # share of the observations that may be brighter than the one from which the exposure is chosen
 _GRAINY_SHARE = 2 / 3
-
-_MOST_SATURATED = 0.03
-"""Largest share of clipped observations in an overexposed capture."""
-
+_MOST_SATURATED = 0.03  # largest share of clipped observations in an overexposed capture
 _UNMEASURED_SHARE = 0.3
 _MOST_UNMEASURED = 0.5
 """Of the captures with errors of the intensities, this share has large ones, with a sigma of up to so many stops."""
 
-_MARGIN = 16
-"""Most pixels that are added at each side of the object."""
-
-_WIDEST_RIM = 12
-"""Most pixels by which a careless mask is too wide."""
+_MARGIN = 16  # most pixels that are added at each side of the object
+_WIDEST_RIM = 12  # most pixels by which a careless mask is too wide
 
 
 def photograph_scene(
     radiance: Tensor, directions: Tensor, config: CaptureConfig, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Photograph a scene: return observations (P, F), divided by the intensities, and calibrated directions (F, 3).
+    """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture shares.
 
-    The functions of synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure
-    places the 0.999 quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 %
-    of the observations are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also
-    have a grain: each observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where
-    images are shifted by a part of a pixel or light arrives from neighbours. Of the captures with errors of the
-    intensities, 30 % have a further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are
-    then wrong by many degrees, and their detail is still right.
-
-    Args:
-        radiance: (P, F).
-        directions: (F, 3), unit.
+    Returns observations (P, F), divided by the intensities, and calibrated directions (F, 3). The functions of
+    synthesis/faults.py draw faults for each row. Here the whole capture is one row. The exposure places the 0.999
+    quantile at 10^U(-0.7, 0) of full scale. In `config.saturated_share` of the captures, 0.1 to 3 % of the observations
+    are clipped, and restored as `infer` does. Two thirds of the captures with sensor noise also have a grain: each
+    observation has its own factor, with a sigma of 10^U(-2.5, -1.2). Fine texture has one, where images are shifted by
+    a part of a pixel or light arrives from neighbours. Of the captures with errors of the intensities, 30 % have a
+    further one with a sigma of U(0, 0.5) stops, as if nobody had measured them: normals are then wrong by many degrees,
+    and their detail is still right.
     """
-
     uniform = partial(draw_number, generator)
     lights = radiance.shape[1]
     intensities = draw_light_intensities(1, lights, config.unequal_lights_share, generator)
@@ -86,21 +74,14 @@ def photograph_scene(
 def add_background(maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that shows some of it.
 
-    Masks may show more than the object, and captures may have none.
+    Masks may show more than the object, and captures may have none. The maps of the object are radiance (F, H, W) and
+    unit normals (3, H, W), under unit lights (F, 3); those that are returned have zero for normals that are not known:
+    in darkness, and where the light is uneven.
 
-    A third of the backgrounds are nearly dark. The others are plates of draw_engraved in the shadow of the object, at
-    a distance of up to half its size. Half of these are lit unevenly, as by near lamps. Half of the masks show
+    A third of the backgrounds are nearly dark. The others are plates of draw_engraved in the shadow of the object, at a
+    distance of up to half its size. Half of these are lit unevenly, as by near lamps. Half of the masks show
     everything, the others are up to 12 pixels too wide.
-
-    Args:
-        maps: (F, H, W) radiance and (3, H, W) unit normals of the object.
-        mask: (H, W), of the object.
-        lights: (F, 3), unit.
-
-    Returns:
-        The maps have zero for normals that are not known: in darkness, and where the light is uneven.
     """
-
     uniform = partial(draw_number, generator)
     sides = [int(uniform(0, _MARGIN + 1)) for _ in range(4)]
     maps, mask = pad(maps * mask, sides), pad(mask, sides)

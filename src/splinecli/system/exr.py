@@ -12,15 +12,10 @@ from splinecli.system.extras import import_extra
 
 
 def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:
-    """Return the file of a map of float16 or float32, without loss (ZIP).
+    """Return the file of a map of float16 or float32, without loss (ZIP), with texts by name in its header.
 
-    Args:
-        pixels: (H, W, 3), the channels R, G and B, or (H, W), the channel Y. Blender reads these names.
-        attributes: texts by name, for the header.
-
-    Raises:
-        UsageError: OpenEXR is not installed.
-        OutputError: the file cannot be written in the folder for temporary files.
+    The map is (H, W, 3), the channels R, G and B, or (H, W), the channel Y. Blender reads these names. Raises
+    UsageError if OpenEXR is not installed, or OutputError if the folder for temporary files cannot be written.
     """
     library = import_extra("OpenEXR", "exr")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage, **attributes}

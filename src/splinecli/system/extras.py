@@ -25,15 +25,10 @@ def import_extra(
     path: Path | None = None,
     otherwise: str | None = None,
 ) -> ModuleType:
-    """Import a module of an extra when it is used for the first time.
+    """Import a module of an extra, a key of _PROBLEMS, when it is used for the first time.
 
-    Args:
-        extra: a key of _PROBLEMS.
-        path: the file that cannot be read without the module, for the message.
-        otherwise: another way out, for the message.
-
-    Raises:
-        UsageError, or `error`: the module is not installed. The message names the command that installs it.
+    Raises UsageError or `error` if the module is not installed. The message names the command that installs it, the
+    file at `path` that cannot be read without it, and `otherwise`, another way out.
     """
     try:
         return importlib.import_module(module)

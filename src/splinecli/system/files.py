@@ -2,10 +2,11 @@
 
 import errno
 import hashlib
+import itertools
 import json
 import os
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -15,6 +16,12 @@ from splinecli.errors import InputError, OutputError
 UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
 _MOST_JSON = 1 << 24  # bytes of a file
 _MOST_DIGITS = 300  # of a whole number in JSON: a float holds any of them
+
+
+def free_name(name: str, is_taken: Callable[[str], bool], mark: str = "-") -> str:
+    """Return the name, or the name with a mark and the lowest number from 2 that is not taken."""
+    numbered = (f"{name}{mark}{number}" for number in itertools.count(2))
+    return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
 
 
 def file_sha256(path: Path) -> str:

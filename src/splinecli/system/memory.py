@@ -31,11 +31,7 @@ def available_memory() -> float:
 
 
 def own_groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's control groups, and of the groups above them, which limit it, too.
-
-    Args:
-        controller: what the groups limit, such as cpu or memory.
-    """
+    """Yield the folders of this process's control groups that limit cpu or memory, and of those above them."""
     try:
         lines = _GROUPS.read_text("utf-8").splitlines()
     except OSError:

@@ -2,5 +2,4 @@
 
 from collections.abc import Callable
 
-Progress = Callable[[int], object]
-"""A function that is called with the number of pixels that were just finished."""
+Progress = Callable[[int], object]  # a function that is called with the number of pixels that were just finished

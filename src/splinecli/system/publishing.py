@@ -6,14 +6,19 @@ report is whole. One without is unfinished, and its work is done again. Nothing 
 anything, and no link in it is followed.
 """
 
+import importlib
+import os
+import stat
+import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.errors import OutputError
 from splinecli.system.files import (
     UNFINISHED,
     check_writable,
@@ -23,7 +28,115 @@ from splinecli.system.files import (
     sync,
     sync_names,
 )
-from splinecli.system.locks import RefusedFolderError, locked
+
+LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
+_SECONDS_BETWEEN_TRIES = 0.02
+
+
+class RefusedFolderError(OutputError):
+    """One folder is refused. Others may be fine, so a batch goes on."""
+
+
+class BusyError(RefusedFolderError):
+    """Another process writes into the folder."""
+
+
+@contextmanager
+def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Make a folder and lock it; `wait` for another process that has locked it, instead of raising BusyError.
+
+    Raises RefusedFolderError if another user left a lock file that this process may not open, or OSError if the folder
+    cannot be made or written.
+    """
+    file = _locked_file(folder, wait=wait)
+    try:
+        yield
+    finally:
+        # Windows removes no file that is open. Elsewhere, whoever locks the file after it is removed sees that.
+        if os.name == "nt":
+            file.close()
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        file.close()
+
+
+def _locked_file(folder: Path, *, wait: bool) -> IO[str]:
+    """Return the open lock file of a folder, which is made as needed."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            file = _open_lock(folder / LOCK)
+        except FileNotFoundError:  # another process removed the folder, because it was empty
+            continue
+        except PermissionError:
+            if not (folder / LOCK).exists():
+                raise
+            raise RefusedFolderError(
+                "this lock file belongs to another user, who may be writing into the folder",
+                path=folder / LOCK,
+                hint="If no splinecli process of that user runs, remove the file. Otherwise choose another -o",
+            ) from None
+        try:
+            got = _try_lock(file)
+        except OSError:  # some network drives have no locks
+            return file
+        if got and _is_current(file, folder / LOCK):
+            return file
+        file.close()
+        if not got and not wait:
+            raise BusyError(
+                "another splinecli process is writing into this folder",
+                path=folder,
+                hint="Wait for it to end, or choose another -o",
+            )
+        if not got:
+            time.sleep(_SECONDS_BETWEEN_TRIES)
+
+
+def _open_lock(path: Path) -> IO[str]:
+    """Open a lock file, which is made as needed. Raises OutputError where there is something else, such as a pipe."""
+    # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
+    flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
+    refused = RefusedFolderError("is not a file, so it cannot lock the folder", path=path, hint="Remove it")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
+    except (FileNotFoundError, PermissionError):
+        raise
+    except OSError:
+        if os.path.lexists(path):  # a link, a folder or a socket
+            raise refused from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise refused
+    return os.fdopen(descriptor, "r+")
+
+
+def _try_lock(file: IO[str]) -> bool:
+    """Lock an open file, unless another process has locked it. Raises OSError where there are no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        windows: Any = importlib.import_module("msvcrt")
+        try:
+            windows.locking(file.fileno(), windows.LK_NBLCK, 1)
+        except PermissionError:
+            return False
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _is_current(file: IO[str], path: Path) -> bool:
+    """Return whether an open file is still the one at the path: its last owner removes it, and others make it anew."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
 
 Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
 
@@ -34,15 +147,9 @@ UNDONE = "an interrupted run left unfinished files, which are removed"
 def held_folder(folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False) -> Iterator[None]:
     """Make a folder, lock it, and remove the unfinished files that a killed process left directly in it.
 
-    A folder that was made here and is empty at the end is removed, as are its parents.
-
-    Args:
-        warn: receives a sentence about what a killed process had left.
-        wait: wait for another process that has locked the folder, instead of raising BusyError.
-
-    Raises:
-        BusyError: another process has locked the folder.
-        OutputError: the folder cannot be made or written.
+    A folder that was made here and is empty at the end is removed, as are its parents. `warn` receives a sentence about
+    what a killed process had left. Raises BusyError if another process has locked the folder, unless it waits for that,
+    or OutputError if the folder cannot be made or written.
     """
     check_writable(folder)
     with ExitStack() as stack:
@@ -63,12 +170,12 @@ class NewFiles:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._hidden: dict[str, Path] = {}
+        self.hidden: dict[str, Path] = {}
 
     @property
     def sizes(self) -> dict[str, int]:
         """The bytes of each complete file by its name."""
-        return {name: path.stat().st_size for name, path in sorted(self._hidden.items())}
+        return {name: path.stat().st_size for name, path in sorted(self.hidden.items())}
 
     @contextmanager
     def open(self, name: str) -> Iterator[IO[bytes]]:
@@ -76,9 +183,9 @@ class NewFiles:
         _check_place(self._folder / name, self._folder)
         with refusals_as_output_errors(self._folder / name):
             with create_hidden(self._folder) as file:
-                self._hidden[name] = Path(file.name)
+                self.hidden[name] = Path(file.name)
                 yield file
-            sync(self._hidden[name])
+            sync(self.hidden[name])
 
     def write(self, name: str, content: Content) -> None:
         """Write a new file. An array becomes NPY, text UTF-8 with escapes for what is not valid. Raises OutputError."""
@@ -93,22 +200,17 @@ class NewFiles:
         if report is not None:
             _remove(self._folder / report, self._folder)
             sync(self._folder)
-        for name in (*self._hidden, *stale):
+        for name in (*self.hidden, *stale):
             _remove(self._folder / name, self._folder)
-        for name in sorted(self._hidden, key=lambda name: name == report):
+        for name in sorted(self.hidden, key=lambda name: name == report):
             place = self._folder / name
             if name == report:
                 sync(self._folder)
             place.parent.mkdir(exist_ok=True)
-            self._hidden[name].replace(place)
+            self.hidden[name].replace(place)
             if place.parent != self._folder:
                 sync(place.parent)
         sync(self._folder)
-
-    def discard(self) -> None:
-        """Remove the files that are not in their places."""
-        for path in self._hidden.values():
-            path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -116,15 +218,12 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
     """Yield a collector of new files. After the block, they replace the earlier ones.
 
     The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as they are. A process
-    that ends during the replacement leaves a folder without a report.
+    that ends during the replacement leaves a folder without a report. Raises OutputError if a file cannot be written.
 
     Args:
         report: the name of the file that describes the others: removed first, written last. None where the caller takes
             care that no report names a file that changes.
         stale: names of earlier files that are removed if no new file replaces them.
-
-    Raises:
-        OutputError: a file cannot be written.
     """
     new = NewFiles(folder)
     try:
@@ -132,7 +231,8 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
         with refusals_as_output_errors(folder):
             new.publish(report, stale)
     finally:
-        new.discard()
+        for path in new.hidden.values():
+            path.unlink(missing_ok=True)
 
 
 def refuse_link(folder: Path) -> None:

@@ -68,16 +68,11 @@ def read_checkpoint_config(path: Path) -> TrainingConfig:
 
 
 def load_checkpoint(
-    path: Path,
-    network: SplineNet,
-    average: SplineNet,
-    optimizer: torch.optim.Optimizer,
-    sets: dict[str, str],
+    path: Path, network: SplineNet, average: SplineNet, optimizer: torch.optim.Optimizer, sets: dict[str, str]
 ) -> RunCounters:
     """Restore networks and optimiser from a checkpoint, in place, and return the counters of the run.
 
-    Raises:
-        ModelError: the file is missing, damaged or from another network, or a pixel set has changed.
+    Raises ModelError if the file is missing, damaged or from another network, or a pixel set has changed.
     """
     tensors, metadata = _read(path)
     for name, sha256 in read_json_entry(metadata, "sets", path).items():

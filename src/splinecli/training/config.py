@@ -14,71 +14,60 @@ from splinecli.training.defaults import DEFAULT_STEPS, PAPER_STEPS, REFINE_STEPS
 GENERATOR = "generator"
 """The name among the sources of the online pixel generator; every other is the path of a pixel set."""
 
-Norm = Literal["mean", "sum"]
-"""Whether the values of a map's cells are averaged or summed."""
+Norm = Literal["mean", "sum"]  # whether the values of a map's cells are averaged or summed
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """The settings of a training run.
-
-    Attributes:
-        sources: the sources of pixels and their weights. A weight is the source's share of the batches.
-        start_from: name or file of the weights that the run starts from; empty for random ones.
-        held_share: share of the scenes of a pixel set that is for validation.
-        batch_size: pixels a step; captures a step for the refinement net.
-        shards: number of parts of a batch. The pixels of a shard come from one random stream and have nearly equal
-            numbers of lights. The number of processes must divide it.
-        updates: "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates`
-            steps for NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and
-            trains the error head alone. "refine_net" fixes all these and trains the refinement net on pixel sets of
-            rendered scenes.
-        learning_rate: the highest rate. It rises over `warmup_steps` and then falls.
-        schedule: "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth
-            for the last tenth of the run.
-        steps, minutes: the length of the run. If minutes is above 0, it replaces steps.
-        beta1, beta2, weight_decay: settings of AdamW. With weight_decay = 0, AdamW is Adam.
-        gradient_limit: largest norm of the gradient; 0 for none.
-        average_decay: decay of the running average of the weights, which is saved; 0 for none.
-        turn_jitter_deg: canonical networks see each pixel turned by up to this angle, either way, and half of the
-            batches mirrored. Estimates from several views can then be averaged.
-        angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
-        symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La.
-        eta, lambda_c: settings of La.
-        li_net_norm, ne_net_norm: whether the cells of a map are averaged or summed, in all terms of LI-Net and in
-            NE-Net's Ls and La. eta is in summed cells in either case.
-        precision: "bfloat16" runs the convolutions in bfloat16 where the device computes in it, "float32" never.
-    """
+    """The settings of a training run."""
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     pixels: PixelGeneratorConfig = field(default_factory=PixelGeneratorConfig)
+    # the sources of pixels and their weights. A weight is the source's share of the batches.
     sources: dict[str, float] = field(default_factory=lambda: {GENERATOR: 1.0})
-    start_from: str = ""
-    held_share: float = 0.1
-    batch_size: int = 256
+    start_from: str = ""  # name or file of the weights that the run starts from; empty for random ones
+    held_share: float = 0.1  # share of the scenes of a pixel set that is for validation
+    batch_size: int = 256  # pixels a step; captures a step for the refinement net
+    # number of parts of a batch. The pixels of a shard come from one random stream and have nearly equal numbers of
+    # lights. The number of processes must divide it.
     shards: int = 4
+    # "joint" updates both networks at each step. "alternating", as in the paper, makes `ne_net_updates` steps for
+    # NE-Net, then one for LI-Net, while the other network is fixed. "error_head" fixes both and trains the error head
+    # alone. "refine_net" fixes all these and trains the refinement net on pixel sets of rendered scenes.
     updates: Literal["joint", "alternating", "error_head", "refine_net"] = "joint"
     ne_net_updates: int = 5
-    learning_rate: float = 1.5e-3
+    learning_rate: float = 1.5e-3  # the highest rate. It rises over `warmup_steps` and then falls.
+    # "cosine" falls to a hundredth of the highest rate. "stepped", as the authors do, falls to a tenth for the last
+    # tenth of the run.
     schedule: Literal["cosine", "stepped"] = "cosine"
     warmup_steps: int = 300
+    # steps, minutes: the length of the run. If minutes is above 0, it replaces steps.
     steps: int = DEFAULT_STEPS
     minutes: float = 0.0
+    # beta1, beta2, weight_decay: settings of AdamW. With weight_decay = 0, AdamW is Adam.
     beta1: float = 0.9
     beta2: float = 0.99
     weight_decay: float = 1e-3
-    gradient_limit: float = 1.0
-    average_decay: float = 0.9995
+    gradient_limit: float = 1.0  # largest norm of the gradient; 0 for none
+    average_decay: float = 0.9995  # decay of the running average of the weights, which is saved; 0 for none
+    # canonical networks see each pixel turned by up to this angle, either way, and half of the batches mirrored.
+    # Estimates from several views can then be averaged.
     turn_jitter_deg: float = 15.0
+    # angle_weight, map_weight, masked_weight: weights of arccos(n . n_gt), |D - D_gt| and |M_s o (D - D_gt)|.
     angle_weight: float = 1.0
     map_weight: float = 1.0
     masked_weight: float = 1.0
+    # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
     symmetric_weight: float = 0.0
     asymmetric_weight: float = 0.0
+    # eta, lambda_c: settings of La
     eta: float = 1.0
     lambda_c: float = 50.0
+    # li_net_norm, ne_net_norm: whether the cells of a map are averaged or summed, in all terms of LI-Net and in
+    # NE-Net's Ls and La. eta is in summed cells in either case.
     li_net_norm: Norm = "mean"
     ne_net_norm: Norm = "sum"
+    # "bfloat16" runs the convolutions in bfloat16 where the device computes in it, "float32" never
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     seed: int = 0
 
@@ -134,10 +123,7 @@ class TrainingConfig:
             if not _is_number(weight) or not 0 <= weight < math.inf:
                 raise ModelError(f"the weight of source {name!r} is {weight!r}; expected a number from 0")
         return cls(
-            network=NetworkConfig.from_dict(network),
-            pixels=PixelGeneratorConfig(**pixels),
-            sources=sources,
-            **values,
+            network=NetworkConfig.from_dict(network), pixels=PixelGeneratorConfig(**pixels), sources=sources, **values
         )
 
 

@@ -16,8 +16,7 @@ from splinecli.training.defaults import DEFAULT_PRESET
 CHANGEABLE = ("steps", "minutes", "learning_rate", "gradient_limit")
 """The settings that may change when a run continues."""
 
-Settings = dict[str, Any]
-"""Nested settings, as in TrainingConfig.to_dict; only some of them may be given."""
+Settings = dict[str, Any]  # nested settings, as in TrainingConfig.to_dict; only some of them may be given
 
 
 def read_config_file(path: Path) -> Settings:
@@ -39,10 +38,8 @@ def read_config_file(path: Path) -> Settings:
 def parse_parameter(text: str) -> Settings:
     """Parse one setting: "a.b=value" gives {"a": {"b": value}}.
 
-    The value is read as TOML. A value that is not TOML is taken as text.
-
-    Raises:
-        UsageError: there is no name or no "=".
+    The value is read as TOML. A value that is not TOML is taken as text. Raises UsageError if there is no name or no
+    "=".
     """
     name, equals, value = text.partition("=")
     keys = [key.strip() for key in name.split(".")]
@@ -61,10 +58,8 @@ def parse_parameter(text: str) -> Settings:
 def parse_light_counts(text: str) -> dict[str, int]:
     """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
 
-    The usual number of lights is 10, as published, or the nearest number in the range.
-
-    Raises:
-        UsageError: the text is no such range, or a pixel would have fewer than 3 lights.
+    The usual number of lights is 10, as published, or the nearest number in the range. Raises UsageError if the text is
+    no such range, or a pixel would have fewer than 3 lights.
     """
     low, dash, high = text.partition("-")
     try:
@@ -96,16 +91,9 @@ def configure(
 ) -> TrainingConfig:
     """Return a preset, changed by the settings of a file and then by `changes`, in their order.
 
-    A table of sources is replaced as a whole. Other tables are merged key by key.
-
-    Args:
-        preset_name: None takes the file's entry "preset", or else `base`.
-        file: see read_config_file.
-        base: None for DEFAULT_PRESET.
-
-    Raises:
-        UsageError: there is no such preset.
-        ModelError: a setting is unknown or its value is not allowed. The message names the file it is in.
+    A table of sources is replaced as a whole. Other tables are merged key by key. Without a name of a preset, the
+    file's entry "preset" counts, or else `base`, which is DEFAULT_PRESET for None. Raises UsageError if there is no
+    such preset, or ModelError if a setting is unknown or its value is not allowed. The message names the file it is in.
     """
     settings = read_config_file(file) if file else {}
     named = settings.pop("preset", DEFAULT_PRESET if base is None else None)

@@ -92,11 +92,7 @@ def restarts_are_allowed() -> bool:
 
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
-    """Join the other processes, if torchrun started any.
-
-    Returns:
-        The place of this process and its own device.
-    """
+    """Join the other processes, if torchrun started any; return the place of this process and its own device."""
     if not is_launched():
         return Workers(), device
     if device.type == "cuda":

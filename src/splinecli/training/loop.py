@@ -1,10 +1,14 @@
-"""The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run."""
+"""The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the run.
+
+A run is started or continued in a folder, alone or with the other processes of torchrun.
+"""
 
 import copy
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import torch
@@ -14,12 +18,14 @@ from splinecli.errors import ModelError, OutputError
 from splinecli.networks.spline_net import SplineNet
 from splinecli.networks.weights import resolve_weights, save_weights
 from splinecli.synthesis.random_numbers import stream_seed
-from splinecli.system.devices import choose_precision
-from splinecli.system.files import write_text
-from splinecli.training.checkpoint import RunCounters, load_checkpoint, save_checkpoint
+from splinecli.system.devices import choose_device, choose_precision, use_available_cores
+from splinecli.system.files import check_writable, write_text
+from splinecli.system.publishing import held_folder
+from splinecli.training.checkpoint import RunCounters, load_checkpoint, read_checkpoint_config, save_checkpoint
 from splinecli.training.config import TrainingConfig
+from splinecli.training.config_files import Settings, check_resumable, configure
 from splinecli.training.defaults import CHECKPOINT, CHECKPOINT_SECONDS, CONFIG, REPORT_STEPS, WEIGHTS
-from splinecli.training.distributed import Workers
+from splinecli.training.distributed import Workers, join_workers, leave_workers, restarts_are_allowed
 from splinecli.training.objective import Losses, Part, part_of_step
 from splinecli.training.run_log import Metrics, RunLog, none_for_nan
 from splinecli.training.tasks import DROPOUT_STREAM, PixelTask, RefinementTask
@@ -214,3 +220,48 @@ class Trainer:
             asymmetric=none_for_nan(float(summed.asymmetric)),
             validation_deg=checked_deg,
         )
+
+
+def configure_run(
+    folder: Path, preset_name: str | None, file: Path | None, changes: Sequence[Settings], *, resume: bool
+) -> tuple[TrainingConfig, bool]:
+    """Return the configuration of a run, and whether it continues. Raises ModelError, UsageError.
+
+    It continues on request, or after torchrun has started its processes again: with --max-restarts, one command both
+    starts a run and continues it. Without a preset, settings of such a run that are not given stay.
+    """
+    if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
+        return configure(preset_name, file, changes), False
+    started = read_checkpoint_config(folder / CHECKPOINT)
+    asked = configure(preset_name, file, changes, base=started)
+    check_resumable(started, asked, folder / CHECKPOINT)
+    return asked, True
+
+
+@contextmanager
+def open_run(
+    config: TrainingConfig,
+    folder: Path,
+    device_name: str,
+    *,
+    resume: bool,
+    tensorboard: bool,
+    warn: Callable[[str], object],
+) -> Iterator[Trainer]:
+    """Join the other processes, lock the folder and yield the trainer of a run that `configure_run` has configured.
+
+    `warn` receives a sentence about what a killed process had left in the folder.
+
+    Raises UsageError if the processes cannot share a batch, the device is not available, or TensorBoard is not
+    installed; ModelError if the checkpoint does not fit, or weights to start from cannot be used; InputError if a pixel
+    set cannot be used; OutputError if the folder cannot be written, or has a run in it and `resume` is not set.
+    """
+    check_writable(folder)
+    use_available_cores()
+    workers, device = join_workers(choose_device(device_name))
+    with ExitStack() as stack:
+        stack.callback(leave_workers)
+        workers.shards(config.shards)  # raises UsageError before the folder is made
+        if workers.leads:
+            stack.enter_context(held_folder(folder, warn))
+        yield Trainer(config, folder, device, resume=resume, workers=workers, tensorboard=tensorboard)

@@ -26,18 +26,14 @@ AXIS_LENGTH = 0.01
 
 
 class Losses(NamedTuple):
-    """The total loss and its unweighted terms. Each is a scalar, NaN where it was not computed.
-
-    Attributes:
-        angle: in radians.
-        on_map, masked: means over cells.
-        symmetric, asymmetric: the terms of LI-Net and of NE-Net added, each in its norm.
-    """
+    """The total loss and its unweighted terms. Each is a scalar, NaN where it was not computed."""
 
     total: Tensor
-    angle: Tensor
+    angle: Tensor  # in radians
+    # on_map, masked: means over cells
     on_map: Tensor
     masked: Tensor
+    # symmetric, asymmetric: the terms of LI-Net and of NE-Net added, each in its norm
     symmetric: Tensor
     asymmetric: Tensor
 
@@ -171,28 +167,21 @@ def angles(normals: Tensor, truth: Tensor) -> Tensor:
 
 
 def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:
-    """Return |D - D_gt| over some cells, or |M_s o (D - D_gt)| over those of the sparse map.
+    """Return |D - D_gt| over some cells, or |M_s o (D - D_gt)| over those of the sparse map: the average or the sum.
 
-    Args:
-        dense: LI-Net's maps D, (P, 1, w, w).
-        truth: the true maps D_gt, of the same shape.
-        cells: 1 in the cells that count, whose true value is known, else 0, of the same shape.
-        norm: average or sum over the cells.
+    LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1 in the cells that count, whose true value is
+    known, else 0.
     """
     total = ((dense - truth).abs() * cells).sum((1, 2, 3))
     return (total if norm == "sum" else total / cells.sum((1, 2, 3)).clamp(min=1)).mean()
 
 
 def mirror(maps: Tensor, normals: Tensor) -> Tensor:
-    """Return r(D, n): the maps mirrored about the axis through the centre and the projected normal.
+    """Return r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and projected unit normals (P, 3).
 
     The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells are interpolated,
-    so that the result has a gradient with respect to the normal as well as the map. A normal towards the camera has
-    no azimuth. Its map is rotated by 180 degrees, which is a symmetry of it as well.
-
-    Args:
-        maps: (P, C, w, w).
-        normals: (P, 3), unit.
+    so that the result has a gradient with respect to the normal as well as the map. A normal towards the camera has no
+    azimuth. Its map is rotated by 180 degrees, which is a symmetry of it as well.
     """
     size = maps.shape[-1]
     centre = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
@@ -209,14 +198,9 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
 def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
     """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and (P,).
 
-    The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with stride 2. Only filled
-    cells with a filled mirror image are compared. Near the rim and beside gaps, a mirrored value would be mixed with
-    empty cells.
-
-    Args:
-        dense: maps D, (P, 1, w, w).
-        normals: (P, 3), unit.
-        filled: 1 in cells with a value, else 0, (P, 1, w, w).
+    The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with stride 2. Maps D and
+    `filled`, 1 in cells with a value, else 0, are (P, 1, w, w); normals are (P, 3), unit. Only filled cells with a
+    filled mirror image are compared. Near the rim and beside gaps, a mirrored value would be mixed with empty cells.
     """
     image, image_filled = torch.chunk(mirror(torch.cat((dense, filled), dim=1), normals), 2, dim=1)
     both = filled * (image_filled > 0.999)

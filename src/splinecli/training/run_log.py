@@ -8,9 +8,10 @@ from typing import Any
 
 from splinecli.errors import OutputError
 from splinecli.pictures.observation_maps import observation_map_figure
-from splinecli.pictures.training_curves import training_curves
+from splinecli.pictures.plotting import png_bytes
+from splinecli.pictures.training_curves import training_figure
 from splinecli.system.extras import import_extra
-from splinecli.system.files import refusals_as_output_errors, write_bytes, write_text
+from splinecli.system.files import free_name, refusals_as_output_errors, write_bytes, write_text
 from splinecli.system.publishing import refuse_link
 from splinecli.training.defaults import CURVES, EVENTS, MAPS, METRICS
 from splinecli.training.tasks import SampleMaps
@@ -18,33 +19,20 @@ from splinecli.training.tasks import SampleMaps
 
 @dataclass(frozen=True)
 class Metrics:
-    """One line of metrics.csv: means over the steps since the previous line.
+    """One line of metrics.csv: means over the steps since the previous line. A value that was not computed is None."""
 
-    A value that was not computed is None.
-
-    Attributes:
-        step: number of updates so far.
-        pixels: number of training pixels drawn so far.
-        minutes: training time so far.
-        learning_rate: the rate of the last update.
-        loss: the weighted sum of all terms. Where LI-Net and NE-Net are updated in turn, the sum of both losses.
-        angle_deg: mean angular error of the training pixels, in degrees.
-        map_error: mean absolute error of LI-Net's dense map. None without a LI-Net.
-        masked_map_error: the same over the cells of the sparse map.
-        symmetric, asymmetric: Ls and La, unweighted. None where their weights are 0.
-        validation_deg: mean angular error of the validation pixels, in degrees. None between checkpoints.
-    """
-
-    step: int
-    pixels: int
-    minutes: float
-    learning_rate: float
-    loss: float
-    angle_deg: float
-    map_error: float | None
-    masked_map_error: float | None
+    step: int  # number of updates so far
+    pixels: int  # number of training pixels drawn so far
+    minutes: float  # training time so far
+    learning_rate: float  # the rate of the last update
+    loss: float  # the weighted sum of all terms. Where LI-Net and NE-Net are updated in turn, the sum of both losses.
+    angle_deg: float  # mean angular error of the training pixels, in degrees
+    map_error: float | None  # mean absolute error of LI-Net's dense map. None without a LI-Net.
+    masked_map_error: float | None  # the same over the cells of the sparse map
+    # symmetric, asymmetric: Ls and La, unweighted. None where their weights are 0.
     symmetric: float | None = None
     asymmetric: float | None = None
+    # mean angular error of the validation pixels, in degrees. None between checkpoints.
     validation_deg: float | None = None
 
 
@@ -58,8 +46,7 @@ class RunLog:
     def __init__(self, folder: Path, step: int, *, tensorboard: bool = False) -> None:
         """Open the log at a step and drop the lines of later steps, which the run is about to repeat.
 
-        Raises:
-            UsageError: `tensorboard` is set and the package is not installed.
+        Raises UsageError if `tensorboard` is set and the package is not installed.
         """
         self.folder = folder
         self.set_aside = _drop_lines_after(step, folder / METRICS)
@@ -88,7 +75,7 @@ class RunLog:
         """Write curves.png anew, and maps.png where there are maps."""
         rows = read_metrics(self.folder / METRICS)
         columns = {field.name: [getattr(row, field.name) for row in rows] for field in fields(Metrics)}
-        write_bytes(self.folder / CURVES, training_curves(columns))
+        write_bytes(self.folder / CURVES, png_bytes(training_figure(columns), dpi=110))
         if maps is None:
             return
         figure = observation_map_figure(
@@ -122,11 +109,8 @@ def _drop_lines_after(step: int, path: Path) -> Path | None:
     try:
         kept = _lines_until(step, path)
     except ValueError:
-        aside = path.with_suffix(".damaged.csv")
-        number = 1
-        while aside.exists():
-            number += 1
-            aside = path.with_suffix(f".damaged-{number}.csv")
+        ending = free_name(".damaged", lambda name: path.with_suffix(f"{name}.csv").exists())
+        aside = path.with_suffix(f"{ending}.csv")
         with refusals_as_output_errors(aside):
             path.replace(aside)
         return aside

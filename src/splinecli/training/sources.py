@@ -56,16 +56,12 @@ Scenes = dict[str, tuple[PixelSet, list[Entry]]]
 
 @dataclass(frozen=True)
 class OpenSets:
-    """The pixel sets of a run.
+    """The pixel sets of a run."""
 
-    Attributes:
-        training, validation: the scenes for either. A set with a single scene is validated on its training pixels.
-        single_scene_sets: these sets.
-    """
-
+    # training, validation: the scenes for either. A set with a single scene is validated on its training pixels.
     training: Scenes
     validation: Scenes
-    single_scene_sets: tuple[str, ...]
+    single_scene_sets: tuple[str, ...]  # these sets
 
     @property
     def sha256(self) -> dict[str, str]:
@@ -76,9 +72,8 @@ class OpenSets:
 def open_sets(config: TrainingConfig) -> OpenSets:
     """Open the pixel sets of a configuration.
 
-    Raises:
-        InputError: a pixel set is missing, unfinished or does not match its manifest, or has no scene left for
-            training.
+    Raises InputError if a pixel set is missing, unfinished or does not match its manifest, or has no scene left for
+    training.
     """
     names = [name for name, weight in config.sources.items() if weight > 0 and name != GENERATOR]
     sets = {name: open_pixel_set(Path(name)) for name in names}

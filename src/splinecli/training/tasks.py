@@ -16,13 +16,7 @@ from splinecli.synthesis.batches import PixelBatch
 from splinecli.synthesis.random_numbers import stream_seed
 from splinecli.training.config import GENERATOR, TrainingConfig
 from splinecli.training.objective import Losses, angles, compute_losses, dense_truth_in_frame, fixed, part_of_step
-from splinecli.training.refinement import (
-    FIRST_EXAMPLES,
-    STEPS_PER_EXAMPLE,
-    ScenePool,
-    refinement_losses,
-    stack_maps,
-)
+from splinecli.training.refinement import FIRST_EXAMPLES, STEPS_PER_EXAMPLE, ScenePool, refinement_losses, stack_maps
 from splinecli.training.sources import Scenes, open_sets, pixel_source
 
 VALIDATION_PIXELS = 2048
@@ -36,28 +30,16 @@ _BATCH_STREAM, _VALIDATION_STREAM, _POOL_STREAM, DROPOUT_STREAM = 2**31, 2**31 +
 
 
 class SampleMaps(NamedTuple):
-    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals.
+    """Observation maps of N pixels, NaN in empty cells, and the errors of their normals."""
 
-    Attributes:
-        sparse: the sparse maps, (N, w, w).
-        dense: LI-Net's dense maps, (N, w, w); None without a LI-Net.
-        truth: the true maps with gaps filled, (N, w, w).
-        error_deg: (N,).
-    """
-
-    sparse: NDArray[np.float32]
-    dense: NDArray[np.float32] | None
-    truth: NDArray[np.float32]
-    error_deg: NDArray[np.float32]
+    sparse: NDArray[np.float32]  # the sparse maps, (N, w, w)
+    dense: NDArray[np.float32] | None  # LI-Net's dense maps, (N, w, w); None without a LI-Net
+    truth: NDArray[np.float32]  # the true maps with gaps filled, (N, w, w)
+    error_deg: NDArray[np.float32]  # (N,)
 
 
 class PixelTask:
-    """Batches of pixels from the sources of a run.
-
-    Attributes:
-        source: draws training pixels.
-        validation: batches of validation pixels.
-    """
+    """Batches of pixels from the sources of a run: its `source` for training, and those for `validation`."""
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
         self.config = config
@@ -79,8 +61,7 @@ class PixelTask:
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
 
-        Returns:
-            Each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
+        Returns each shard's pixels and their further turns in degrees (P,), and whether all are mirrored.
         """
         config = self.config
         canonical = config.network.is_canonical

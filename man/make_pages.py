@@ -1,9 +1,8 @@
-"""Make the man pages, an overview and one page per command, from the commands: `python -m splinecli.cli.man man`."""
+"""Make the man pages, an overview and one page per command, from the commands: `python man/make_pages.py`."""
 
 import inspect
 import re
 import shlex
-import sys
 import textwrap
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,8 +11,8 @@ from typing import Any
 import typer
 
 from splinecli import __version__
-from splinecli.cli.app import app
 from splinecli.cli.commands import help_panels
+from splinecli.cli.main import app
 
 EXIT_STATUS = {
     "0": "Done.",
@@ -212,6 +211,5 @@ def _escape(text: str) -> str:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1])
     for page, text in man_pages().items():
-        (folder / page).write_text(text, "utf-8")
+        (Path(__file__).parent / page).write_text(text, "utf-8")

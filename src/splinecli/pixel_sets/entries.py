@@ -1,0 +1,227 @@
+"""Captures with ground truth and rendered scenes as entries of a pixel set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from splinecli.capture import capture_name, open_capture
+from splinecli.capture.stamp import digest
+from splinecli.capture.stored import name_reading
+from splinecli.errors import InputError, OutputError
+from splinecli.pixel_sets.store import ARRAYS, Pixels
+from splinecli.pixel_sets.writer import PixelSetWriter
+from splinecli.synthesis.meshes import read_mesh
+from splinecli.synthesis.principled import CLASSES
+from splinecli.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.system.extras import import_extra
+from splinecli.system.files import file_sha256, free_name, replacing
+
+if TYPE_CHECKING:
+    from splinecli.capture import Capture, CaptureSource
+
+
+class CaptureChangedError(OutputError):
+    """A capture differs from the one that its entry was made from."""
+
+
+def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
+    """Choose the name of the entry of each capture, and return the folders by name.
+
+    A capture that is in the set keeps its name. A new capture is named after its folder, with a number if another
+    capture has that name. A folder that is given twice counts once, because its pixels must not both train and
+    validate.
+    """
+    captures: dict[str, Path] = {}
+    for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
+
+        def is_taken(name: str, source: str = str(resolved)) -> bool:
+            by_another = name in writer and writer.recipe_of(name).get("source") != source
+            return name in captures or by_another
+
+        captures[free_name(capture_name(folder), is_taken)] = folder
+    return captures
+
+
+def add_capture(
+    writer: PixelSetWriter,
+    name: str,
+    folder: Path,
+    *,
+    as_stored: bool = False,
+    white_level: float | None = None,
+    update: bool = False,
+) -> None:
+    """Read a capture and write its pixels with ground truth, unless the set has them.
+
+    Of the images of CyclesPS's PRPS, only every second row and column counts: the training of CNN-PS reads them at
+    half their size.
+
+    Args:
+        as_stored: use the stored values alone. By default, saturated observations are restored and unknown light
+            intensities are estimated, as `infer` does.
+        white_level: stored value from which a pixel counts as saturated; None to find it in the images.
+        update: replace an entry whose capture changed.
+
+    Raises:
+        InputError: the capture cannot be read, or has no ground truth.
+        CaptureChangedError: the capture changed since its entry was made, and `update` is not set.
+        OutputError: the entry cannot be written.
+    """
+    source = open_capture(folder, white_level=white_level)
+    recipe: dict[str, Any] = {
+        "source": str(folder.resolve()),
+        "reading": name_reading(as_stored=as_stored),
+        "white_level": white_level,
+        # The stamp depends on the white level too, so it is compared last.
+        "files": digest(source.stamp),
+    }
+    if source.lamps is not None and source.lamps.used:
+        raise InputError(
+            "the capture has near lamps, and training needs distant lights",
+            path=folder,
+            hint="Leave it out, or render or photograph it under distant lights",
+        )
+    if name in writer:
+        difference = writer.difference(name, recipe)
+        if difference is None:
+            return
+        if not update:
+            problem = f"its entry {name} was made with {difference}"
+            if difference.startswith("files ="):
+                problem = f"its files changed since the entry {name} was made"
+            hint = "Add --update to read it again, or choose another -o"
+            raise CaptureChangedError(problem, path=folder, hint=hint)
+    if source.files.ground_truth is None:
+        raise InputError("the capture has no ground truth, which training needs", path=folder)
+    pixels = _pixels(source.read(as_stored=as_stored), source, folder)
+    # The materials of an object of CyclesPS share its shape.
+    scene = source.files.folder.absolute().name if source.files.boundaries else name
+    writer.add(name, scene, str(folder), recipe, pixels)
+
+
+def _pixels(capture: Capture, source: CaptureSource, folder: Path) -> Pixels:
+    """Return the pixels of a capture that have a true normal. Raises InputError if there are none."""
+    assert capture.ground_truth is not None
+    normals = capture.ground_truth[capture.mask]
+    # The images of CyclesPS's PRPS count at half their size.
+    step = 2 if source.files.boundaries and source.files.folder.absolute().parent.name == "PRPS" else 1
+    rows, columns = np.nonzero(capture.mask)
+    used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
+    if not used.any():
+        raise InputError("no pixel of the mask has a ground-truth normal", path=folder)
+    mask = np.zeros_like(capture.mask)
+    mask[capture.mask] = used
+    return Pixels(
+        observations=capture.observations[used],
+        normals=normals[used].astype(np.float32),
+        light_directions=capture.light_directions.astype(np.float32),
+        mask=mask[::step, ::step],
+    )
+
+
+RENDERER = 3  # Version of the renderer. Raise it when a scene comes out differently, because one set must not mix both.
+
+# Meshes have random numbers of their own, so that a mesh changes no other scene.
+_FIRST_MESH_INDEX = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlan:
+    """The scenes to render: first one of each mesh file, then `count` random ones."""
+
+    config: SceneConfig
+    seed: int
+    count: int
+    meshes: tuple[Path, ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of the scenes. A mesh gives its file name, with a number if another mesh has it."""
+        names: list[str] = []
+        for path in self.meshes:
+            names.append(free_name(path.stem, names.__contains__))
+        return (*names, *(f"scene{index:04}" for index in range(self.count)))
+
+    def entry_names(self, position: int) -> dict[str, str]:
+        """Return the names of a scene's entries by class of material."""
+        return {kind: f"{self.names[position]}-{kind}" for kind in CLASSES}
+
+    def recipe(self, position: int) -> dict[str, Any]:
+        """Return the values that decide the content of a scene."""
+        return {
+            "renderer": RENDERER,
+            **asdict(self.config),
+            "seed": self.seed,
+            "mesh": file_sha256(self.meshes[position]) if position < len(self.meshes) else None,
+            "measured_share": 0.0,  # earlier versions had a choice
+        }
+
+    def check_inputs(self) -> None:
+        """Check what rendering needs, before anything is rendered.
+
+        Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the packages of the extra
+        `render` are not installed.
+        """
+        if self.names:
+            for package in ("embreex.rtcore_scene", "skimage.measure"):
+                import_extra(package, "render")
+        for path in self.meshes:
+            read_mesh(path)
+
+    def check_set(self, writer: PixelSetWriter) -> None:
+        """Raise OutputError if the set has one of the scenes, rendered with other settings."""
+        for position in range(len(self.names)):
+            recipe = self.recipe(position)
+            for name in self.entry_names(position).values():
+                difference = writer.difference(name, recipe) if name in writer else None
+                if difference is not None:
+                    raise OutputError(
+                        f"the entry {name} was made with {difference}", path=writer.folder, hint="Choose another -o"
+                    )
+
+    def render(self, position: int, progress: Callable[[float], None] | None = None) -> tuple[str, dict[str, Pixels]]:
+        """Render a scene; return its shape in words, and the pixels by class of material.
+
+        `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot be used, or the
+        camera sees nothing; UsageError if the packages of the extra `render` are not installed.
+        """
+        mesh_file = self.meshes[position] if position < len(self.meshes) else None
+        mesh = None if mesh_file is None else read_mesh(mesh_file)
+        index = position - len(self.meshes) if mesh_file is None else _FIRST_MESH_INDEX + position
+        scene = draw_scene(self.seed, index, self.config, mesh)
+        rendered = render_scene(scene, self.config, progress)
+        if not rendered.mask.any():
+            raise InputError(
+                "the camera sees nothing of the mesh",
+                path=mesh_file or self.names[position],
+                hint="The camera looks along -z. A face is visible if its corners run anticlockwise towards the camera",
+            )
+        normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
+        # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.
+        observations = {kind: values.astype(np.float16) for kind, values in rendered.observations.items()}
+        return scene.shape, {kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in CLASSES}
+
+    def add(self, writer: PixelSetWriter, position: int, shape: str, pixels: Mapping[str, Pixels]) -> None:
+        """Add the entries of a scene to a set that has passed check_set. Raises OutputError."""
+        recipe = self.recipe(position)
+        for kind, name in self.entry_names(position).items():
+            writer.add(name, self.names[position], f"rendered: {shape}", recipe, pixels[kind])
+
+
+def save_rendered(pixels: Mapping[str, Pixels], path: Path) -> None:
+    """Write the pixels of a scene to a file, for load_rendered. Raises OutputError."""
+    arrays = {f"{kind}.{name}": getattr(pixels[kind], name) for kind in CLASSES for name in ARRAYS}
+    with replacing(path) as file:
+        np.savez(file, **arrays)
+
+
+def load_rendered(path: Path) -> dict[str, Pixels]:
+    """Return the pixels in a file that save_rendered wrote. Raises OSError."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return {kind: Pixels(**{name: arrays[f"{kind}.{name}"] for name in ARRAYS}) for kind in CLASSES}
