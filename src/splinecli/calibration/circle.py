@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError
 
 RAYS = 720
-MIN_VISIBLE = 0.35
-"""Smallest visible share of an outline. A shorter arc may be the edge of another object."""
-
+MIN_VISIBLE = 0.35  # Smallest visible share of an outline. A shorter arc may be the edge of another object.
 _SEARCH_SIZE = 480  # longer side, in pixels, of the image that the Hough transform searches
 _SEARCH_BAND = 0.06  # of the radius: the distance to either side of the guess in which edges are searched
 _TOLERANCE = 0.015  # of the radius: the largest distance from the circle at which a point agrees with it

@@ -19,9 +19,7 @@ LEAST_CORRELATION, LEAST_GAIN = 0.2, 0.2
 """A shift counts if detail correlates so well at it, and so much better than without it. Of right captures of ten
 images and more, a polished metal reached 0.44 and 0.17."""
 
-LEAST_SHIFT = 0.8
-"""The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel."""
-
+LEAST_SHIFT = 0.8  # The shortest shift that counts, in pixels of the sample. A tripod sinks by half a pixel.
 LEAST_IMAGES = 10  # fewest images: from fewer, polished metals are predicted so badly that right ones would be named
 LEAST_PIXELS = 1000  # fewest pixels that must stay in the mask under every shift
 _MIN_PREDICTORS = 5  # an image is predicted from three factors of four others or more

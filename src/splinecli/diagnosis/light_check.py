@@ -28,9 +28,7 @@ CURL_WEIGHT, RIM_WEIGHT = 5.0, 1.0
 
 TOLD_APART = 0.5  # smallest difference of advantages that tells two frames apart
 NEAR = 0.1  # candidates whose advantages differ by less are near equals
-
-LOWEST_CURL = 0.1
-"""Curls below this are noise. On a cap of a sphere, other frames give little more."""
+LOWEST_CURL = 0.1  # Curls below this are noise. On a cap of a sphere, other frames give little more.
 
 RIM_COUNTS_FROM, RIM_COUNTS_FULLY = 0.3, 0.6
 """Shares of steep pixels at the rim: below the first, the mask's edge is no outline of the object."""

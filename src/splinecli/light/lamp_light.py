@@ -73,14 +73,9 @@ class LampLight:
         return normals if self.turns is None else np.einsum("pji,pj->pi", self.turns, normals)
 
 
-Rows = NDArray[np.integer]
-"""Numbers of some of a capture's pixels, in the order of its mask."""
-
-LightOf = Callable[[Rows], LampLight]
-"""From rows of a capture's pixels to their observations and light directions."""
-
-LIT_AT_ONCE = 1 << 14
-"""Pixels whose light is asked for at once: under near lamps, each has its own lights."""
+Rows = NDArray[np.integer]  # numbers of some of a capture's pixels, in the order of its mask
+LightOf = Callable[[Rows], LampLight]  # from rows of a capture's pixels to their observations and light directions
+LIT_AT_ONCE = 1 << 14  # pixels whose light is asked for at once: under near lamps, each has its own lights
 
 
 def parts_of_rows(count: int, size: int = LIT_AT_ONCE, *, step: int = 1) -> Iterator[Rows]:

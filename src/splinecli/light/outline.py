@@ -15,14 +15,12 @@ from splinecli.maths.normals import unit
 
 Array = NDArray[np.float64]
 
-MIN_PIXELS = 20
-"""Fewer lit pixels at the outline show no rotation."""
+MIN_PIXELS = 20  # fewer lit pixels at the outline show no rotation
 
 _SMOOTHING = 0.02
 """Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered mask falls outwards."""
 
-_BORDER = 0.01
-"""Masks of objects that fill the image may leave out a border of this share of its sides."""
+_BORDER = 0.01  # masks of objects that fill the image may leave out a border of this share of its sides
 
 _RIM_Z = 0.25
 """Typical z of normals within a pixel of the outline: pixels have a size, and masks are drawn inside the object."""

@@ -35,8 +35,7 @@ LEAST_SIDE = 0.15
 
 SIDES: dict[str, tuple[float, float]] = {"left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
 
-SAME_IMAGES = 0.01
-"""Images that differ by less from their mean, as a share of it, show no light that moves."""
+SAME_IMAGES = 0.01  # images that differ by less from their mean, as a share of it, show no light that moves
 
 # Chosen on rendered scenes that the network was not trained on.
 _WORTH_PIXELS = 6.0  # see fit_near

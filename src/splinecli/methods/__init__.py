@@ -97,8 +97,7 @@ def _network(name: str, options: MethodOptions, *, weights: str, rotations: int,
     )
 
 
-_BATCH = {"cpu": 256, "cuda": 1024}
-"""Pixels in a network's batch. Processors compute a batch on each core."""
+_BATCH = {"cpu": 256, "cuda": 1024}  # Pixels in a network's batch. Processors compute a batch on each core.
 
 _METHODS: dict[str, Callable[[str, MethodOptions], Estimator]] = {
     "spline-net": partial(_network, weights="spline-net", rotations=1),

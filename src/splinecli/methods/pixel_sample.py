@@ -5,11 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-CELLS = 256
-"""Number of groups of pixels of like appearance."""
-
-EVEN_SHARE = 0.5
-"""Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups."""
+CELLS = 256  # number of groups of pixels of like appearance
+EVEN_SHARE = 0.5  # Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the groups.
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-FEWEST_PIXELS = 64
-"""The smallest sample that can be learned from."""
+FEWEST_PIXELS = 64  # the smallest sample that can be learned from
 
 
 @dataclass(frozen=True)

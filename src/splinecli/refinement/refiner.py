@@ -41,8 +41,7 @@ TILE = 608
 Larger tiles take less time, because their margins are smaller in all, and more memory.
 """
 
-MOST_PIXELS = 150_000
-"""The most pixels of a capture that the net sees as they are."""
+MOST_PIXELS = 150_000  # the most pixels of a capture that the net sees as they are
 
 _DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
 

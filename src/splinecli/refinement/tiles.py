@@ -10,8 +10,7 @@ from splinecli.networks.refine_net import COARSEST, Part
 
 Floats = NDArray[np.float32]
 
-Box = tuple[slice, slice]
-"""Rows and columns of a map, both with a start and a stop."""
+Box = tuple[slice, slice]  # rows and columns of a map, both with a start and a stop
 
 
 @dataclass(frozen=True)

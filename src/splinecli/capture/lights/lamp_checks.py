@@ -13,8 +13,7 @@ from splinecli.capture.lights.near_lamps import NearLamps
 from splinecli.capture.paths import is_substitution
 from splinecli.errors import InputError
 
-NEAR_DEG = 2.0
-"""The change of a light direction across the object above which distant lights carry a warning."""
+NEAR_DEG = 2.0  # the change of a light direction across the object above which distant lights carry a warning
 
 INSIDE = 0.5
 """A lamp is refused if its distance from the middle of the object is below this share of the smaller of the object's

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from splinecli.capture.robust_fit import absolute_weights, fit_scaled_normals, shade, shadow_weights
 
-ITERATIONS = 16
-"""Fits to a pixel. More change the restored values by less than the fit's own error."""
+ITERATIONS = 16  # Fits to a pixel. More change the restored values by less than the fit's own error.
 
 RAISED_WEIGHT = np.float32(0.1)
 """Weight of an observation that the last fit raised; one that the fit meets has 50. It determines nothing but what the
