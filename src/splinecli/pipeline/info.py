@@ -11,8 +11,8 @@ from splinecli.capture.capture_warnings import estimated_lights
 from splinecli.capture.lights.found_lights import FoundLights
 from splinecli.capture.lights.light_files import rows_text
 from splinecli.capture.summary import CaptureSummary, summarise_capture
-from splinecli.diagnosis.checks import check_sample
-from splinecli.diagnosis.evidence import StatedLights
+from splinecli.diagnosis.checks import check_evidence
+from splinecli.diagnosis.evidence import Evidence
 from splinecli.diagnosis.light_check import candidate_rows
 from splinecli.errors import InputError, UsageError
 from splinecli.methods.student_size import student_sizes
@@ -87,8 +87,10 @@ def describe_capture(
             write_bytes(plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg))
         check, warnings = None, summary.warnings()
         if summary.sample is not None and summary.closeup is not None:
-            lights = StatedLights.of_source(source, summary.sample, range(source.n_lights))
-            check, found = check_sample(lights, summary.sample, summary.closeup, strict=reading.strict)
+            samples = summary.sample, summary.closeup
+            check, found = check_evidence(
+                Evidence.of_source(source, samples, range(source.n_lights), strict=reading.strict)
+            )
             warnings += found
         if found_lights is not None:
             warnings.append(estimated_lights(found_lights.errors_deg))
