@@ -43,6 +43,7 @@ class NumberRows:
 
     path: Path
     rows: tuple[Row, ...] = field(repr=False)
+    names: tuple[str, ...] | None = None  # of each row's image, without folders; None where rows begin with numbers
 
     def as_array(self) -> NDArray[np.float64]:
         """Return the rows as (R, C) float64. Raises InputError at the first row that differs in length."""
@@ -185,12 +186,8 @@ def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
     return any("," in word for word in words) and all(map(is_match, words))
 
 
-def is_number(word: str) -> bool:
-    """Return whether a word is a number, finite or not."""
-    return _to_number(word) is not None
-
-
-def _to_number(word: str) -> float | None:
+def to_number(word: str) -> float | None:
+    """Return the number that a word stands for, finite or not; None for another word."""
     try:
         # float() also takes Python's notation "1_000", but "2024_01" is the name of an image.
         return float(word) if "_" not in word else None
@@ -200,7 +197,7 @@ def _to_number(word: str) -> float | None:
 
 def parse_number(word: str, path: Path, line: int) -> float:
     """Return the finite number that a word of a text file stands for. Raises InputError with the line."""
-    value = _to_number(word)
+    value = to_number(word)
     if value is None or not np.isfinite(value):
         what = "a number" if value is None else "a finite number"
         raise InputError(f'found "{word[:40]}", expected {what}', path=path, line=line)

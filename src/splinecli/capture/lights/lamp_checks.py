@@ -81,7 +81,7 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     if path.suffix.lower() in (*NAMED_SUFFIXES, *ARRAY_SUFFIXES) or is_substitution(path):
         return []
     try:
-        vectors = read_light_rows(path, expected="x y z", n_numbers=3).numbers.as_array()
+        vectors = read_light_rows(path, expected="x y z", n_numbers=3).as_array()
     except InputError:
         return []  # a file of angles
     vectors = vectors.T if vectors.shape[1] != 3 and vectors.shape[0] == 3 else vectors[:, -3:]

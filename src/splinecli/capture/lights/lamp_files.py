@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import is_number, read_lines, read_number_rows
+from splinecli.capture.formats.text import read_lines, read_number_rows, to_number
 from splinecli.capture.layouts.capture_files import LIGHT_POSITIONS, find_lights, find_named
 from splinecli.capture.lights.light_files import read_light_positions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
@@ -249,7 +249,7 @@ def _read_pixel_size(path: Path) -> float:
     content = [(line, text.partition("#")[0].strip()) for line, text in lines]
     content = [(line, text) for line, text in content if text] or [(1, "")]
     line, text = content[0]
-    size = float(text) if is_number(text) else 0.0
+    size = to_number(text) or 0.0
     if len(content) != 1 or not 0 < size < math.inf:
         raise InputError(
             f'found "{text[:40]}", expected one number above 0, the width of a pixel',

@@ -10,18 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import (
-    DECIMAL_POINT,
-    NumberRows,
-    columns,
-    has_decimal_commas,
-    read_number_rows,
-)
+from splinecli.capture.formats.text import DECIMAL_POINT, NumberRows, columns, has_decimal_commas, read_number_rows
 from splinecli.capture.lights.array_files import SUFFIXES, read_array_file
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import (
     COLUMNS,
-    LightRows,
     RowForm,
     check_angles,
     counts_rows,
@@ -55,20 +48,15 @@ def read_light_directions(
             vector or a light below the horizon; also where the count disagrees with the count line or with
             n_images, and for angles that are read as vectors.
     """
-    return directions_of(read_light_table(Path(path), n_images, form).numbers, n_images, frame, form)
+    return lights_of(read_light_table(Path(path), n_images, form), n_images, frame, form)[1]
 
 
-def read_light_table(path: Path, n_images: int | None, form: RowForm) -> LightRows:
+def read_light_table(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Return the rows of a text file or of a file of matrices. Raises InputError; see read_light_directions."""
     if path.suffix.lower() in SUFFIXES:
-        return LightRows(read_array_file(path, n_images))
+        return read_array_file(path, n_images)
     meaning = COLUMNS[form]
     return read_light_rows(path, expected=_FILE.format(*meaning.values()), n_numbers=min(meaning))
-
-
-def directions_of(table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm) -> NDArray[np.float64]:
-    """Return unit light directions (F, 3) from the rows of a file; see read_light_directions."""
-    return _lights_of(table, n_images, frame, form)[1]
 
 
 def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME) -> NDArray[np.float64]:
@@ -78,19 +66,16 @@ def read_light_positions(path: StrPath, n_images: int, frame: LightFrame = USUAL
         InputError: as read_light_directions, which checks the same numbers as directions from the origin; also for
             rows that name their images.
     """
-    rows = read_light_table(Path(path), n_images, "positions")
-    positions, _ = _lights_of(rows.numbers, n_images, frame, "positions")
-    if rows.names is not None:
-        raise InputError(
-            f"found the name {rows.names[0]!r}, expected x y z",
-            path=Path(path),
-            line=rows.numbers.rows[0].line,
-            hint="Positions have a line for each image, in the order of the images",
-        )
+    table = read_light_table(Path(path), n_images, "positions")
+    positions, _ = lights_of(table, n_images, frame, "positions")
+    if table.names is not None:
+        problem = f"found the name {table.names[0]!r}, expected x y z"
+        hint = "Positions have a line for each image, in the order of the images"
+        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
     return positions
 
 
-def _lights_of(
+def lights_of(
     table: NumberRows, n_images: int | None, frame: LightFrame, form: RowForm
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return vectors (F, 3) of any length in the usual frame, and the same at unit length."""

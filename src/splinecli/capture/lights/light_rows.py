@@ -2,14 +2,14 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.formats.text import NumberRows, is_number, parse_rows, read_rows_of_words
+from splinecli.capture.formats.text import NumberRows, parse_rows, read_rows_of_words, to_number
 from splinecli.errors import InputError
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
@@ -69,18 +69,6 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         )
 
 
-def refuse_zenith(header: list[str], path: Path, line: int) -> None:
-    """Raise InputError for a header with an angle from the camera axis in place of the elevation."""
-    found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
-    if found is not None:
-        raise InputError(
-            f'found the column "{found[:40]}", expected azimuth and elevation',
-            path=path,
-            line=line,
-            hint="The elevation is 90 minus the angle from the camera axis",
-        )
-
-
 def zenith_as_elevation(light_directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the lights (..., 3) whose angles from the camera axis are the elevations of these."""
     level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
@@ -123,16 +111,7 @@ _ANGLE = re.compile(r"(az|el|alt)")
 _AXES, _ANGLES = ("x", "y", "z"), ("az", "el")
 
 
-@dataclass(frozen=True)
-class LightRows:
-    """The rows of a light file."""
-
-    numbers: NumberRows  # without a header and without names
-    # the name of each row's image, without folders; None where the rows begin with numbers
-    names: tuple[str, ...] | None = None
-
-
-def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
+def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
     """Return the rows of a text file, without "#" comments, blank lines and a header (a first row without numbers).
 
     Rows that begin with a word belong to named images, as "img 1.png 0 0 1": the last numbers are the light. A header
@@ -147,25 +126,26 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> LightRows:
     """
     rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
-    if len(rows) > 1 and not any(is_number(word) for word in rows[0][2]):
+    if len(rows) > 1 and all(to_number(word) is None for word in rows[0][2]):
         line, _, header = rows.pop(0)
         order = _order_of(header[-n_numbers:])
-        if n_numbers == len(_ANGLES):
-            refuse_zenith(header, path, line)
+        found = next((word for word in header if word.lower().startswith(_ZENITH)), None)
+        if found is not None and n_numbers == len(_ANGLES):
+            problem = f'found the column "{found[:40]}", expected azimuth and elevation'
+            hint = "The elevation is 90 minus the angle from the camera axis"
+            raise InputError(problem, path=path, line=line, hint=hint)
     # A count may stand before rows with names.
     body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
-    if body and all(len(words) > n_numbers and not is_number(words[0]) for _, _, words in body):
-        names = tuple(image_name(text, words[-n_numbers:]) for _, text, words in body)
-        without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
-        return LightRows(_reordered(parse_rows(without_names, path), order), names)
-    if n_numbers == len(_AXES) and body and all(_is_named_angles(words) for *_, words in body):
-        raise InputError(
-            "found a name and 2 numbers, expected a name and 3 (x y z)",
-            path=path,
-            line=body[0][0],
-            hint=AZEL_HINT,
-        )
-    return LightRows(_reordered(parse_rows(rows, path), order))
+    if body and all(to_number(words[0]) is None for *_, words in body):
+        if all(len(words) > n_numbers for *_, words in body):
+            names = tuple(image_name(text, words[-n_numbers:]) for _, text, words in body)
+            without_names = [(line, text, words[-n_numbers:]) for line, text, words in body]
+            return replace(_reordered(parse_rows(without_names, path), order), names=names)
+        angles = [words[1:] for *_, words in body if None not in map(to_number, words[1:])]
+        if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [len(_ANGLES)]:
+            problem = "found a name and 2 numbers, expected a name and 3 (x y z)"
+            raise InputError(problem, path=path, line=body[0][0], hint=AZEL_HINT)
+    return _reordered(parse_rows(rows, path), order)
 
 
 def _order_of(header: list[str]) -> list[int]:
@@ -190,11 +170,6 @@ def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
         for row in table.rows
     )
     return replace(table, rows=tuple(rows))
-
-
-def _is_named_angles(words: list[str]) -> bool:
-    name, *numbers = words
-    return not is_number(name) and len(numbers) == len(_ANGLES) and all(map(is_number, numbers))
 
 
 def image_name(text: str, numbers: list[str]) -> str:

@@ -7,7 +7,7 @@ the folder are matched to them by base name, then by name without suffix, then b
 import json
 import reprlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.capture.formats.text import parse_number, read_lines, split_words, uses_decimal_commas
-from splinecli.capture.lights.light_files import directions_of, read_light_table, unit_directions
+from splinecli.capture.lights.light_files import lights_of, read_light_table, unit_directions
 from splinecli.capture.lights.light_frames import USUAL_FRAME, LightFrame
 from splinecli.capture.lights.light_rows import RowForm, image_name
 from splinecli.errors import InputError
@@ -51,13 +51,9 @@ class NamedLights:
             if name.casefold() in lines:
                 raise InputError(f'a second light for the image "{name}"', path=self.path, line=line)
             lines[name.casefold()] = line
-        keys: tuple[tuple[str, Callable[[str], str]], ...] = (
-            ("name", str.casefold),
-            ("name without suffix", lambda name: Path(name).stem.casefold()),
-        )
-        for how, key in keys:
-            by_key = {key(image.name): image for image in reversed(images)}
-            wanted = [key(name) for name in self.names]
+        for how, part in (("name", "name"), ("name without suffix", "stem")):
+            by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
+            wanted = [getattr(Path(name), part).casefold() for name in self.names]
             if len(set(wanted)) == len(wanted) and all(name in by_key for name in wanted):
                 return tuple(by_key[name] for name in wanted), how
         if len(images) == len(self.names):
@@ -86,11 +82,11 @@ def read_lights(
     """
     if path.suffix.lower() in SUFFIXES:
         return _read_json(path, frame) if path.suffix.lower() == ".json" else _read_lp(path, frame)
-    rows = read_light_table(path, n_images, form)
-    if rows.names is None:
-        return directions_of(rows.numbers, n_images, frame, form)
-    lines = tuple(row.line for row in rows.numbers.rows)
-    return NamedLights(path, rows.names, lines, directions_of(rows.numbers, None, frame, form))
+    table = read_light_table(path, n_images, form)
+    _, directions = lights_of(table, n_images if table.names is None else None, frame, form)
+    if table.names is None:
+        return directions
+    return NamedLights(path, table.names, tuple(row.line for row in table.rows), directions)
 
 
 def _read_lp(path: Path, frame: LightFrame) -> NamedLights:
